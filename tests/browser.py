@@ -3,6 +3,7 @@
 import base64
 import itertools
 import json
+import math
 import shutil
 import subprocess
 import time
@@ -12,6 +13,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from websockets.sync.client import connect
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -22,18 +24,26 @@ class Tab:
 
     def __init__(self, socket: Any, downloads: Path, width: int, height: int) -> None:
         self._socket, self._numbers = socket, itertools.count(1)
-        self.send("Page.enable")
-        self.send("Runtime.enable")
+        self.console: list[Any] = []
+        for domain in ("Page", "Runtime", "Log"):
+            self.send(f"{domain}.enable")
         self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
         self.resize(width, height)
 
-    def send(self, method: str, **given: Any) -> Any:
+    def post(self, method: str, **given: Any) -> int:
+        """Send a command without waiting for its answer, and return its number."""
         number = next(self._numbers)
         self._socket.send(json.dumps({"id": number, "method": method, "params": given}))
+        return number
+
+    def send(self, method: str, **given: Any) -> Any:
+        number = self.post(method, **given)
         while True:
             answer = json.loads(self._socket.recv(timeout=120))
+            assert "error" not in answer, answer
+            if answer.get("method") in ("Runtime.consoleAPICalled", "Runtime.exceptionThrown", "Log.entryAdded"):
+                self.console.append(answer["params"])
             if answer.get("id") == number:
-                assert "error" not in answer, answer
                 return answer["result"]
 
     def resize(self, width: int, height: int, *, mobile: bool = False) -> None:
@@ -65,12 +75,16 @@ class Tab:
         for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
             self.mouse(kind, x, y)
 
-    def drag(self, x0: float, y0: float, x1: float, y1: float) -> None:
+    def drag(self, x0: float, y0: float, x1: float, y1: float, *, seconds: float = 0.5, held_s: float = 0.0) -> None:
+        """Press, hold still, move on an arc with 60 moves a second, and release; events do not wait for answers."""
         self.mouse("mouseMoved", x0, y0)
         self.mouse("mousePressed", x0, y0)
-        for part in (0.2, 0.6, 1.0):
-            x, y = x0 + part * (x1 - x0), y0 + part * (y1 - y0)
-            self.send("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+        time.sleep(held_s)
+        for part in np.linspace(0.0, 1.0, round(60 * seconds) + 1)[1:].tolist():
+            bend = 0.1 * math.sin(math.pi * part)
+            x, y = x0 + part * (x1 - x0) + bend * (y1 - y0), y0 + part * (y1 - y0) + bend * (x0 - x1)
+            self.post("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y, button="left", buttons=1)
+            time.sleep(1 / 60)
         self.mouse("mouseReleased", x1, y1)
 
     def choose_files(self, selector: str, *paths: Path) -> None:
@@ -78,9 +92,22 @@ class Tab:
         node = self.send("DOM.querySelector", nodeId=root, selector=selector)["nodeId"]
         self.send("DOM.setFileInputFiles", nodeId=node, files=[str(path) for path in paths])
 
-    def screenshot(self, path: Path, *, whole: bool = False) -> None:
+    def faults(self) -> list[Any]:
+        """Return what the page has logged as a warning or an error, exceptions included."""
+        logged = [
+            (entry.get("type", entry.get("entry", {}).get("level", "exception")), entry) for entry in self.console
+        ]
+        return [entry for kind, entry in logged if kind not in ("log", "info", "debug", "verbose")]
+
+    def screenshot(
+        self, path: Path, *, whole: bool = False, part: tuple[float, float, float, float] | None = None
+    ) -> None:
+        """Write a PNG of the window, the whole page, or a part of it: left, top, width and height."""
         self.send("Page.bringToFront")
-        picture = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole)["data"]
+        clip = (
+            {} if part is None else {"clip": dict(zip(("x", "y", "width", "height"), part, strict=True)) | {"scale": 1}}
+        )
+        picture = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole, **clip)["data"]
         path.write_bytes(base64.b64decode(picture))
 
 

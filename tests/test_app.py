@@ -4,6 +4,7 @@ import io
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 import threading
@@ -25,8 +26,10 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 import sionna_partial as sp
-from sionna_partial.app.session import FILES, Session, Transmitter, stored_map
-from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.app import session as app_session
+from sionna_partial.app.session import FILES, Session, Transmitter
+from sionna_partial.app.uploads import stored_map
+from sionna_partial.errors import MapError, PositionError, SettingsError
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -53,7 +56,7 @@ class Window:
 
     def settle(self) -> str:
         """Do what waits until no job is left, and return the last message."""
-        end = time.monotonic() + 120.0
+        end = time.monotonic() + 600.0
         while self.session.status.fraction is not None and time.monotonic() < end:
             while self.waiting:
                 self.waiting.pop(0)()
@@ -118,16 +121,36 @@ class TestJobs:
         window.session.put([("", 1.0, 1.0)])
         assert window.settle() == "Ready."
 
-    @pytest.mark.parametrize(
-        ("place", "message"), [((2.05, 1.0), "is inside a wall"), ((9.0, 1.0), "outside the map")], ids=str
-    )
-    def test_what_cannot_be_is_said(self, window: Window, place: tuple[float, float], message: str) -> None:
-        window.session.put([("", 1.0, 1.0)])
+    def test_windows_take_turns_within_their_jobs(self, window: Window) -> None:
+        other, ended = Window(), threading.Event()
+
+        def long(report: Any) -> Iterator[Callable[[], None]]:
+            while not ended.wait(0.001):  # without turns the other window waits for ever
+                report(0.5, "working")
+            yield lambda: None
+
+        def short(report: Any) -> Iterator[Callable[[], None]]:
+            for _ in range(3):
+                report(0.5, "working")
+            yield ended.set
+
+        window.session.begin(long)
+        other.session.begin(short)
+        assert other.settle() == window.settle() == "Ready."
+        other.session.close()
+
+    def test_a_drag_keeps_the_model(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+        made: list[Any] = []
+        monkeypatch.setattr(
+            app_session, "LinkModel", lambda *given, **named: made.append(sp.LinkModel(*given, **named)) or made[-1]
+        )
+        for x_m in (1.0, 1.5, 3.0):
+            window.session.put([("tx1" if made else "", x_m, 1.0)])
+            assert window.settle() == "Ready."
+        assert len(made) == 1
+        window.session.set(frequency_hz=60e9)
         window.settle()
-        window.session.put([("tx1", *place)])
-        assert message in window.settle()
-        assert window.session.status.is_error
-        assert window.session.answer is None  # not that of the place before
+        assert len(made) == 2
 
     def test_windows_do_not_mix(self, window: Window) -> None:
         other = Window()
@@ -168,10 +191,59 @@ class TestTransmitters:
         np.testing.assert_allclose(two["p_above"], above, atol=1e-6)
         assert np.isfinite(best["sinr_mean_db"].to_numpy()[best["valid"].to_numpy()]).all()
 
+    @pytest.mark.parametrize(
+        ("place", "free"), [((2.02, 1.02), (1.95, 1.05)), ((99.0, 1.02), (4.05, 1.05))], ids=["wall", "outside"]
+    )
+    def test_one_in_a_wall_or_outside_moves_to_the_nearest_free_cell(
+        self, window: Window, place: tuple[float, float], free: tuple[float, float]
+    ) -> None:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.put([("tx1", 1.0, 1.0), ("tx2", *place)])
+        assert window.settle() == "Ready."
+        assert [each.position_m[:2] for each in window.session.transmitters.values()] == [(1.0, 1.0), free]
+        assert window.session.warnings == [
+            f"tx2 cannot be at ({place[0]:g}, {place[1]:g}): ({free[0]:g}, {free[1]:g}) is the nearest free cell."
+        ]
+        assert window.session.answer is not None
+        assert [*window.session.answer.coverage["tx"].to_numpy()] == ["tx1", "tx2"]
+        window.session.put([("tx1", 1.0, 1.2), ("tx2", *free)])
+        assert window.session.warnings == []
+        assert window.session.chosen == "tx1"
+        window.settle()
+
+    def test_a_height_above_the_ceiling_changes_nothing(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        with pytest.raises(PositionError, match="not between floor and ceiling"):
+            window.session.change("tx1", z_m=9.0)
+        assert window.session.transmitters == {"tx1": Transmitter(1.0, 1.0)}
+        assert window.session.answer is not None
+
+    def test_low_rooms(self, window: Window) -> None:
+        window.session.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
+        window.session.put([("", 1.0, 1.0)])
+        assert window.settle() == "Ready."
+        assert window.session.transmitters["tx1"].z_m == window.session.settings.rx_height_m == 0.6
+
     def test_it_is_placed(self, window: Window) -> None:
         window.session.place()
         assert window.settle() == "Ready."
         assert [*window.session.transmitters] == ["tx1"]
+
+
+def test_the_warning_of_the_predictor_stays_with_the_settings(window: Window) -> None:
+    unseen = ROOM.copy()
+    unseen[:, 30:] = 2
+    window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
+    window.session.set(frequency_hz=60e9)
+    for x_m in (1.0, 1.5):
+        window.session.put([("tx1" if window.session.transmitters else "", x_m, 1.0)])
+        window.settle()
+        (warning,) = window.session.warnings
+        assert "at 28 GHz, and is used at 60 GHz" in warning
+    window.session.set(frequency_hz=28e9)
+    window.settle()
+    assert window.session.warnings == []
 
 
 class TestRobot:
@@ -241,11 +313,53 @@ class TestFiles:
         window.settle()
         assert window.session.measured is None
 
-    def test_measurements_of_another_transmitter(self, window: Window) -> None:
+        assert "no transmitter is within" in window.session.warnings[0]
+
+    @pytest.mark.parametrize(
+        ("csv", "message"),
+        [
+            (b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n", r"move one to \(3, 1, 1.5\)"),
+            (b"x,y,rssi\n2.05,1.0,-60\n", "are in walls"),
+            (b"x,y,rssi\n70,1,-60\n", "is outside the map"),
+        ],
+        ids=["another", "walls", "outside"],
+    )
+    def test_measurements_that_are_refused_change_nothing(self, window: Window, csv: bytes, message: str) -> None:
         window.session.put([("", 1.0, 1.0)])
-        window.session.learn(b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n")
-        assert "move one to (3, 1, 1.5)" in window.settle()
+        window.settle()
+        window.session.learn(b"x,y,rssi\n1.5,2.0,-60\n3.0,2.5,-70\n")
+        window.settle()
+        before = window.session.measured, window.session.answer
+        window.session.learn(csv)
+        assert re.search(message, window.settle())
+        assert window.session.status.is_error
+        assert (window.session.measured, window.session.answer) == before
+
+    def test_measured_points_are_counted_and_forgotten(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
+        assert window.settle() == "Ready."
+        points_m, used = window.session.measured_points()
+        assert (len(points_m), used.tolist()) == (3, [True, True, False])
+        unused, offset = window.session.warnings
+        assert unused.startswith("1 of 3 measurements are not used")
+        assert "taken for an offset" in offset
+        window.session.learn(b"\xff\x00")
+        window.settle()
+        assert window.session.warnings == [unused, offset]
+        window.session.forget_measurements()
+        window.settle()
+        assert window.session.answer is not None
+        assert "measured_links" not in window.session.answer.coverage.attrs
+        assert (len(window.session.measured_points()[0]), window.session.warnings) == (0, [])
+
+    def test_measurements_with_which_nothing_can_be_predicted_are_dropped(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.session.measured = sp.Measurements((1.0, 1.0, 1.5), [(2.05, 1.0, 1.5)], [-60.0])
+        window.session.predict()
+        assert window.settle() == "Ready."
         assert window.session.measured is None
+        assert "are in walls" in window.session.warnings[0]
 
     def test_spoilt_measurements(self, window: Window) -> None:
         window.session.put([("", 1.0, 1.0)])
@@ -292,6 +406,39 @@ class TestUploads:
             stored_map(files, tmp_path)
         assert not [*tmp_path.iterdir()]
 
+    @pytest.mark.parametrize("name", ["room.yaml", "room.pgm"])
+    def test_half_of_a_ros_map(self, name: str, tmp_path: Path) -> None:
+        with pytest.raises(MapError, match=f"{name}' alone is not a map: choose the YAML and the image"):
+            stored_map([(name, b"")], tmp_path)
+
+    @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
+    def test_damaged_zip(self, method: int, tmp_path: Path) -> None:
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w", method) as archive:
+            for name, content in uploaded(tmp_path):
+                archive.writestr(name, content)
+        (tmp_path / "in").mkdir()
+        for at in range(len(packed.getvalue())):
+            damaged = bytearray(packed.getvalue())
+            damaged[at] ^= 0xFF
+            with suppress(MapError):
+                stored_map([("room.zip", bytes(damaged))], tmp_path / "in")
+
+    def test_warnings_of_a_reader_stay_with_the_map(self, window: Window, tmp_path: Path) -> None:
+        (sheet, text), (image, pixels) = uploaded(tmp_path)
+        header, grey = pixels[: -PARTIAL.state.size], bytearray(pixels[-PARTIAL.state.size :])
+        grey[:600] = bytes([205]) * 600
+        text = re.sub(rb"free_thresh: .*", b"free_thresh: 0.25", text)
+        for _ in range(2):  # Python shows the same warning of a line once
+            window.session.upload_map([(sheet, text), (image, header + grey)])
+            window.settle()
+            assert "205" in window.session.warnings[0]
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        assert "205" in window.session.warnings[0]
+        window.session.open_map(PARTIAL, "room.yaml")
+        assert window.session.warnings == []
+
     def test_images_of_the_server_are_not_read(self, window: Window, tmp_path: Path) -> None:
         (_, text), _ = uploaded(tmp_path)
         secret = text.replace(b"room.pgm", str(tmp_path / "room.pgm").encode())
@@ -320,12 +467,31 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         server.terminate()
 
 
-def status_of(url: str, data: bytes | None = None) -> int:
+def status_of(url: str | urllib.request.Request, data: bytes | None = None) -> int:
     try:
         with urllib.request.urlopen(url, data, timeout=60) as answer:
             return int(answer.status)
     except urllib.error.HTTPError as error:
         return error.code
+
+
+def window_key(url: str) -> str:
+    """Open a window, and return the key of its files."""
+    with urllib.request.urlopen(url, timeout=60) as answer:
+        return re.findall(r"/files/([\w-]+)", answer.read().decode())[0]
+
+
+def refusal(url: str, path: str, header: str) -> int:
+    """Return how the server answers to a POST of which it gets the header, and of chunks the first 0.2 MB."""
+    host, port, token = re.fullmatch(r"http://(.+):(\d+)/(.+)", url).groups()  # type: ignore[union-attr]
+    if "KEY" in path:
+        path = path.replace("KEY", window_key(url))
+    with socket.create_connection((host, int(port)), timeout=60) as connection:
+        connection.sendall(f"POST /{token}{path} HTTP/1.1\r\nHost: {host}\r\n{header}\r\n\r\n".encode())
+        with suppress(ConnectionError):
+            if "chunked" in header:
+                connection.sendall(b"30d40\r\n" + bytes(200_000) + b"\r\n")
+        return int(connection.recv(100).split()[1])
 
 
 class TestServer:
@@ -338,6 +504,34 @@ class TestServer:
     def test_files_of_no_window(self, url: str) -> None:
         assert status_of(f"{url}/files/guessed/png") == 404
         assert status_of(f"{url}/files/guessed/map", b"") == 404
+
+    @pytest.mark.parametrize("path", ["/wrong", "/files/guessed/map", "/files/KEY/wrong"])
+    @pytest.mark.parametrize("header", ["Content-Length: 190000000", "Transfer-Encoding: chunked"])
+    def test_large_bodies_are_refused_by_their_headers(self, url: str, path: str, header: str) -> None:
+        assert refusal(url, path, header) in (400, 404)
+
+    @pytest.mark.parametrize(
+        ("header", "code"),
+        [
+            ("Content-Length: 190000000", 415),
+            ("Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 202000000", 413),
+            ("Content-Type: multipart/form-data; boundary=x\r\nTransfer-Encoding: chunked", 411),
+        ],
+        ids=["type", "size", "chunked"],
+    )
+    def test_uploads_are_refused_by_their_headers(self, url: str, header: str, code: int) -> None:
+        assert refusal(url, "/files/KEY/map", header) == code
+
+    def test_an_upload(self, url: str) -> None:
+        key = window_key(url)
+        form = (
+            b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.npz"\r\n\r\n'
+            + bytes(10**6)
+            + b"\r\n--x--\r\n"
+        )
+        kind = {"Content-Type": "multipart/form-data; boundary=x"}
+        for body, code in ((form, 200), (b"--x--\r\n", 404), (b"nothing", 400)):
+            assert status_of(urllib.request.Request(f"{url}/files/{key}/map", body, kind)) == code
 
     def test_other_sites_get_no_socket(self, url: str) -> None:
         with (
@@ -383,13 +577,21 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         tab.click(*pixel(tab, 1.0, 1.0))
         tab.wait(_READY)
         before = tab.run(f"{_MODEL}('python').value")
-        for _ in range(5):  # where the machine is slow, a drag is taken for a long press
-            with suppress(TimeoutError):
-                at = tab.run(f"['x', 'y'].map(axis => {_MODEL}('points').data[axis][0])")
-                tab.drag(*pixel(tab, *at), *pixel(tab, 3.0, 2.0))
-                tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3) < 0.1", 5.0)
-                break
+        for x_m, y_m, held_s in ((3.0, 2.0, 0.0), (1.5, 2.5, 0.5), (3.0, 2.0, 0.0)):
+            at = tab.run(f"['x', 'y'].map(axis => {_MODEL}('points').data[axis][0])")
+            tab.drag(*pixel(tab, *at), *pixel(tab, x_m, y_m), held_s=held_s)
+            tab.wait(f"Math.hypot({_MODEL}('points').data.x[0] - {x_m}, {_MODEL}('points').data.y[0] - {y_m}) < 0.1")
+        tab.click(*pixel(tab, 1.0, 1.0))
+        tab.wait(f"{_MODEL}('points').data.name[1] == 'tx2' && {_READY}")
+        tab.click(*pixel(tab, 3.0, 2.0))  # what is clicked does not move with what is dragged next
+        tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 1.0, 2.5))
+        tab.wait(f"Math.abs({_MODEL}('points').data.y[1] - 2.5) < 0.1")
         assert abs(tab.run(f"{_MODEL}('points').data.x[0]") - 3.0) < 0.1
+        press(tab, "Remove")
+        tab.wait(f"{_MODEL}('points').data.name.length == 1")
+        tab.run(f"{_MODEL}('measured').data = {{x: [99], y: [1], colour: ['white']}}, 0")
+        tab.run("new Promise(done => setTimeout(done, 300))")
+        assert tab.run(f"{_MODEL}('picture').x_range.end") < 6.0  # the axes stay with the map
         tab.wait(f"{_MODEL}('python').value != {json.dumps(before)} && {_READY}")
         assert tab.run(f"{_MODEL}('points').data.name.length") == 1
         links = re.findall('href="([^"]+)"', tab.run(f"{_MODEL}('links').text"))

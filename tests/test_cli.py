@@ -280,7 +280,7 @@ class TestHelp:
     def test_package_is_a_command(self) -> None:
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
         command = [sys.executable, "-m", "sionna_partial", "--version"]
-        assert subprocess.check_output(command, env=environment, text=True, timeout=60) == f"{__version__}\n"
+        assert subprocess.check_output(command, env=environment, text=True, timeout=600) == f"{__version__}\n"
 
     def test_position_is_shown_as_it_is_typed(self) -> None:
         assert "--tx X Y [Z]" in run("predict", "--help").stdout

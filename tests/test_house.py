@@ -76,7 +76,7 @@ ROOMS = {
         *("material_plot", "placement_plot", "evaluation_plot"),
     ),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("session", "page", "server"),
+    "app": ("jobs", "uploads", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }
@@ -176,7 +176,7 @@ def modules_after(*steps: str) -> list[set[str]]:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, sys.path)])}
     loaded = "[name + '.' * hasattr(each, '__path__') for name, each in sys.modules.items()]"
     code = "\n".join(["import sys, json", *(f"{step}\nprint(json.dumps({loaded}))" for step in steps)])
-    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=60)
+    result = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=600)
     assert result.returncode == 0, result.stderr
     return [set(json.loads(line)) for line in result.stdout.splitlines() if line.startswith("[")]
 

@@ -47,7 +47,7 @@ robot = dds.Dds(Topics(map="/unused"), {})
 writer = robot._writer("/map", GRID_TYPE)
 writer.write(dds.filled(GRID_TYPE, GRID))
 reader = robot._reader("/radio/tx", GRID_TYPE, True)
-for _ in range(3000):
+for _ in range(30_000):
     for each in reader.take(1):
         print(each.header.frame_id, each.info.width, *each.data, flush=True)
     time.sleep(0.02)
@@ -94,7 +94,7 @@ class TestDds:
                 assert [int(each) for each in cost][:5] == [-1] * 5
                 robot.kill()  # a robot that disappears
                 live.send_signal(signal.SIGINT)
-                output, errors = live.communicate(timeout=30)
+                output, errors = live.communicate(timeout=600)
             finally:
                 robot.kill()
                 live.kill()

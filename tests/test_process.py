@@ -31,13 +31,13 @@ class TestSignals:
         code = COMMAND + (
             "from sionna_partial.process import own_folder, end_at_signals; from pathlib import Path; import time\n"
             "end_at_signals()\n"
-            "with own_folder(Path(sys.argv[1]) / 'new', 'x'):\n    Path(sys.argv[1], 'ready').touch(); time.sleep(60)"
+            "with own_folder(Path(sys.argv[1]) / 'new', 'x'):\n    Path(sys.argv[1], 'ready').touch(); time.sleep(600)"
         )
         process = python(code, tmp_path)
         while not (tmp_path / "ready").exists():
             time.sleep(0.02)
         process.send_signal(number)
-        _, errors = process.communicate(timeout=30.0)
+        _, errors = process.communicate(timeout=600.0)
         assert (process.returncode, errors) == (128 + number, "interrupted\n")
         assert [path.name for path in tmp_path.iterdir()] == ["ready"]
 
@@ -47,7 +47,7 @@ class TestSignals:
             "        name == 'typer' and signal.raise_signal(signal.SIGINT)\nsys.meta_path.insert(0, Press)\n" + COMMAND
         )
         process = python(code)
-        assert (process.communicate(timeout=60.0)[1], process.returncode) == ("interrupted\n", 130)
+        assert (process.communicate(timeout=600.0)[1], process.returncode) == ("interrupted\n", 130)
 
     def test_held_signals_come_later(self) -> None:
         done = False
@@ -60,7 +60,7 @@ class TestSignals:
 
 def test_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
     code = "import sys, time; from pathlib import Path; from sionna_partial.process import own_folder\n"
-    code += "with own_folder(Path(sys.argv[1]), 'left_'):\n    print(flush=True); time.sleep(60)"
+    code += "with own_folder(Path(sys.argv[1]), 'left_'):\n    print(flush=True); time.sleep(600)"
     process = python(code, tmp_path, stdout=subprocess.PIPE)
     assert process.stdout
     process.stdout.readline()

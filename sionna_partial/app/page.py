@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, Answer, Session
+from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
@@ -40,6 +40,9 @@ _TOOLTIPS = (
 )
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
+_UNSELECT = "points.selection_manager.clear()"
+"""Ends the selection by a click, or the next drag would move what was clicked as well."""
+
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
 const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
@@ -56,25 +59,26 @@ TEMPLATE = """\
 <meta name="referrer" content="no-referrer">
 <style>
   body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
-  main { display: grid; grid-template-columns: minmax(0, 1fr) 21rem; gap: 1rem; max-width: 90rem;
-    margin: auto; padding: 0.8rem;
-    box-sizing: border-box }
-  h1 { font-size: 1.15rem; margin: 0; grid-column: 1 / -1 }
+  main { display: grid; grid-template: "title title" auto "map status" auto "map controls" 1fr / minmax(0, 1fr) 21rem;
+    gap: 0 1rem; max-width: 90rem; margin: auto; padding: 0.8rem; box-sizing: border-box }
+  #status { grid-area: status } #picture { grid-area: map } #controls { grid-area: controls }
+  h1 { font-size: 1.15rem; margin: 0 0 1rem; grid-area: title }
   h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
   section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.7rem; margin-bottom: 0.8rem }
-  @media (max-width: 52rem) { main { grid-template-columns: minmax(0, 1fr); padding: 0.4rem } }
+  @media (max-width: 52rem) { main { padding: 0.4rem;
+    grid-template: "title" auto "status" auto "map" auto "controls" auto / minmax(0, 1fr) } }
 </style>
 {% endblock %}
 {% block contents %}
 <main>
   <h1>Radio coverage of a partly known building</h1>
-  <div>
-    <section aria-label="Status">{{ embed(roots.status) }}</section>
+  <section id="status" aria-label="Status">{{ embed(roots.status) }}</section>
+  <div id="picture">
     <section aria-label="Map with transmitters and coverage">{{ embed(roots.choices) }}
-      {{ embed(roots.picture) }}</section>
+      {{ embed(roots.picture) }}{{ embed(roots.summary) }}</section>
     <section aria-labelledby="files"><h2 id="files">Download and repeat</h2>{{ embed(roots.files) }}</section>
   </div>
-  <div>
+  <div id="controls">
     <section aria-labelledby="map"><h2 id="map">Map</h2>{{ embed(roots.map) }}</section>
     <section aria-labelledby="tx"><h2 id="tx">Transmitters</h2>{{ embed(roots.transmitters) }}</section>
     <section aria-labelledby="radio"><h2 id="radio">Radio</h2>{{ embed(roots.radio) }}</section>
@@ -84,6 +88,9 @@ TEMPLATE = """\
 <input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
 <input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
 <script>
+  try { // a pause before a drag is no long press, which no tool here takes
+    Bokeh.require("core/ui_gestures").UIGestures.press_threshold = 2 ** 30
+  } catch { console.info("A drag begins within 0.3 s.") }
   const labels = {
     "noUi-handle": "Threshold [dBm]", "bk-spin-btn-up": "more", "bk-spin-btn-down": "less",
     "bk-events": "Map; the fields x and y move its transmitters",
@@ -142,7 +149,7 @@ class Page:
     # What is made once
 
     def _make_picture(self) -> None:
-        from bokeh.models import ColumnDataSource, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
+        from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
         from bokeh.plotting import figure
 
         self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
@@ -150,6 +157,7 @@ class Page:
         self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
         self._aims = ColumnDataSource({"xs": [], "ys": []})
         self._routes = ColumnDataSource({"xs": [], "ys": []})
+        self._measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
         self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
         plot: Any = figure(
             x_range=DataRange1d(range_padding=0.02),
@@ -169,19 +177,20 @@ class Page:
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
         walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
-        plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
+        ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
+        plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self._values, **where}
         self._parts = {
             name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
+        plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self._routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self._aims, line_color="black", line_width=4)
-        points = plot.scatter(
-            "x", "y", source=self._points, marker="star", size=24, fill_color="colour", line_color="black"
-        )
+        look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
+        points = plot.scatter("x", "y", source=self._points, marker="star", **look)
         plot.text("x", "y", text="name", source=self._points, x_offset=13, **_LABEL)
         tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
         hover = HoverTool(
@@ -191,6 +200,7 @@ class Page:
         )
         plot.add_tools(hover, tool)
         plot.toolbar.active_tap = tool
+        plot.js_on_event("tap", CustomJS(args={"points": self._points}, code=_UNSELECT))
         self._points.on_change("data", self._on_points)
         self._points.selected.on_change("indices", self._on_selected)
 
@@ -218,6 +228,7 @@ class Page:
         self.message = Div(
             name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
         )
+        self.warnings = Div(name="warnings", sizing_mode="stretch_width", html_attributes={"role": "status"})
         self.summary = Div(name="summary", sizing_mode="stretch_width")
         self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
 
@@ -275,6 +286,7 @@ class Page:
                 ("spacing_m", "Between receivers [m]", 1.0, 0.05, 0.05, 10),
             )
         }
+        self.measured_text = Div(name="measured_text", sizing_mode="stretch_width")
         self.links = Div(name="links", sizing_mode="stretch_width", stylesheets=[_LINKS])
         self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
 
@@ -300,13 +312,15 @@ class Page:
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
         copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
+        self.forget = self._button("Forget the measurements", lambda: session.forget_measurements())
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing = self.radio.values()
         return {
-            "status": column(row(self.message, self.cancel, sizing_mode="stretch_width"), sizing_mode="stretch_width"),
-            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth), self.summary),
-            "picture": self.plot,
+            "status": wide(row(self.message, self.cancel), self.warnings),
+            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth)),
+            "picture": self.plot,  # nothing above it changes its height with an answer: a drag would miss
+            "summary": self.summary,
             "map": wide(self.example, upload_map, self.map_text),
             "transmitters": wide(
                 pair(self.chosen, self.name),
@@ -320,7 +334,13 @@ class Page:
                 self._button("Place it for me", lambda: session.place(), button_type="primary"),
             ),
             "radio": wide(pair(frequency, bandwidth), self.walls, pair(height, spacing)),
-            "robot": wide(self.more, self._button("Best next views", lambda: session.find_views()), upload_csv),
+            "robot": wide(
+                self.more,
+                self._button("Best next views", lambda: session.find_views()),
+                upload_csv,
+                self.measured_text,
+                self.forget,
+            ),
             "files": wide(self.links, self.python, copy),
         }
 
@@ -359,10 +379,9 @@ class Page:
             self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
 
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
-        """Choose what is clicked; nothing stays selected, or it would be dragged with the next one."""
+        """Choose the transmitter that is clicked or dragged. To clear the selection here would end a drag."""
         if new and not self._is_showing:
             self._choose(self._points.data["name"][new[-1]])
-            self._points.selected.indices = []
 
     def _open_example(self, name: str) -> None:
         if name:
@@ -395,6 +414,7 @@ class Page:
             self._show_status()
             self._once("map", (self.session.partial, self.session.title, self.session.steps), self._show_map)
             self._show_transmitters()
+            self._show_measured()
             self._show_answer()
             self._once("views", (self.session.views,), self._show_views)
         finally:
@@ -414,6 +434,8 @@ class Page:
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None
+        self.warnings.text = "<br>".join(f"<b>Note:</b> {html.escape(each)}" for each in self.session.warnings)
+        self.warnings.visible = bool(self.session.warnings)
 
     def _show_map(self) -> None:
         partial, session = self.session.partial, self.session
@@ -436,16 +458,14 @@ class Page:
         names = [*session.transmitters]
         each = [*session.transmitters.values()]
         colours = server_codes(MOST_TRANSMITTERS)
-        rows = {
+        rows: dict[str, Any] = {
             "x": [tx.x_m for tx in each],
             "y": [tx.y_m for tx in each],
             "name": names,
             "colour": colours[: len(names)],
         }
-        self._once(
-            "points", (repr(rows), repr(self._points.data)), functools.partial(setattr, self._points, "data", rows)
-        )
-        self._drawn["points"] = repr(rows), repr(self._points.data)
+        if not _are_drawn(rows, self._points.data):
+            self._points.data = rows
         self.chosen.options, self.chosen.value = [*names], session.chosen
         self.name.value = session.chosen
         chosen = session.transmitters.get(session.chosen)
@@ -471,6 +491,19 @@ class Page:
         self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
         self.python.value = session.python()
 
+    def _show_measured(self) -> None:
+        session = self.session
+        self.measured_text.visible = self.forget.visible = session.measured is not None
+        key = session.measured, session.partial, repr(session.transmitters), session.settings.frequency_hz
+        self._once("measured", key, self._show_points)
+
+    def _show_points(self) -> None:
+        rx_m, used = self.session.measured_points()
+        colours = [_USED if each else _UNUSED for each in used]
+        self._measured.data = {"x": rx_m[:, 0], "y": rx_m[:, 1], "colour": colours}
+        unused = f", {(~used).sum()} of them not used (white)" if not used.all() else ""
+        self.measured_text.text = f"{len(used)} measured points{unused}"
+
     def _aimed(self) -> dict[str, list[list[float]]]:
         """Return lines from transmitters with a main direction along it [m]."""
         partial, lines = self.session.partial, []
@@ -494,13 +527,13 @@ class Page:
         self._once("answer", (answer, name, threshold_dbm, self.truth.value), self._show_values)
         for layer, parts in self._parts.items():
             for part in parts:
-                part.visible = layer == self.layer.value and answer is not None
+                part.visible = layer == self.layer.value
         title = _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
         if answer is not None and not answer.is_final:
             title += " (coarse)"
         elif answer is not None and self.truth.value:
             title += ", the whole home" if answer.truth is not None else ", the partial map"
-        self.plot.title.text = "" if answer is None else title
+        self.plot.title.text = "Map" if answer is None else title
 
     def _show_values(self) -> None:
         answer, session = self.session.answer, self.session
@@ -547,10 +580,19 @@ _LABEL: dict[str, Any] = {
     "background_fill_alpha": 0.75,
 }
 _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
+_USED, _UNUSED = "#ee6677", "#ffffff"
+"""Colours of measured points."""
+
 _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
     "a { display: inline-block; padding: 0.25em 0.7em; margin: 0.15em; border: 1px solid #93a1b0; border-radius: 6px }"
 )
+
+
+def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
+    """Return whether the page has these transmitters, up to rounding: to send them again would disturb a drag."""
+    same = all([*drawn[name]] == rows[name] for name in ("name", "colour"))
+    return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:

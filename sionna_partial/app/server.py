@@ -3,11 +3,12 @@
 import functools
 import secrets
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from sionna_partial.app.page import TEMPLATE, Page
-from sionna_partial.app.session import FILES, MAP_SUFFIXES, MOST_BYTES, Session
+from sionna_partial.app.session import FILES, Session
+from sionna_partial.app.uploads import MOST_BYTES, UPLOADED_SUFFIXES
 from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 
@@ -15,6 +16,12 @@ LOOPBACK = "127.0.0.1"
 """Address that programs of this machine alone reach."""
 
 _FIRST_EXAMPLE = "apartment"
+
+_OTHER_BYTES = 100_000
+"""Size of the body of a request that is no upload to an open window: a larger one ends the connection [bytes]."""
+
+_FORM_BYTES = 1_000_000
+"""Size of an upload besides its files [bytes]."""
 
 
 class AppServer:
@@ -29,6 +36,8 @@ class AppServer:
         Of the interface that is listened at.
     port : int
         0 is any free one.
+    warnings : sequence of str
+        Warnings of the reader of the map, which the page shows.
 
     Attributes
     ----------
@@ -42,13 +51,21 @@ class AppServer:
     """
 
     def __init__(
-        self, partial: PartialMap | None = None, title: str = "", address: str = LOOPBACK, port: int = 0
+        self,
+        partial: PartialMap | None = None,
+        title: str = "",
+        address: str = LOOPBACK,
+        port: int = 0,
+        warnings: Sequence[str] = (),
     ) -> None:
         from bokeh.application import Application
         from bokeh.application.handlers.function import FunctionHandler
         from bokeh.server.server import Server
 
-        self._map, self._sessions, self._token = (partial, title), dict[str, Session](), secrets.token_urlsafe(24)
+        self._sessions, self._token = dict[str, Session](), secrets.token_urlsafe(24)
+        self._open_first = functools.partial(Session.open_example, name=_FIRST_EXAMPLE)
+        if partial is not None:
+            self._open_first = functools.partial(Session.open_map, partial=partial, title=title, warnings=warnings)
         path = f"/{self._token}"
         hosts = {address, socket.gethostname()} | ({"localhost"} if address == LOOPBACK else set())
         try:
@@ -62,7 +79,7 @@ class AppServer:
                 extra_patterns=[(rf"{path}/files/([\w-]+)/(\w+)", _files_handler(), {"sessions": self._sessions})],
                 use_index=False,
                 redirect_root=False,
-                http_server_kwargs={"max_buffer_size": MOST_BYTES + 10**6, "max_body_size": MOST_BYTES + 10**6},
+                http_server_kwargs={"max_body_size": _OTHER_BYTES},
             )
         except OSError as error:
             remedy = "choose another --port, or an --address of this machine."
@@ -91,7 +108,7 @@ class AppServer:
             {
                 "files_url": files_url,
                 "most_bytes": MOST_BYTES,
-                "map_suffixes": ",".join((*MAP_SUFFIXES, ".pgm", ".png", ".bmp", ".zip")),
+                "map_suffixes": ",".join(UPLOADED_SUFFIXES),
             }
         )
 
@@ -100,22 +117,53 @@ class AppServer:
             session.close()
 
         document.on_session_destroyed(close)
-        partial, title = self._map
-        if partial is None:
-            session.open_example(_FIRST_EXAMPLE)
-        else:
-            session.open_map(partial, title)
+        self._open_first(session)
 
 
 def _files_handler() -> Any:
+    from tornado.httputil import HTTPFile, HTTPInputError, parse_body_arguments
     from tornado.ioloop import IOLoop
-    from tornado.web import RequestHandler
+    from tornado.web import RequestHandler, stream_request_body
 
+    @stream_request_body
     class Files(RequestHandler):
         """Files that a window sends and fetches; `key` is known to that window alone."""
 
         def initialize(self, sessions: dict[str, Session]) -> None:
-            self._sessions = sessions
+            self._sessions, self._chunks = sessions, list[bytes]()
+            self._receiver: Session | None = None
+
+        def prepare(self) -> None:
+            """Refuse an upload by its header, before anything of its body is read."""
+            if self.request.method != "POST":
+                return
+            key, kind = self.path_args
+            session, size = self._sessions.get(key), self.request.headers.get("Content-Length", "")
+            if session is None or kind not in ("map", "measurements"):
+                self._refuse(404, "There is nothing to send, or the window was closed.")
+            elif not size.isdecimal():
+                self._refuse(411, "The size of an upload has to be in its header.")
+            elif int(size) > MOST_BYTES + _FORM_BYTES:
+                self._refuse(413, f"An upload may have {MOST_BYTES:,} bytes.")
+            elif not self.request.headers.get("Content-Type", "").startswith("multipart/form-data"):
+                self._refuse(415, "An upload has to be a form with files.")
+            elif session.is_receiving:
+                self._refuse(409, "Another upload of this window is under way: wait for its end.")
+            else:
+                session.is_receiving, self._receiver = True, session
+                self.request.connection.set_max_body_size(MOST_BYTES + _FORM_BYTES)  # type: ignore[union-attr]
+
+        def data_received(self, chunk: bytes) -> None:
+            """Keep a part of an upload that `prepare` has accepted."""
+            if self._receiver is not None:
+                self._chunks.append(chunk)
+
+        def on_finish(self) -> None:
+            """Let the window send again."""
+            if self._receiver is not None:
+                self._receiver.is_receiving = False
+
+        on_connection_close = on_finish
 
         def _refuse(self, code: int, text: str) -> None:
             self.set_status(code)
@@ -139,9 +187,17 @@ def _files_handler() -> Any:
             await self.finish(content)
 
         async def post(self, key: str, kind: str) -> None:
+            form: dict[str, list[HTTPFile]] = {}
+            body = b"".join(self._chunks)
+            self._chunks.clear()
+            try:
+                parse_body_arguments(self.request.headers["Content-Type"], body, {}, form)
+            except HTTPInputError as error:
+                self._refuse(400, f"The upload cannot be read: {error}")
+                return
+            files = [(each.filename, each.body) for each in form.get("file", [])]
             session = self._sessions.get(key)
-            files = [(each.filename, each.body) for each in self.request.files.get("file", [])]
-            if session is None or kind not in ("map", "measurements") or not files:
+            if session is None or not files:
                 self._refuse(404, "There is nothing to send, or the window was closed.")
                 return
             take = session.upload_map if kind == "map" else session.learn

@@ -7,11 +7,11 @@ import logging
 import math
 import re
 import tempfile
-import threading
 import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePath
 from typing import Annotated, Any
@@ -19,31 +19,27 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
-from sionna_partial.arrays import Floats
+from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
+from sionna_partial.app.uploads import uploaded_map
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Checked, Progress, Within, require, require_choice, shown
-from sionna_partial.constants import (
-    BAG_SUFFIXES,
-    CARRIER_FREQUENCY_HZ,
-    DEFAULT_HEIGHT_M,
-    DRAWING_SUFFIXES,
-    GAIN_FLOOR_DB,
-    IFC_SUFFIXES,
-    MESH_SUFFIXES,
-    POINT_SUFFIXES,
-    CellState,
-)
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
 from sionna_partial.coverage.network import network_map
-from sionna_partial.errors import MapError, PositionError, SettingsError, SionnaPartialError
+from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.export import save_coverage, save_network
-from sionna_partial.files import unzipped
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.ros_map import read_ros_map
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, load_measurements
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
+from sionna_partial.measurements.measurements import (
+    SAME_TX_M,
+    Measurements,
+    can_be_used,
+    load_measurements,
+    measurements_of_each,
+)
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -55,11 +51,11 @@ from sionna_partial.tracing.antennas import Antenna
 COARSER = 4
 """Distance between the receivers of the first picture, in those of the final one."""
 
-MOST_BYTES = 200_000_000
-"""Size of the files that are uploaded together [bytes]."""
-
 MOST_TRANSMITTERS = 10
 """Number of transmitters of one window."""
+
+ROUNDING_M = 0.006
+"""Distance up to which a position of the picture is the same as a rounded one [m]."""
 
 FIRST_STEPS, MORE_STEPS = 100, 50
 """Steps of the simulated robot when an example is opened, and at each request."""
@@ -74,21 +70,9 @@ FILES = {
 }
 """Kinds of files that can be downloaded, and their names."""
 
-_FINEST_M, _MOST_RECEIVERS = 0.15, 30_000
-
-_IMAGES, _SHEETS = (".pgm", ".png", ".bmp"), (".yaml", ".yml")
-
-MAP_SUFFIXES = (*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES)
-"""Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
-
-_ONE_AT_A_TIME = ThreadPoolExecutor(1, "coverage of the app")
-"""Windows take turns: one picture each."""
+_FINEST_M, _MOST_RECEIVERS, _NEAREST_CELLS = 0.15, 30_000, 1000
 
 _log = logging.getLogger(__name__)
-
-
-class _CancelledError(Exception):
-    """A job that is not wanted any more."""
 
 
 @dataclass(frozen=True)
@@ -173,28 +157,6 @@ class Answer:
         return float((states[0] == states[1]).mean()), math.sqrt(float(np.mean((gains_db[0] - gains_db[1]) ** 2)))
 
 
-@dataclass(frozen=True)
-class Status:
-    """What the page shows: a message, the fraction of the work that is done or None, and whether it is an error."""
-
-    message: str = ""
-    fraction: float | None = None
-    is_error: bool = False
-
-
-class _Job:
-    """A piece of work, which ends at its next report when it is cancelled."""
-
-    def __init__(self, tell: Callable[["_Job", float, str], None]) -> None:
-        self.is_cancelled = threading.Event()
-        self._tell = tell
-
-    def report(self, fraction: float, message: str) -> None:
-        if self.is_cancelled.is_set():
-            raise _CancelledError
-        self._tell(self, fraction, message)
-
-
 class Session:
     """State of one window. Its methods are called in one thread; what takes time is computed in another.
 
@@ -211,8 +173,10 @@ class Session:
     def __init__(self, call: Callable[[Callable[[], None]], object], show: Callable[[], None]) -> None:
         self._call, self._show = call, show
         self._waiting: deque[Callable[[], None]] = deque()
-        self._job: _Job | None = None
-        self._models: dict[str, LinkModel] = {}
+        self._job: Job | None = None
+        self._worker = ThreadPoolExecutor(1, "coverage of a window")
+        self._models: dict[str, tuple[LinkModel, list[str]]] = {}
+        self._warnings: dict[str, list[str]] = {"map": [], "act": [], "job": []}
         self.partial: PartialMap | None = None
         self.home: PartialMap | None = None
         self.title, self.steps, self._seed = "", 0, 0
@@ -225,6 +189,7 @@ class Session:
         self._is_outdated = False
         self.views: NextViews | None = None
         self.status = Status()
+        self.is_receiving = False
 
     def do(self, function: Callable[[], None]) -> None:
         """Run a function in the thread of the session, after those that wait; called in any thread."""
@@ -239,6 +204,15 @@ class Session:
         """Cancel what is computed, and compute nothing any more."""
         self.cancel()
         self._call = lambda function: None
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Warnings of the map, of what was done last, of the predictor, and of the answer and what followed it."""
+        on_networks = self.partial is not None and not self.partial.is_complete
+        of_models = [warning for _, found in [*self._models.values()] for warning in found if on_networks]
+        found = [*self._warnings["map"], *self._warnings["act"], *of_models, *self._warnings["job"]]
+        return list(dict.fromkeys(found))
 
     def cancel(self) -> None:
         """End the job, if there is one."""
@@ -254,10 +228,10 @@ class Session:
 
     # Maps
 
-    def open_map(self, partial: PartialMap, title: str) -> None:
-        """Take a map, with no transmitter yet."""
+    def open_map(self, partial: PartialMap, title: str, warnings: Sequence[str] = ()) -> None:
+        """Take a map, with no transmitter yet, and the warnings of its reader."""
         self._take_map(partial, title, [f"partial = sp.load_map({title!r})"])
-        self.home = None
+        self.home, self._warnings["map"] = None, [*warnings]
         self.predict()
 
     def open_example(self, name: str) -> None:
@@ -290,11 +264,10 @@ class Session:
                 f'home = sp.load_map("scenes/{name}/complete/map.yaml")',
                 f"partial = sp.explore(home, steps=({total},), seed={seed})[0]",
             ]
-            transmitters, measured = self.transmitters, self.measured
+            transmitters, chosen, measured = self.transmitters, self.chosen, self.measured
             self._take_map(partial, name, lines)
-            self.steps, self.transmitters, self.measured = total, transmitters, measured
-            self.chosen = next(iter(transmitters), "")
-            self.predict()
+            self.steps, self.chosen, self.measured = total, chosen, measured
+            self._take_transmitters(transmitters)
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             partial = explore_trajectory(home, (total,), seed, progress=report).maps[0]
@@ -308,17 +281,19 @@ class Session:
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, f"reading {title}")
-            with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-                path = stored_map(files, Path(folder))
-                partial = read_ros_map(path, confined=True) if path.suffix in _SHEETS else load_map(path)
-            yield functools.partial(self.open_map, partial, title)
+            with collected_warnings() as warnings:
+                partial = uploaded_map(files)
+            yield functools.partial(self.open_map, partial, title, warnings)
 
         self.begin(work)
 
     def _take_map(self, partial: PartialMap, title: str, python: list[str]) -> None:
         self.partial, self.title, self._python_map = partial, title, python
+        self._warnings = {"map": [], "act": [], "job": []}
         self.transmitters, self.chosen, self.measured, self.views, self.answer = {}, "", None, None, None
-        x0, y0, x1, y1 = partial.bounds_m
+        (x0, y0, x1, y1), (low_m, high_m) = partial.bounds_m, partial.height_range_m
+        if not low_m < self.settings.rx_height_m < high_m:
+            self.settings = replace(self.settings, rx_height_m=self._usual_height_m())
         steps = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / _MOST_RECEIVERS) / 0.05)
         self.settings = replace(self.settings, spacing_m=max(_FINEST_M, round(0.05 * steps, 2)))
 
@@ -333,10 +308,19 @@ class Session:
             old = self.transmitters.get(name)
             name = name if old else self._new_name([*self.transmitters, *found])
             x_m, y_m = round(float(x_m), 2), round(float(y_m), 2)
-            if old is None or (x_m, y_m) != (old.x_m, old.y_m):
-                self.chosen = name
-            found[name] = replace(old, x_m=x_m, y_m=y_m) if old else Transmitter(x_m, y_m)
-        self._take_transmitters(found)
+            if old is None:
+                self.chosen, found[name] = name, Transmitter(x_m, y_m, self._usual_height_m())
+            elif max(abs(x_m - old.x_m), abs(y_m - old.y_m)) > ROUNDING_M:
+                self.chosen, found[name] = name, replace(old, x_m=x_m, y_m=y_m)
+            else:
+                found[name] = old
+        if found != self.transmitters:  # a drag of the picture moves none
+            self._take_transmitters(found)
+
+    def _usual_height_m(self) -> float:
+        """Return the height of a new transmitter [m], half that of the rooms where they are low or not at z = 0."""
+        low_m, high_m = self._map().height_range_m
+        return DEFAULT_HEIGHT_M if low_m < DEFAULT_HEIGHT_M < high_m else round((low_m + high_m) / 2.0, 2)
 
     def add(self) -> None:
         """Put a transmitter into the middle of the free cell that is nearest to that of the map."""
@@ -376,15 +360,53 @@ class Session:
             self.predict()
 
     def _take_transmitters(self, transmitters: dict[str, Transmitter]) -> None:
-        self.transmitters, self.views = transmitters, None
-        if self.chosen not in transmitters:
-            self.chosen = next(iter(transmitters), "")
-        self.measured = self.measured if self.measured is not None and self._is_of_ours(self.measured) else None
+        """Predict for transmitters; one that is in a wall or outside the map moves to the nearest free cell."""
+        placed = {name: self._placed(each) for name, each in transmitters.items()}
+        self._warnings["act"] = [
+            f"{name} cannot be at ({old.x_m:g}, {old.y_m:g}): ({new.x_m:g}, {new.y_m:g}) is the nearest free cell."
+            for (name, old), new in zip(transmitters.items(), placed.values(), strict=True)
+            if new is not old
+        ]
+        self.transmitters, self.views = placed, None
+        if self.chosen not in placed:
+            self.chosen = next(iter(placed), "")
+        if self.measured is not None and not self._are_ours(self.measured).any():
+            self.measured = None
+            self._warnings["act"].append(
+                f"The measurements are not used any more: no transmitter is within {SAME_TX_M:g} m of theirs."
+            )
         self.predict()
 
-    def _is_of_ours(self, measured: Measurements) -> bool:
-        positions_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
-        return bool((np.linalg.norm(measured.tx[:, None] - positions_m, axis=2) <= SAME_TX_M).any())
+    def _placed(self, transmitter: Transmitter) -> Transmitter:
+        """Return a transmitter where it can be, itself if that is where it is; its height must be right."""
+        partial, at_m = self._map(), np.array(transmitter.position_m)
+        if partial.radios_can_stand(at_m[None])[0]:
+            return transmitter
+        free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
+        free_m = free_m[np.hypot(*(free_m - at_m[:2]).T).argsort()[:_NEAREST_CELLS]]
+        allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
+        if not allowed.any():
+            partial.require_positions("the transmitter", at_m)
+        x_m, y_m = free_m[allowed.argmax()].round(3).tolist()
+        return replace(transmitter, x_m=x_m, y_m=y_m)
+
+    def _are_ours(self, measured: Measurements) -> Bools:
+        """Return whether each of the measured links (N,) is of a transmitter of this window."""
+        tx_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
+        return np.asarray((np.linalg.norm(measured.tx[:, None] - tx_m, axis=2) <= SAME_TX_M).any(axis=1))
+
+    def measured_points(self) -> tuple[Floats, Bools]:
+        """Return the receivers (N, 3) of the measurements [m], and whether each is used (N,)."""
+        measured, tx_m = self.measured, np.array([each.position_m for each in self.transmitters.values()])
+        if measured is None or self.partial is None:
+            return np.empty((0, 3)), np.empty(0, dtype=bool)
+        used = can_be_used(self.partial, tx_m, measured.rx, self.settings.frequency_hz)
+        return measured.rx, used & self._are_ours(measured)
+
+    def forget_measurements(self, *warnings: str) -> None:
+        """Predict without measurements."""
+        self.measured, self._warnings["act"] = None, [*warnings]
+        self.predict()
 
     def _new_name(self, taken: Sequence[str]) -> str:
         return next(name for name in map("tx{}".format, itertools.count(1)) if name not in taken)
@@ -419,7 +441,7 @@ class Session:
             model = self._model(of, where, settings)
             return model.coverage(tx_m, spacing_m=spacing_m, progress=report, **of_all, **given)
 
-        def work(report: Progress) -> Iterator[Callable[[], None]]:
+        def steps(report: Progress) -> Iterator[Callable[[], None]]:
             coarse_m = COARSER * settings.spacing_m
             found = coverage("map", partial, coarse_m, part_of(report, 0.0, 0.2), measurements=measured)
             answer = Answer(found, eirp_dbm, settings, is_final=False)
@@ -435,13 +457,19 @@ class Session:
                 truth = coverage("home", home, settings.spacing_m, part_of(report, 0.75, 1.0))
                 yield functools.partial(self._take_answer, replace(answer, truth=truth))
 
+        def work(report: Progress) -> Iterator[Callable[[], None]]:
+            try:
+                yield from steps(report)
+            except MeasurementError as error:
+                yield functools.partial(self.forget_measurements, f"The measurements are not used any more: {error}")
+
         self._is_outdated = True
         self.begin(work)
 
     def place(self) -> None:
         """Move the chosen transmitter, or put the first one, to where it covers most."""
         partial, settings, name = self._map(), self.settings, self.chosen
-        old = self.transmitters.get(name, Transmitter(0.0, 0.0))
+        old = self.transmitters.get(name, Transmitter(0.0, 0.0, self._usual_height_m()))
         threshold_db = float(np.clip(settings.threshold_dbm - old.eirp_dbm, GAIN_FLOOR_DB + 1.0, 0.0))
 
         def take(position_m: Floats) -> None:
@@ -481,16 +509,11 @@ class Session:
 
     def learn(self, content: bytes) -> None:
         """Take measured gains or powers, a CSV; those that name no transmitter are of the chosen one."""
-        tx_m = dict(self._tx_m())[self.chosen]
+        partial, all_m, tx_m = self._map(), self._tx_m(), self._tx_m()[self.chosen]
+        frequency_hz = self.settings.frequency_hz
 
         def take(measured: Measurements) -> None:
-            if not self._is_of_ours(measured):
-                position = ", ".join(f"{each:g}" for each in measured.tx[0])
-                remedy = f"move one to ({position}), where that of the first one is."
-                self.cancel()
-                self.refuse(f"no transmitter is within {SAME_TX_M:g} m of those of the measurements: {remedy}")
-                return
-            self.measured = measured
+            self.measured, self._warnings["act"] = measured, []
             self.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
@@ -501,59 +524,79 @@ class Session:
                 measured = load_measurements(path)
                 if not measured.tx_known.any():
                     measured = load_measurements(path, tx=tx_m)
+            if not self._are_ours(measured).any():
+                position = ", ".join(f"{each:g}" for each in measured.tx[0])
+                raise MeasurementError(
+                    f"the measurements are of no transmitter within {SAME_TX_M:g} m: move one to ({position}), "
+                    "the first position in the file."
+                )
+            measurements_of_each(partial, [np.array([each_m]) for each_m in all_m.values()], measured, frequency_hz)
             yield functools.partial(take, measured)
 
         self.begin(work)
 
     def _model(self, of: str, partial: PartialMap, settings: RadioSettings) -> LinkModel:
         """Return the warm model of the map, or of the home; called by jobs alone."""
-        model = self._models.get(of)
+        model, warnings = self._models.get(of, (None, []))
         if model is None or model.simulation.trace_settings != settings.trace_settings:
-            model = self._models[of] = LinkModel(partial, trace_settings=settings.trace_settings)
-        model.update(partial)
+            model, warnings = self._models[of] = LinkModel(partial, trace_settings=settings.trace_settings), []
+        with collected_warnings(warnings):  # the predictor's is logged once for a model, whichever job comes first
+            model.update(partial)
+            _ = model.predictor_of_map
         return model
 
     def begin(self, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
         """Start a job and cancel the one before: it yields what is to be done in the session's thread."""
         if self._job is not None:
             self._job.is_cancelled.set()
-        job = self._job = _Job(self._tell)
+        job = self._job = Job(self._tell)
         self.status = Status("Waiting", 0.0)
         self._show()
-        _ONE_AT_A_TIME.submit(self._advance, job, work(job.report))
+        with suppress(RuntimeError):  # a window that was closed computes nothing
+            self._worker.submit(self._run, job, work)
 
-    def _advance(self, job: _Job, found: Iterator[Callable[[], None]]) -> None:
-        """Compute up to the next thing that a job finds, and let those of other windows have their turn."""
+    def _run(self, job: Job, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
+        """Compute a job in turns with those of other windows."""
         try:
-            job.report(0.0, "starting")
-            change = next(found, None)
-        except _CancelledError:
+            with TURNS, collected_warnings(job.warnings):
+                job.report(0.0, "starting")
+                for change in work(job.report):
+                    self.do(functools.partial(self._take, job, change))
+                    job.pass_on()
+                end = functools.partial(self._conclude, Status("Ready."))
+        except CancelledError:
             return
         except Exception as error:  # whatever it is, the page shows it and stays alive
-            known = isinstance(error, SionnaPartialError | OSError | MemoryError)
-            if not known:
+            if not isinstance(error, SionnaPartialError | OSError | MemoryError):
                 _log.exception("a job of the app failed")
-            message = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
-            self.do(functools.partial(self._end, job, Status(message, is_error=True)))
-            return
-        if change is None:
-            self.do(functools.partial(self._end, job, Status("Ready.")))
-        else:
-            self.do(functools.partial(self._take, job, change))
-            _ONE_AT_A_TIME.submit(self._advance, job, found)
+            end = functools.partial(self._fail, error)
+        self.do(functools.partial(self._end, job, end))
 
-    def _tell(self, job: _Job, fraction: float, message: str) -> None:
-        self.do(functools.partial(self._take, job, lambda: setattr(self, "status", Status(message, fraction))))
+    def _tell(self, job: Job, status: Status) -> None:
+        def tell() -> None:
+            if job is self._job:
+                self.status = status
+                self._show()
 
-    def _take(self, job: _Job, change: Callable[[], None]) -> None:
+        self.do(tell)
+
+    def _take(self, job: Job, change: Callable[[], None]) -> None:
         if job is self._job:
             change()
+            self._warnings["job"] += job.warnings
             self._show()
 
-    def _end(self, job: _Job, status: Status) -> None:
+    def _end(self, job: Job, end: Callable[[], None]) -> None:
         if job is self._job:
             self._job = None
-            self._conclude(status)
+            self._warnings["job"] += job.warnings
+            end()
+
+    def _fail(self, error: Exception) -> None:
+        """Show why a job has failed."""
+        known = isinstance(error, SionnaPartialError | OSError | MemoryError)
+        message = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
+        self._conclude(Status(message, is_error=True))
 
     def _conclude(self, status: Status) -> None:
         """Show how a job has ended; an answer to another question than that of the page goes."""
@@ -563,7 +606,7 @@ class Session:
         self._show()
 
     def _take_answer(self, answer: Answer) -> None:
-        self.answer, self._is_outdated = answer, False
+        self.answer, self._is_outdated, self._warnings["job"] = answer, False, []
 
     # Files
 
@@ -607,40 +650,6 @@ class Session:
             'coverage.radio.save("coverage.nc")',
         ]
         return "\n".join(lines) + "\n"
-
-
-def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
-    """Write an uploaded map under names of ours: of the names of its files only the suffixes count.
-
-    Raises
-    ------
-    MapError
-        For other files than a map of `MAP_SUFFIXES`, or more than `MOST_BYTES`.
-    """
-    if len(files) == 1 and PurePath(files[0][0]).suffix.lower() == ".zip":
-        files = _unzipped(files[0][1])
-    by_suffix = {PurePath(name).suffix.lower(): content for name, content in files}
-    sheets = [suffix for suffix in by_suffix if suffix in MAP_SUFFIXES and (suffix in _SHEETS or len(files) == 1)]
-    images = [suffix for suffix in by_suffix if suffix in _IMAGES]
-    if len(sheets) != 1 or len(by_suffix) != len(files) or len(sheets) + len(images) != len(files) or len(images) > 1:
-        names = ", ".join(shown(name) for name, _ in files[:3])
-        raise MapError(
-            f"{names}: give one map ({', '.join(MAP_SUFFIXES)}); of a ROS map YAML and image together, or a zip."
-        )
-    path, content = folder / f"map{sheets[0]}", by_suffix[sheets[0]]
-    if images:
-        (folder / f"map{images[0]}").write_bytes(by_suffix[images[0]])
-        content = re.sub(rb"(?m)^image:.*$", f"image: map{images[0]}".encode(), content)
-    path.write_bytes(content)
-    return path
-
-
-def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
-    """Return the files of a zip, which may not unpack to more than `MOST_BYTES`."""
-    try:
-        return [*unzipped(content, MOST_BYTES).items()]
-    except ValueError as error:
-        raise MapError(f"the zip cannot be read ({error}): give a zip of a ROS map's YAML and image.") from error
 
 
 def _zipped(paths: Sequence[Path]) -> bytes:

@@ -124,10 +124,12 @@ def open_app(
     browser: Annotated[bool, typer.Option(help="Whether the page is opened in a browser.")] = True,
 ) -> None:
     """Serve a page on which transmitters are dragged over a map, and the coverage follows, until Ctrl-C."""
+    from sionna_partial.app.jobs import collected_warnings, logged_warnings
     from sionna_partial.app.server import AppServer
 
-    partial = None if map_path is None else sp.load_map(map_path)
-    server = AppServer(partial, str(map_path or ""), address, port)
+    with collected_warnings() as warnings, logged_warnings():
+        partial = None if map_path is None else sp.load_map(map_path)
+    server = AppServer(partial, str(map_path or ""), address, port, warnings)
     typer.echo(f"open {server.url}")
     if browser:
         import webbrowser

@@ -1,0 +1,74 @@
+"""Maps that are uploaded: files with names that are not trusted -> a PartialMap."""
+
+import re
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path, PurePath
+
+from sionna_partial.app.jobs import logged_warnings
+from sionna_partial.checks import shown
+from sionna_partial.constants import BAG_SUFFIXES, DRAWING_SUFFIXES, IFC_SUFFIXES, MESH_SUFFIXES, POINT_SUFFIXES
+from sionna_partial.errors import MapError
+from sionna_partial.files import unzipped
+from sionna_partial.maps.map_files import load_map
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.ros_map import read_ros_map
+
+MOST_BYTES = 200_000_000
+"""Size of the files that are uploaded together [bytes]."""
+
+_IMAGES, _SHEETS = (".pgm", ".png", ".bmp"), (".yaml", ".yml")
+
+MAP_SUFFIXES = (*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES)
+"""Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
+
+UPLOADED_SUFFIXES = (*MAP_SUFFIXES, *_IMAGES, ".zip")
+"""Files that can be uploaded for a map."""
+
+
+def uploaded_map(files: Sequence[tuple[str, bytes]]) -> PartialMap:
+    """Read a map of files (name, content); warnings of its reader are logged.
+
+    Raises
+    ------
+    MapError
+        If it cannot be read.
+    """
+    with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
+        path = stored_map(files, Path(folder))
+        return read_ros_map(path, confined=True) if path.suffix in _SHEETS else load_map(path)
+
+
+def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
+    """Write an uploaded map under names of ours: of the names of its files only the suffixes count.
+
+    Raises
+    ------
+    MapError
+        For other files than a map of `MAP_SUFFIXES`, or more than `MOST_BYTES`.
+    """
+    if len(files) == 1 and PurePath(files[0][0]).suffix.lower() == ".zip":
+        files = _unzipped(files[0][1])
+    by_suffix = {PurePath(name).suffix.lower(): content for name, content in files}
+    sheets = [suffix for suffix in by_suffix if suffix in MAP_SUFFIXES and (suffix in _SHEETS or len(files) == 1)]
+    images = [suffix for suffix in by_suffix if suffix in _IMAGES]
+    names, one = ", ".join(shown(name) for name, _ in files[:3]), len(files) == 1
+    both = "choose the YAML and the image of a ROS map together, or a zip of both."
+    if one and (images or {*sheets} & {*_SHEETS}):
+        raise MapError(f"{names} alone is not a map: {both}")
+    if len(sheets) != 1 or len(by_suffix) != len(files) or len(sheets) + len(images) != len(files) or len(images) > 1:
+        raise MapError(f"{names} cannot be read: give one map ({', '.join(MAP_SUFFIXES)}); {both}")
+    path, content = folder / f"map{sheets[0]}", by_suffix[sheets[0]]
+    if images:
+        (folder / f"map{images[0]}").write_bytes(by_suffix[images[0]])
+        content = re.sub(rb"(?m)^image:.*$", f"image: map{images[0]}".encode(), content)
+    path.write_bytes(content)
+    return path
+
+
+def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
+    """Return the files of a zip, which may not unpack to more than `MOST_BYTES`."""
+    try:
+        return [*unzipped(content, MOST_BYTES).items()]
+    except ValueError as error:
+        raise MapError(f"the zip cannot be read ({error}): give a zip of a ROS map's YAML and image.") from error
