@@ -168,7 +168,7 @@ class LinkModel:
         """The predictor, which is read when it is first needed."""
         model = warm_predictor(self.asked)
         if isinstance(model, Predictor) and not self._by_wall_losses:
-            _warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
+            warn_of_other_traces(model, self.simulation.trace_settings, self.simulation.scene_settings)
         return model
 
     @property
@@ -394,7 +394,7 @@ def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]
     return [Antenna.of(by_name[name] if by_name else tx_antenna[at]) for at, name in enumerate(names)]  # type: ignore[index]
 
 
-def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
+def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
     if trained.through_walls != settings.through_walls:
