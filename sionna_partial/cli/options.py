@@ -87,7 +87,7 @@ class OnceCommand(TyperCommand):
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments, and count the options among them."""
-        _, _, order = self.make_parser(ctx).parse_args(args=[*args])
+        order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]
         for option in order:
             if order.count(option) > 1 and not (option.multiple or option.count):
                 others = " `sionna-partial network` takes several transmitters." if option.name == "tx" else ""

@@ -181,7 +181,9 @@ class _Grid:
         sizes = {"resolution": self.resolution_m, "width": self.percent.shape[1], "height": self.percent.shape[0]}
         return {"map_load_time": self.header["stamp"], **sizes, "origin": {"position": position, "orientation": turn}}
 
-    def costs(self, coverage: xr.Dataset, threshold_db: float, max_cost: int) -> list[NDArray[np.int8]]:
+    def costs(
+        self, coverage: xr.Dataset, threshold_db: float, max_cost: int
+    ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
         """Return the percentage of outage at the nearest receiver of free and of unknown cells, -1 in all others."""
         valid = coverage["valid"].to_numpy() == 1
         percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
@@ -198,7 +200,8 @@ class _Grid:
         cost = np.nan_to_num(predicted, nan=-1.0)[tuple(at)].astype(np.int8)
         state = self.partial.state_at(np.stack([x_m, y_m], axis=-1))
         state[(self.percent < 0) | (self.percent > 100)] = CellState.UNKNOWN
-        return [np.where(state == kind, cost, np.int8(-1)) for kind in (CellState.FREE, CellState.UNKNOWN)]
+        free, unknown = (np.where(state == kind, cost, np.int8(-1)) for kind in (CellState.FREE, CellState.UNKNOWN))
+        return free, unknown
 
 
 class _NewerMap(Exception):
@@ -441,9 +444,9 @@ class LiveCoverage:
             measurements=self._measured(name),
             progress=report,
         )
-        costs = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
+        cost, unknown = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
         age_s = time.monotonic() - grid.came_s
-        self._publish(LiveGrid(name, grid.number, is_final, coverage, *costs, grid.header, grid.info, age_s))
+        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s))
 
     def _measured(self, name: str) -> Measurements | None:
         """Return the powers that were measured of a transmitter and can be used on the map of now."""
