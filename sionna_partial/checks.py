@@ -161,7 +161,7 @@ class Within:
 class Checked:
     """Base of dataclasses whose fields are checked against their annotations.
 
-    Checked are ranges (`Annotated[float, Within(0, 1)]`, whole numbers for int), bool, Literal and dataclasses.
+    Checked are ranges (`Annotated[float, Within(0, 1)]`, whole numbers for int), bool, text, Literal and dataclasses.
     Numbers of NumPy become those of Python, so that settings can be written as JSON.
     """
 
@@ -183,6 +183,8 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         require_choice(name, value, arguments)
     elif hint is bool or arguments == (bool, NoneType):
         require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
+    elif hint is str:
+        require(isinstance(value, str), name, value, "give a text.")
     elif isinstance(hint, type) and is_dataclass(hint):
         if isinstance(value, str) and hasattr(hint, "named"):
             value = hint.named(value)

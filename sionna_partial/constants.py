@@ -35,6 +35,9 @@ DRYWALL_CONDUCTIVITY_EXPONENT = 0.9395
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
 
+MAX_COST = 98
+"""Largest value of a cost grid [percent]: nav2 reads 99 as an inscribed obstacle and 100 as an obstacle."""
+
 MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
 """File formats of meshes."""
 

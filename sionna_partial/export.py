@@ -12,7 +12,7 @@ import yaml
 from rasterio import Affine
 from rasterio.io import MemoryFile
 
-from sionna_partial.constants import NO_RECEIVER
+from sionna_partial.constants import MAX_COST, NO_RECEIVER
 from sionna_partial.coverage.dataset import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
 from sionna_partial.coverage.network import VARIABLES, require_network
 from sionna_partial.errors import OutputError, SettingsError
@@ -44,10 +44,10 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     `.png`   The picture of `plot_coverage`.
     `.html`  A page for the browser, which needs no network: the layers, the values under the pointer, and
              P(gain > threshold) with a slider; of several transmitters a choice, and the best server.
-    `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 100,
-             is the probability of outage in percent; unknown (-1) where no receiver stands. Nav2 loads it as a
-             layer that keeps a robot where it has a link (static layer, `trinary_costmap: false`). One transmitter;
-             for several, save `network_map`.
+    `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 98,
+             is the probability of outage in percent; unknown (-1) where no receiver stands and in cells that the map
+             does not know. A static layer of nav2 keeps a robot where it has a link (parameters: `docs/live.md`). One
+             transmitter; for several, save `network_map`.
     ======== ==========================================================================================
 
     Parameters
@@ -243,9 +243,10 @@ def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
     """Write the YAML and its PGM of a probability; if one cannot be written, neither is."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
-    quantity = {"quantity": "probability of outage in percent; 255 where no receiver can stand"}
+    quantity = {"quantity": f"probability of outage in percent, at most {MAX_COST}; 255 where unknown or no receiver"}
     sheet = ros_sheet(path, "raw", spacing_m, corner_m) | quantity
-    percent = np.rint(100 * coverage[p_outage].fillna(NO_RECEIVER / 100).to_numpy()).astype(np.uint8)
+    cost = np.minimum(np.rint(100 * coverage[p_outage].where(coverage["observed"]).to_numpy()), MAX_COST)
+    percent = np.nan_to_num(cost, nan=NO_RECEIVER).astype(np.uint8)
     write_ros_files(
         path, yaml.safe_dump(sheet, sort_keys=False, default_flow_style=None), {path.with_suffix(".pgm"): percent}
     )

@@ -96,7 +96,7 @@ def _library(name: str) -> Finding:
     try:
         return Finding(name, metadata.version(name))
     except metadata.PackageNotFoundError:
-        return Finding(name, "not installed", f"run pip install {name}, or pip install sionna-partial again.")
+        return Finding(name, "not installed", f"run pip install {name}, or install sionna-partial again.")
 
 
 def _predictors() -> Finding:

@@ -132,7 +132,7 @@ class LinkModel:
         """The networks, which are read when they are first needed."""
         networks = warm_predictor(self.asked)
         if isinstance(networks, Predictor) and not self._by_mean_losses:
-            _warn_of_other_traces(networks, *self.simulation.resolved)
+            warn_of_other_traces(networks, *self.simulation.resolved)
         return networks
 
     @property
@@ -293,7 +293,7 @@ def _drop_oldest(kept: dict[Any, Any]) -> None:
         del kept[oldest]
 
 
-def _warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
+def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
     if trained.through_walls != settings.through_walls:

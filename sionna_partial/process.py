@@ -26,6 +26,12 @@ ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 GRACE_S = 1.0
 """Time that native code has to return before the process ends without it [s]."""
 
+NEW_FOLDER = ".new-sionna_partial_"
+"""Beginning of the names of own folders that are not locked yet."""
+
+UNLOCKED_S = 60.0
+"""Age from which on such a folder is a killed process's [s]."""
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
@@ -102,7 +108,7 @@ def own_folder(parent: Path, prefix: str) -> Iterator[Path]:
     """
     mine = prefix + hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
     made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
-    new, folder = (parent / f"{start}{secrets.token_hex(8)}" for start in (".new-sionna_partial_", mine))
+    new, folder = (parent / f"{start}{secrets.token_hex(8)}" for start in (NEW_FOLDER, mine))
 
     def remove() -> None:
         for each in (new, folder):
@@ -115,9 +121,12 @@ def own_folder(parent: Path, prefix: str) -> Iterator[Path]:
         new.mkdir(0o700, parents=True)
         lock.enter_context(_locked(new))
         new.rename(folder)
-        for other in parent.glob(f"{mine}*"):
-            with suppress(OSError), _locked(other, must=True):
-                shutil.rmtree(other, ignore_errors=True)
+        old = (each for each in parent.glob(f"{NEW_FOLDER}*") if time.time() - each.lstat().st_mtime > UNLOCKED_S)
+        for others in (parent.glob(f"{mine}*"), old):
+            with suppress(OSError):
+                for other in others:
+                    with suppress(OSError), _locked(other, must=True):
+                        shutil.rmtree(other, ignore_errors=True)
         yield folder
 
 

@@ -116,7 +116,7 @@ class Material(Checked):
 
         The names are those of `WALL_MATERIALS`, such as "drywall", which is the default, and those of ITU-R P.2040-3,
         with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
-        such walls: `docs/materials.md`.
+        such walls: `docs/through_walls.md`.
 
         Examples
         --------

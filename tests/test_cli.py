@@ -7,9 +7,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import typer
 import xarray as xr
 import yaml
 from coverage_cases import PICTURE, TX, map_of, shipped
@@ -284,3 +286,21 @@ class TestHelp:
 
     def test_position_is_shown_as_it_is_typed(self) -> None:
         assert "--tx X Y [Z]" in run("predict", "--help").stdout
+
+
+OPTIONS = [
+    (name, option)
+    for name, command in typer.main.get_command(cli.app).commands.items()  # type: ignore[attr-defined]
+    for option in command.params
+    if option.opts[0].startswith("--")
+]
+
+
+@pytest.mark.parametrize(("name", "option"), OPTIONS, ids=[f"{name} {option.name}" for name, option in OPTIONS])
+def test_options_that_are_no_lists_are_given_once(name: str, option: Any) -> None:
+    """The parser would take the last one."""
+    words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
+    rest = ["--no-such-option"] * option.multiple  # which ends the command
+    result = run(name, option.opts[0], *words, (option.secondary_opts or option.opts)[0], *words, *rest)
+    assert result.exit_code == 2
+    assert (f"{option.opts[0]} is given 2 times: give it once." in result.stderr) != option.multiple

@@ -7,6 +7,7 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -137,8 +138,13 @@ class TestBuild:
 
 
 class TestKilled:
-    def test_killed_runs_are_continued_to_the_same_bytes(self, unbroken: Path, tmp_path: Path, notes: Path) -> None:
-        folder = tmp_path / "set"
+    def test_killed_runs_are_continued_to_the_same_bytes(
+        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        folder, temporary = tmp_path / "set", tmp_path / "temporary"
+        temporary.mkdir()
+        monkeypatch.setenv("TMPDIR", str(temporary))
+        monkeypatch.setattr(tempfile, "tempdir", str(temporary))
         with started(sys.executable, "-c", BUILD, folder) as run:
             wait_until(lambda: shards(folder) >= 2)
             run.kill()
@@ -147,11 +153,13 @@ class TestKilled:
         for parent in (folder, folder / "shards"):
             (parent / ".tmp-0123456789abcdef").mkdir()
             (parent / ".tmp-0123456789abcdef" / "half a file").touch()
+            (parent / ".new-sionna_partial_0123456789abcdef").mkdir()
         there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
         report = build_dataset(folder, SEEDS, SETTINGS, workers=1)
         assert len(report.skipped) == len(there)
         assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
         assert files(folder) == files(unbroken)
+        assert not list(temporary.iterdir())
 
     def test_ctrl_c_ends_at_once_and_leaves_no_process_or_file(
         self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
@@ -168,7 +176,9 @@ class TestKilled:
         assert run.returncode not in (0, None)
         assert "Traceback" not in errors
         assert not any(map(is_running, processes(notes)))
-        assert not list(temporary.glob("sionna_partial_*"))
+        assert not list(temporary.iterdir())
+        assert {each.name for each in (tmp_path / "set").iterdir()} <= {".lock", "dataset.json", "shards"}
+        assert {each.suffix for each in (tmp_path / "set" / "shards").iterdir()} == {".parquet"}
 
 
 POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)

@@ -248,6 +248,25 @@ class TestErrors:
         with pytest.raises(SettingsError, match=rf"{name} = .* is not allowed: {remedy}"):
             links_of("partial", "paper")(**{name: value})
 
+    @pytest.mark.parametrize("predictor", [None, "map"])
+    def test_paths_through_walls_on_a_map_that_is_not_complete(self, predictor, caplog):
+        """The default prediction has no gradients there; a network that learnt from opaque walls is named."""
+        settings = replace(TRACE, frequency_hz=5e9, max_depth=2)
+        if predictor is None:
+            with pytest.raises(SettingsError, match=r"refraction = True is not allowed: .*TraceSettings\(refraction=F"):
+                sp.DifferentiableScene(MAPS["partial"], trace_settings=settings)
+        else:
+            sp.DifferentiableScene(MAPS["partial"], predictor=predictor, trace_settings=settings)
+            assert "was trained on opaque walls, and is used through walls" in caplog.text
+        opaque = replace(settings, refraction=False)
+        assert sp.DifferentiableScene(MAPS["partial"], trace_settings=opaque).links(TX_M, RX_M)().p_los.shape == (6,)
+
+    def test_paths_through_walls_on_a_complete_map(self):
+        settings = replace(TRACE, frequency_hz=5e9)
+        links = sp.DifferentiableScene(MAPS["complete"], trace_settings=settings).links(TX_M, RX_M)
+        traced = sp.trace_links(MAPS["complete"], TX_M, RX_M, trace_settings=settings)
+        np.testing.assert_allclose(links().gain_mean_db, traced.gain_db, rtol=1e-6)
+
     def test_within_a_function(self, links_of):
         links = links_of("partial", "paper")
         with pytest.raises(SettingsError, match=r"tx_m = .* is not allowed: call links eagerly, not within"):

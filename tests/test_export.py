@@ -83,17 +83,21 @@ def test_png_is_the_picture(several, tmp_path):
 
 
 def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):
-    """As nav2_map_server reads it in raw mode: shades 0 to 100 are occupancies, others unknown, row 0 is the top."""
+    """As nav2_map_server reads it in raw mode: shades 0 to 98 are occupancies, others unknown, row 0 is the top."""
+    coverage = coverage.assign(p_outage=coverage["p_outage"] + coverage["p_los"], p_los=0.0 * coverage["p_los"])
     save_coverage(coverage, tmp_path / "outage.yaml")
     sheet = yaml.safe_load((tmp_path / "outage.yaml").read_text())
     assert (sheet["mode"], sheet["negate"], sheet["image"]) == ("raw", 0, "outage.pgm")
     assert sheet["resolution"] == 0.25
     assert sheet["origin"] == [-1.0, 2.0, 0.0]
     occupancy = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(int)
-    p_outage, valid = coverage["p_outage"].to_numpy(), coverage["valid"].to_numpy()
+    p_outage, known = coverage["p_outage"].to_numpy(), (coverage["valid"] & coverage["observed"]).to_numpy()
     loaded = load_map(tmp_path / "outage.yaml")
-    assert (occupancy[~valid] == 255).all()
-    assert (np.abs(occupancy - 100 * p_outage)[valid] <= 0.5).all()
+    assert (occupancy[~known] == 255).all()
+    assert (np.abs(occupancy - np.minimum(100 * p_outage, 98))[known] <= 0.5).all()
+    assert (known & (p_outage > 0.99)).any()
+    assert (~known & coverage["valid"].to_numpy()).any()
+    p_outage[~known] = np.nan
     assert (loaded.shape, loaded.resolution_m, loaded.origin_m) == (p_outage.shape, 0.25, (-1.0, 2.0))
     assert (loaded.state[p_outage > 0.66] == CellState.WALL).all()
     assert (loaded.state[p_outage < 0.19] == CellState.FREE).all()
@@ -153,7 +157,7 @@ class TestSeveralTransmitters:
         network = network_map(several, n=50)
         save_network(network, tmp_path / "outage.yaml")
         percent = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(float)
-        expected = 100 * network["p_all_outage"].to_numpy()
+        expected = np.minimum(100 * network["p_all_outage"].where(network["observed"]).to_numpy(), 98)
         np.testing.assert_allclose(np.where(percent == 255, np.nan, percent), expected, atol=0.5)
         assert yaml.safe_load((tmp_path / "outage.yaml").read_text())["origin"] == [-1.0, 2.0, 0.0]
 

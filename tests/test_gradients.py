@@ -13,6 +13,7 @@ import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
+from sionna_partial.tracing.interactions import REFRACTION
 
 SLOPES = (
     *("tx_db_per_m", "relative_permittivity_db", "conductivity_db_per_s_m", "thickness_db_per_m"),
@@ -80,6 +81,35 @@ class TestAgainstFormulas:
         expected = np.stack([floor_slopes(material, rx) for rx in RX], axis=1)
         scale = np.abs(expected).max(axis=1, keepdims=True)
         np.testing.assert_allclose(all_slopes(found) / scale, expected / scale, rtol=0.01, atol=2e-4)
+
+
+def test_paths_through_a_wall_by_differences() -> None:
+    state = np.zeros((40, 60), dtype=np.uint8)
+    state[[0, -1], :] = state[:, [0, -1]] = state[:30, 29] = CellState.WALL
+    settings = sp.TraceSettings(5.2e9, max_depth=1, diffraction=False, power_tolerance_db=0.0)
+    material, rx_m = sp.Material(3.0, 0.03, 0.05), [(4.2, 1.1, 1.1), (5.1, 0.7, 2.2)]
+
+    def gains_db(tx_m: object = TX, frequency_hz: float = 5.2e9, **change: float) -> NDArray[np.float64]:
+        trace = dataclasses.replace(settings, frequency_hz=frequency_hz)
+        scene = sp.SceneSettings(material=dataclasses.replace(material, **change))
+        links = sp.trace_links(sp.PartialMap(state, 0.1), tx_m, rx_m, trace_settings=trace, scene_settings=scene)
+        assert (links.interactions == REFRACTION).any()
+        return links.gain_db
+
+    def slope(step: float, low: NDArray[np.float64], high: NDArray[np.float64]) -> NDArray[np.float64]:
+        return (high - low) / (2 * step)
+
+    scene_settings = sp.SceneSettings(material=material)
+    partial = sp.PartialMap(state, 0.1)
+    found = gain_gradients(partial, TX, rx_m, trace_settings=settings, scene_settings=scene_settings)
+    steps_m = 2e-3 * np.eye(3)
+    expected = [slope(2e-3, gains_db(TX - step), gains_db(TX + step)) for step in steps_m]
+    for name, step in {"relative_permittivity": 1e-2, "conductivity_s_m": 1e-3, "thickness_m": 1e-4}.items():
+        value = getattr(material, name)
+        expected.append(slope(step, gains_db(**{name: value - step}), gains_db(**{name: value + step})))
+    expected.append(slope(1e7, gains_db(frequency_hz=5.19e9), gains_db(frequency_hz=5.21e9)))
+    scale = np.abs(expected).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(all_slopes(found) / scale, expected / scale, atol=0.05)
 
 
 class TestGainGradients:

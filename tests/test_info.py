@@ -60,7 +60,7 @@ def test_other_versions_and_another_platform(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(metadata, "requires", lambda _: ["keras<4,>=3", "shapely>=2", "scipy", 'ruff; extra == "dev"'])
     monkeypatch.setattr(platform, "machine", lambda: "aarch64")
     findings = found()
-    remedy = "run pip install {}, or pip install sionna-partial again."
+    remedy = "run pip install {}, or install sionna-partial again."
     assert findings["keras"] == Finding("keras", "not installed", remedy.format("keras"))
     assert findings["shapely"] == Finding("shapely", "not installed", remedy.format("shapely"))
     assert not {"scipy", "ruff"} & findings.keys()

@@ -8,9 +8,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
+from numpy.typing import NDArray
 from rosbag_files import Messages, write_bag
 
 import sionna_partial as sp
+from sionna_partial.errors import SettingsError
+from sionna_partial.live import topics
 from sionna_partial.live.bags import replay
 from sionna_partial.live.coverage import LiveGrid, LiveViews
 from sionna_partial.live.topics import Listener, Topics
@@ -107,7 +111,7 @@ class TestMaps:
     @pytest.mark.parametrize("yaw", [0.0, 0.5, math.pi / 2, -2.5])
     def test_costs_of_turned_maps_are_those_at_the_cells(self, yaw: float) -> None:
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
-        heard = Heard((*turn @ TX[:2], 1.5), threshold_db=-62.0)
+        heard = Heard((*turn @ TX[:2], 1.5), threshold_db=-62.0, max_cost=100)
         heard.live.on_map(message(grown(), yaw=yaw))
         heard.step()
         p_above = heard[-1].coverage.radio.probability_above(-62.0)
@@ -224,6 +228,93 @@ class TestTransmitters:
             assert line in caplog.text
 
 
+NO_INFORMATION, LETHAL = 255, 254
+"""Costs of nav2."""
+
+
+def layer_of(message: dict[str, Any], parameters: dict[str, Any]) -> NDArray[np.uint8]:
+    """Return the costs that nav2's static layer reads from a grid (StaticLayer::interpretValue)."""
+    value = np.array(message["data"]).astype(np.uint8)
+    threshold = parameters["lethal_cost_threshold"]
+    cost = np.zeros(value.shape) if parameters["trinary_costmap"] else np.floor(value / threshold * LETHAL)
+    cost[value >= threshold] = LETHAL
+    cost[value == 99] = 253
+    cost[value == 255] = NO_INFORMATION if parameters["track_unknown_space"] else 0
+    return cost.reshape(message["info"]["height"], message["info"]["width"]).astype(np.uint8)
+
+
+def update_with_max(master: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Combine a layer with the costmap (CostmapLayer::updateWithMax): `use_maximum: true`."""
+    replaced = (layer != NO_INFORMATION) & ((master == NO_INFORMATION) | (master < layer))
+    return np.where(replaced, layer, master)
+
+
+def update_with_overwrite(master: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Combine a layer with the costmap (CostmapLayer::updateWithOverwrite)."""
+    return np.where(layer != NO_INFORMATION, layer, master)
+
+
+def update_with_true_overwrite(master: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Combine a layer with the costmap (CostmapLayer::updateWithTrueOverwrite): `use_maximum: false`, the default."""
+    return layer
+
+
+@pytest.fixture(scope="module")
+def half_seen() -> Heard:
+    partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
+    heard = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0)
+    percent = np.array([0, 100, -1])[partial.state]
+    sent = message(percent, at=partial.origin_m)
+    sent.info.resolution = partial.resolution_m
+    heard.live.on_map(sent)
+    heard.step()
+    heard.append(percent)
+    return heard
+
+
+@pytest.fixture(scope="module")
+def parameters() -> dict[str, Any]:
+    """Return the parameters of the page, where nav2 reads them: those of the costmap."""
+    page = (Path(__file__).parents[1] / "docs" / "live.md").read_text("utf-8")
+    costmap = yaml.safe_load(page.partition("```yaml")[2].partition("```")[0])["global_costmap"]["global_costmap"]
+    assert costmap["ros__parameters"]["use_maximum"]
+    return dict(costmap["ros__parameters"])
+
+
+class TestNav2:
+    @pytest.mark.parametrize(
+        ("rule", "keeps_walls"),
+        [(update_with_max, True), (update_with_overwrite, True), (update_with_true_overwrite, False)],
+    )
+    def test_unknown_cells_and_obstacles_stay(
+        self, half_seen: Heard, parameters: dict[str, Any], rule: Any, keeps_walls: bool
+    ) -> None:
+        percent, grid = half_seen[-1], half_seen[-2]
+        master = layer_of({"data": percent.ravel(), "info": grid.info}, parameters)
+        combined = rule(master, layer_of(grid.message(), parameters))
+        assert ((master == NO_INFORMATION) <= (combined == NO_INFORMATION)).all()
+        assert ((combined >= 253) <= (master >= 253)).all()
+        assert keeps_walls == ((master == LETHAL) <= (combined == LETHAL)).all()
+        free = combined[percent == 0]
+        assert {0, 248} <= {*free.tolist()}
+        assert len({*free.tolist()}) > 10
+
+    def test_predictions_for_unknown_cells_have_their_own_grid(
+        self, half_seen: Heard, parameters: dict[str, Any]
+    ) -> None:
+        percent, grid = half_seen[-1], half_seen[-2]
+        assert (grid.cost[percent != 0] == -1).all()
+        assert (grid.unknown_cost[percent != -1] == -1).all()
+        assert grid.cost.max() == grid.unknown_cost.max() == 98
+        master = layer_of({"data": percent.ravel(), "info": grid.info}, parameters)
+        combined = update_with_max(master, layer_of(grid.message(unknown=True), parameters))
+        assert ((combined == NO_INFORMATION).sum() < 0.1 * (master == NO_INFORMATION).sum()).all()
+        assert ((combined >= 253) <= (master >= 253)).all()
+        assert list(Topics(unknown=True).messages(grid)) == ["/radio/tx", "/radio/tx/unknown"]
+        assert list(Topics().messages(grid)) == ["/radio/tx"]
+        assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
+
+
 class TestListener:
     @staticmethod
     def transform(parent: str, child: str, x: float, yaw: float = 0.0) -> Fields:
@@ -247,6 +338,43 @@ class TestListener:
         assert heard.live._pose[2] == 7.0  # type: ignore[index]
         assert "is not finite" in caplog.text
 
+    @pytest.mark.parametrize("robot_frame", ["base_link", "/base_link"])
+    @pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+    @pytest.mark.parametrize("when", [0, 1, 2])
+    def test_any_number_of_other_frames(
+        self, topic: str, when: int, robot_frame: str, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """Others come before the frames of the robot, between them, or after them; few of them are kept."""
+        monkeypatch.setattr(topics, "MOST_FRAMES", 10)
+        heard = Heard()
+        listener = Listener(heard.live, Topics(robot_frame=robot_frame))
+        listener.take("/map", message())
+        others = [Fields(transforms=[self.transform("map", f"other{number}", 1.0)]) for number in range(25)]
+        messages = [
+            ("/tf_static", Fields(transforms=[self.transform("map", "odom", 2.0)])),
+            ("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.0)])),
+        ]
+        messages[when:when] = [(topic if when != 1 else "/tf", other) for other in others]
+        for at, each in enumerate([*messages, messages[-1]]):
+            listener.take(*each, float(at))
+        listener.take("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.5)]), 99.0)
+        assert heard.live._pose == pytest.approx((3.5, 0.0, 99.0))
+        assert len(listener._frames) <= 13
+
+    @pytest.mark.parametrize(("powers", "name"), [({"/rssi": "attic"}, "attic"), ({"/rssi": None}, None)])
+    def test_powers_of_no_transmitter(self, powers: Any, name: str | None) -> None:
+        heard = Heard({"desk": TX, "door": TX})
+        with pytest.raises(SettingsError, match=rf"powers\['/rssi'\] = {name!r} is not allowed: name one of the"):
+            Listener(heard.live, Topics(powers=powers))
+
+    @pytest.mark.parametrize(
+        "given",
+        [{"map": "map"}, {"prefix": "/"}, {"powers": {"rssi": None}}, {"key_values": "/a b"}, {"robot_frame": ""}],
+    )
+    def test_names_that_no_topic_has(self, given: Any) -> None:
+        with pytest.raises(SettingsError, match=f"{next(iter(given))}.* is not allowed: give "):
+            Topics(**given)
+
     def test_powers_and_views(self) -> None:
         heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
         listener = Listener(heard.live, Topics(powers={"/rssi": "door"}, key_values="/wifi"))
@@ -265,7 +393,7 @@ class TestListener:
         heard.step()
         assert isinstance(heard[0], LiveViews)
         assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]
-        assert listener.topics.topic_of(heard[0]) == "/radio/next_views"
+        assert [*listener.topics.messages(heard[0])] == ["/radio/next_views"]
 
 
 class TestRecordings:

@@ -64,9 +64,12 @@ def test_folders_of_dead_processes_are_removed(tmp_path: Path) -> None:
     process = python(code, tmp_path, stdout=subprocess.PIPE)
     assert process.stdout
     process.stdout.readline()
-    (tmp_path / "left_other").mkdir()
+    for name, age_s in {"left_other": 1e6, ".new-sionna_partial_a": 1.0, ".new-sionna_partial_b": 100.0}.items():
+        (tmp_path / name).mkdir()
+        os.utime(tmp_path / name, (time.time() - age_s,) * 2)
     with own_folder(tmp_path, "left_"):
-        assert len(list(tmp_path.iterdir())) == 3
+        assert len(list(tmp_path.iterdir())) == 4
+    (tmp_path / ".new-sionna_partial_a").rmdir()  # a living process may be about to lock it
     process.kill()
     process.communicate()
     with own_folder(tmp_path, "left_") as mine:

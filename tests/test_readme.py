@@ -119,6 +119,38 @@ def test_notebooks_are_stored_without_outputs() -> None:
         assert not [cell for cell in cells if cell.get("outputs")], f"{notebook.name}: clear its outputs"
 
 
+def test_every_command_is_in_the_table() -> None:
+    table = (ROOT / "docs" / "usage.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
+    rows = re.findall(r"^\| (`[^|]*) \|", table, flags=re.MULTILINE)
+    named = {name for row in rows for name in re.findall(r"`([a-z-]+)", row)}
+    assert named == typer.main.get_command(app).commands.keys()  # type: ignore[attr-defined]
+
+
+def test_only_the_repository_is_installed_from() -> None:
+    for path in (*PAGES, *(file for end in ("py", "md", "ipynb") for file in ROOT.glob(f"[des]*/**/*.{end}"))):
+        assert not re.search(r"pip install ['\"]?sionna-partial", path.read_text("utf-8")), (
+            f"{path} installs from an index"
+        )
+
+
+def test_pages_named_in_code_exist() -> None:
+    """Docstrings, comments, pages, notebooks and examples name pages by their paths."""
+    for folder in ("sionna_partial", "docs", "tests", "examples", "benchmarks"):
+        for path in (ROOT / folder).rglob("*"):
+            if path.suffix in (".py", ".md", ".ipynb", ".html", ".rst"):
+                for name in re.findall(r"\bdocs/[\w/]+\.\w+", path.read_text("utf-8")):
+                    assert (ROOT / name).exists(), f"{path.name} names {name}"
+
+
+def test_notebooks_link_to_files_and_headings() -> None:
+    for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
+        text = "".join(line for cell in json.loads(notebook.read_text("utf-8"))["cells"] for line in cell["source"])
+        for target, anchor in re.findall(r"\]\(([^):#]+)#?([^)]*)\)", text):
+            page = (notebook.parent / target).resolve()
+            assert not page.suffix or page.is_file(), f"{notebook.name} links to {target}"
+            assert not anchor or anchor in anchors(page), f"{notebook.name} links to {target}#{anchor}"
+
+
 def test_files_named_in_code_exist() -> None:
     for page in PAGES:
         if page.name == "experiments.md":  # scripts of earlier commits

@@ -4,13 +4,15 @@ import math
 import re
 import subprocess
 import sys
+from importlib import import_module
+from typing import get_type_hints
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sionna_partial.checks import shown
+from sionna_partial.checks import Checked, shown
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
 from sionna_partial.settings import (
@@ -95,6 +97,32 @@ def test_switches(kind: type, name: str) -> None:
         expected = f"{name} = {value!r} is not allowed: give True or False."
         with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
             kind(**{name: value})
+
+
+def all_settings(kind: type = Checked) -> list[type]:
+    """Return the settings classes of all modules."""
+    for module in ("app.session", "coverage.link_budget", "live.topics", "tracing.antennas"):
+        import_module(f"sionna_partial.{module}")
+    return [each for own in kind.__subclasses__() for each in (own, *all_settings(own))]
+
+
+def texts() -> list[tuple[type, str]]:
+    """Return each settings class, and a field of it that holds text."""
+    fields = [(kind, name, str(hint)) for kind in all_settings() for name, hint in get_type_hints(kind).items()]
+    return [(kind, name) for kind, name, hint in fields if re.search(r"\bstr\b", hint)]
+
+
+@pytest.mark.parametrize(("kind", "name"), texts())
+def test_texts(kind: type, name: str) -> None:
+    for value in (3, 2.5, True, b"map", ["map"]):
+        with pytest.raises(SettingsError, match=f"^{name}.* is not allowed: "):
+            kind(**{name: value})
+
+
+def test_texts_are_found() -> None:
+    assert {"LiveSettings.frame", "Topics.robot_frame", "Antenna.pattern"} <= {
+        f"{kind.__name__}.{name}" for kind, name in texts()
+    }
 
 
 def test_scene_choices() -> None:

@@ -203,7 +203,7 @@ def calibrate_materials(
     start : Material, optional
         Start of the search; its thickness is kept. By default the material of the scene.
     trace_settings : TraceSettings, optional
-        Refraction and diffuse reflection must be off; diffraction too on meshes.
+        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls.
     scene_settings : SceneSettings, optional
     seed : int, optional
         Seed of the rays that find the paths of a mesh, in place of that in `trace_settings`. Nothing else is drawn.

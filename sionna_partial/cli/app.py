@@ -13,7 +13,7 @@ from typer.core import TyperGroup
 from sionna_partial import __version__
 from sionna_partial.cli.learning import dataset, evaluate, train
 from sionna_partial.cli.live import live, open_app
-from sionna_partial.cli.options import TransmitterCommand
+from sionna_partial.cli.options import OnceCommand, TransmitterCommand
 from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import channels, demo, explore, export_scene, info, network, predict
 from sionna_partial.errors import SionnaPartialError, one_line
@@ -100,6 +100,6 @@ app.command(cls=TransmitterCommand)(network)
 app.command("next", cls=TransmitterCommand)(next_views)
 app.command(cls=TransmitterCommand)(explore)
 app.command(cls=TransmitterCommand)(live)
-app.command("app")(open_app)
+app.command("app", cls=OnceCommand)(open_app)
 for _command in (export_scene, dataset, train, evaluate, calibrate, place, demo, info):
-    app.command()(_command)
+    app.command(cls=OnceCommand)(_command)

@@ -7,7 +7,7 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.constants import DEFAULT_HEIGHT_M, MAX_COST
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.process import cleaned_up
 
@@ -20,11 +20,17 @@ def _topics(
     robot_frame: Annotated[str, typer.Option(help="Frame of the robot.")] = "base_link",
     power: Annotated[list[str], typer.Option(metavar="TOPIC", help=_POWER_HELP, show_default=False)] = [],  # noqa: B006
     key_values: Annotated[str, typer.Option(help="Topic of diagnostic_msgs/KeyValue: name, power.")] = "",
+    publish_unknown: Annotated[
+        bool, typer.Option("--publish-unknown", help="Publish predictions for unknown cells, at PREFIX/NAME/unknown.")
+    ] = False,
 ) -> Any:
     from sionna_partial.live.topics import Topics
 
     parts = [each.rpartition("=") for each in power]
-    return Topics(map_topic, prefix, robot_frame, {topic: name or None for name, _, topic in parts}, key_values)
+    powers = {topic: name or None for name, _, topic in parts}
+    if len(powers) < len(parts):
+        raise typer.BadParameter(f"--power {' '.join(power)} has a topic twice: give each topic once.")
+    return Topics(map_topic, prefix, robot_frame, powers, key_values, publish_unknown)
 
 
 def _live_settings(
@@ -34,8 +40,12 @@ def _live_settings(
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     tx_power: Annotated[float, typer.Option(help="Subtracted from received powers [dBm].")] = 0.0,
     views_every: Annotated[float, typer.Option(help="Time between lists of next views [s]; 0: on request.")] = 0.0,
+    max_cost: Annotated[
+        int, typer.Option(help="Largest value of a grid [percent]; in nav2, 100 is a wall.")
+    ] = MAX_COST,
 ) -> Any:
-    return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, views_every_s=views_every)
+    options = {"views_every_s": views_every, "max_cost": max_cost}
+    return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]
 
 
 @opt.with_options

@@ -90,7 +90,22 @@ Drift = Annotated[float, typer.Option(help="Odometry drift per metre travelled [
 MissedWalls = Annotated[float, typer.Option(help="Fraction of walls that it does not detect, as glass [1].")]
 
 
-class TransmitterCommand(TyperCommand):
+class OnceCommand(TyperCommand):
+    """Refuses an option that is given twice and is no list, of which the parser would take the last."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Parse arguments, and count the options among them."""
+        order: list[Any] = self.make_parser(ctx).parse_args(args=[*args])[2]
+        for option in order:
+            if order.count(option) > 1 and not (option.multiple or option.count):
+                others = " `sionna-partial network` takes several transmitters." if option.name == "tx" else ""
+                raise typer.BadParameter(
+                    f"{option.opts[0]} is given {order.count(option)} times: give it once.{others}"
+                )
+        return super().parse_args(ctx, args)
+
+
+class TransmitterCommand(OnceCommand):
     """Takes `--tx X Y` and `--tx X Y Z`: an option with two or three values."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

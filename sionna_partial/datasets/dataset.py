@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import dask
 from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm import parse_address, parse_host_port
 
@@ -29,8 +30,8 @@ from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.display import Shown
 from sionna_partial.errors import BackendError, OutputError, SettingsError
-from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes
-from sionna_partial.process import cleaned_up, core_count
+from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
+from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
 from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
 
@@ -42,6 +43,9 @@ ANY_PORT = "127.0.0.1:0"
 
 MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
 """Largest scheduler file, and largest index of a data set [bytes]."""
+
+LEFTOVERS = (".tmp-", NEW_FOLDER)
+"""Beginnings of the names of folders that a killed run leaves."""
 
 CONNECT_S = 30.0
 """Time to wait for a scheduler [s]."""
@@ -193,7 +197,7 @@ def _prepare(
     text = json.dumps(index, indent=2, sort_keys=True) + "\n"
     _require_same(folder, json.loads(text))
     for parent in (folder, folder / SHARDS_FOLDER, folder / FAILED_FOLDER):
-        for left in parent.glob(".tmp-*"):
+        for left in (each for start in LEFTOVERS for each in parent.glob(f"{start}*")):
             shutil.rmtree(left, ignore_errors=True)
     if not path.is_file() or path.read_text(encoding="utf-8") != text:
         with atomic_write(path, "w") as stream:
@@ -207,7 +211,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
     path = folder / INDEX_FILE
     if not path.exists():
         names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
-        others = [name for name in names if name != LOCK_FILE and not name.startswith(".tmp-")]
+        others = [name for name in names if name != LOCK_FILE and not name.startswith(LEFTOVERS)]
         if others:
             raise OutputError(
                 f"folder = '{folder}' has other content than a data set ({others[0]}): choose a new or an empty folder."
@@ -265,6 +269,8 @@ def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
         return
     allow_homes()
     with (
+        temporary_folder() as scratch,
+        dask.config.set({"temporary-directory": str(scratch)}),  # dask leaves its own behind where it is killed
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,

@@ -36,7 +36,7 @@ from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.differentiable.smooth_lengths import SmoothLengths
 from sionna_partial.errors import MapError
-from sionna_partial.link_model import LinkModel, link_model_of
+from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of, link_features
 from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
@@ -114,13 +114,15 @@ class DifferentiableScene:
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default. On a complete map it is not used.
     trace_settings : TraceSettings, optional
-        Refraction and diffuse reflection must be off; diffraction too on meshes.
+        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls on complete maps, and on
+        others with a predictor that was trained on such paths.
     scene_settings : SceneSettings, optional
 
     Raises
     ------
     MapError, SettingsError, PredictorError, BackendError
-        As `predict_map`, or for paths that only rays find.
+        As `predict_map`, for paths that only rays find, or for paths through walls on a map that is not complete,
+        without a predictor that was trained on such paths.
 
     Examples
     --------
@@ -156,7 +158,15 @@ class DifferentiableScene:
                 "scene has obstacles below the ceiling, which smooth lengths in walls do not know: give "
                 "dataclasses.replace(partial, obstacle=None)."
             )
+        by_losses = model.asked is None and self.simulation.trace_settings.through_walls
+        remedy = (
+            "the default prediction through walls has no gradients on a map that is not complete: give "
+            "TraceSettings(refraction=False), or a predictor that was trained on paths through walls."
+        )
+        require(self.partial.is_complete or not by_losses, "refraction", True, remedy)
         self.predictor = Predictor.load(model.asked)
+        if not self.partial.is_complete:
+            warn_of_other_traces(self.predictor, *self.simulation.resolved)
         self.networks = parts(self.predictor.model)
 
     @property

@@ -27,12 +27,12 @@ from sionna_partial.checks import (
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
-from sionna_partial.maps.bags import OCCUPIED_PERCENT, map_of_percent, occupancy_parts
+from sionna_partial.maps.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -77,6 +77,9 @@ class LiveSettings(Checked):
         Shortest time between two answers for one map, as measured powers come in [s].
     views_every_s : float
         Time between two lists of next views [s]; 0 lists them on request alone.
+    max_cost : int
+        Largest value of a published grid [percent]; greater probabilities of outage are set to it. Nav2 reads 99 as an
+        inscribed obstacle and 100 as an obstacle.
 
     Examples
     --------
@@ -92,6 +95,7 @@ class LiveSettings(Checked):
     tx_power_dbm: Annotated[float, Within(-200.0, 200.0)] = 0.0
     refresh_s: Annotated[float, Within(0.1, 1e6)] = 10.0
     views_every_s: Annotated[float, Within(0.0, 1e6)] = 0.0
+    max_cost: Annotated[int, Within(1, 100)] = MAX_COST
 
 
 class LiveGrid(NamedTuple):
@@ -108,7 +112,10 @@ class LiveGrid(NamedTuple):
     coverage : xarray.Dataset
         As `predict_map` returns it.
     cost : (ny, nx) int8 array
-        P(path gain <= threshold) in percent, -1 in walls and where nothing is known; on the cells of the message.
+        P(path gain <= threshold) in percent, at most `LiveSettings.max_cost`, on the cells of the message; -1 in walls
+        and in cells that the map does not know.
+    unknown_cost : (ny, nx) int8 array
+        The predictions for the cells that the map does not know; -1 in all others.
     header, info : dict
         Those of the map, as `nav_msgs/OccupancyGrid` has them.
     age_s : float
@@ -120,13 +127,15 @@ class LiveGrid(NamedTuple):
     is_final: bool
     coverage: xr.Dataset
     cost: NDArray[np.int8]
+    unknown_cost: NDArray[np.int8]
     header: dict[str, Any]
     info: dict[str, Any]
     age_s: float
 
-    def message(self) -> dict[str, Any]:
-        """Return the fields of a `nav_msgs/OccupancyGrid`."""
-        return {"header": self.header, "info": self.info, "data": self.cost.ravel().tolist()}
+    def message(self, *, unknown: bool = False) -> dict[str, Any]:
+        """Return the fields of a `nav_msgs/OccupancyGrid` with `cost`, or with `unknown_cost`."""
+        data = self.unknown_cost if unknown else self.cost
+        return {"header": self.header, "info": self.info, "data": data.ravel().tolist()}
 
 
 class LiveViews(NamedTuple):
@@ -172,12 +181,14 @@ class _Grid:
         sizes = {"resolution": self.resolution_m, "width": self.percent.shape[1], "height": self.percent.shape[0]}
         return {"map_load_time": self.header["stamp"], **sizes, "origin": {"position": position, "orientation": turn}}
 
-    def cost(self, coverage: xr.Dataset, threshold_db: float) -> NDArray[np.int8]:
-        """Return the percentage of outage at the nearest receiver of each cell, -1 in walls and further away."""
+    def costs(
+        self, coverage: xr.Dataset, threshold_db: float, max_cost: int
+    ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """Return the percentage of outage at the nearest receiver of free and of unknown cells, -1 in all others."""
         valid = coverage["valid"].to_numpy() == 1
-        percent = np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db)))
+        percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
         apart, nearest = distance_transform_edt(~valid, return_indices=True)
-        known = np.where(valid.any() & (apart < 2.0), percent[tuple(nearest)], -1.0)
+        predicted = np.where(valid.any() & (apart < 2.0), percent[tuple(nearest)], -1.0)
         x, y, yaw = self.origin
         rows, columns = ((np.arange(n) + 0.5) * self.resolution_m for n in self.percent.shape)
         x_m = x + math.cos(yaw) * columns - math.sin(yaw) * rows[:, None]
@@ -186,8 +197,11 @@ class _Grid:
         for name, each_m in (("y", y_m), ("x", x_m)):
             index = np.rint((each_m - float(coverage[name][0])) / float(coverage.attrs["spacing_m"])).astype(int)
             at.append(np.clip(index, 0, coverage.sizes[name] - 1))
-        wall = (self.percent >= OCCUPIED_PERCENT) & (self.percent <= 100)
-        return np.where(wall, -1, np.nan_to_num(known, nan=-1.0)[tuple(at)]).astype(np.int8)
+        cost = np.nan_to_num(predicted, nan=-1.0)[tuple(at)].astype(np.int8)
+        state = self.partial.state_at(np.stack([x_m, y_m], axis=-1))
+        state[(self.percent < 0) | (self.percent > 100)] = CellState.UNKNOWN
+        free, unknown = (np.where(state == kind, cost, np.int8(-1)) for kind in (CellState.FREE, CellState.UNKNOWN))
+        return free, unknown
 
 
 class _NewerMap(Exception):
@@ -430,9 +444,9 @@ class LiveCoverage:
             measurements=self._measured(name),
             progress=report,
         )
-        cost = grid.cost(coverage, self.settings.threshold_db)
+        cost, unknown = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
         age_s = time.monotonic() - grid.came_s
-        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, grid.header, grid.info, age_s))
+        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s))
 
     def _measured(self, name: str) -> Measurements | None:
         """Return the powers that were measured of a transmitter and can be used on the map of now."""

@@ -52,7 +52,7 @@ class Dds:
             from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
         except ImportError as error:
-            raise SettingsError("DDS needs cyclonedds: pip install 'sionna-partial[live]'.") from error
+            raise SettingsError("DDS needs cyclonedds: pip install '.[live]' in the repository.") from error
         try:
             config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
             self._domain: Any = Domain(number, config)
@@ -70,8 +70,9 @@ class Dds:
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer, reliably; who joins later gets the last one."""
-        kind, writer = self._writers[self.topics.topic_of(answer)]
-        writer.write(filled(kind, answer.message()))
+        for topic, message in self.topics.messages(answer).items():
+            kind, writer = self._writers[topic]
+            writer.write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
         """Hand messages to a `LiveCoverage`, for ever."""

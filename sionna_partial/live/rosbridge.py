@@ -44,7 +44,7 @@ class Rosbridge:
         try:
             from websockets.uri import parse_uri
         except ImportError as error:
-            raise SettingsError("rosbridge needs websockets: pip install 'sionna-partial[live]'.") from error
+            raise SettingsError("rosbridge needs websockets: pip install '.[live]' in the repository.") from error
         try:
             good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
         except ValueError:  # a port that is none
@@ -58,9 +58,9 @@ class Rosbridge:
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer; a server that starts again gets the last ones."""
-        topic = self.topics.topic_of(answer)
-        self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": answer.message()})
-        self._send(self._last[topic])
+        for topic, message in self.topics.messages(answer).items():
+            self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": message})
+            self._send(self._last[topic])
 
     def listen(self, live: LiveCoverage) -> None:
         """Hand messages to a `LiveCoverage`, for ever."""

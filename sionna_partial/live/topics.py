@@ -1,7 +1,9 @@
 """Topics of a robot: which method of a LiveCoverage takes each message, and where the robot is by its transforms."""
 
+import re
 import time
-from collections.abc import Mapping
+from collections import ChainMap
+from collections.abc import Mapping, MutableMapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -9,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sionna_partial.checks import Checked, require
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 
 MOST_FRAMES = 1000
-"""Number of frames of a robot that are kept."""
+"""Number of frames outside the robot's chain that are kept, the newest ones of `/tf` and of `/tf_static`."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
 """Types of what is published."""
@@ -25,7 +28,7 @@ TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 
 @dataclass(frozen=True)
-class Topics:
+class Topics(Checked):
     """Names of topics.
 
     Parameters
@@ -38,6 +41,13 @@ class Topics:
         Topics of `std_msgs/Float32` with received powers, and the transmitter of each; None where there is one alone.
     key_values : str
         Topic of `diagnostic_msgs/KeyValue` with the name of a transmitter and its power; "" for none.
+    unknown : bool
+        Whether the predictions for cells that the map does not know are published, with "/unknown" behind the topic.
+
+    Raises
+    ------
+    SettingsError
+        For names that no topic can have.
     """
 
     map: str = "/map"
@@ -45,6 +55,17 @@ class Topics:
     robot_frame: str = "base_link"
     powers: Mapping[str, str | None] = field(default_factory=dict)
     key_values: str = ""
+    unknown: bool = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require(isinstance(self.powers, Mapping), "powers", self.powers, "give a mapping of topics to transmitters.")
+        names = {"map": self.map, "prefix": self.prefix, **{f"powers {name}": name for name in self.powers}}
+        names |= {"key_values": self.key_values} if self.key_values else {}
+        for name, topic in names.items():
+            good = isinstance(topic, str) and re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic)
+            require(bool(good), name, topic, "give the full name of a topic, such as /map.")
+        require(bool(self.robot_frame), "robot_frame", self.robot_frame, "give a frame, such as base_link.")
 
     def types(self) -> dict[str, str]:
         """Return the message type of each topic that is listened to."""
@@ -55,11 +76,17 @@ class Topics:
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
         """Return the message type of each topic that is published for transmitters of these names."""
-        return {f"{self.prefix}/{name}": GRID_TYPE for name in names} | {f"{self.prefix}/next_views": VIEWS_TYPE}
+        ends = ("", "/unknown") if self.unknown else ("",)
+        grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
+        return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
 
-    def topic_of(self, answer: LiveGrid | LiveViews) -> str:
-        """Return where an answer is published."""
-        return f"{self.prefix}/{answer.name if isinstance(answer, LiveGrid) else 'next_views'}"
+    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, dict[str, Any]]:
+        """Return the messages of an answer by topic."""
+        if isinstance(answer, LiveViews):
+            return {f"{self.prefix}/next_views": answer.message()}
+        topic = f"{self.prefix}/{answer.name}"
+        unknown = {f"{topic}/unknown": answer.message(unknown=True)} if self.unknown else {}
+        return {topic: answer.message()} | unknown
 
 
 class _Transform(NamedTuple):
@@ -75,7 +102,11 @@ class Listener:
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
         self.live, self.topics = live, topics
-        self._frames: dict[str, _Transform] = {}
+        for topic, name in topics.powers.items():
+            known = name in live.tx_m if name is not None else len(live.tx_m) == 1
+            remedy = f"name one of the transmitters {', '.join(live.tx_m)}."
+            require(known, f"powers[{topic!r}]", name, remedy)
+        self._frames = ChainMap[str, _Transform]({}, {})  # of /tf and of /tf_static
 
     def take(self, topic: str, message: Any, time_s: float | None = None) -> None:
         """Take a message that came at `time_s`, now by default."""
@@ -86,7 +117,7 @@ class Listener:
             elif topic == f"{topics.map}_updates":
                 live.on_map_update(message)
             elif topic in ("/tf", "/tf_static"):
-                self._take_transforms(message, now_s)
+                self._take_transforms(message, now_s, self._frames.maps[topic == "/tf_static"])
             elif topic in topics.powers:
                 live.on_power(message.data, now_s, topics.powers[topic])
             elif topic == topics.key_values:
@@ -96,7 +127,7 @@ class Listener:
         except Exception as error:  # messages may hold anything
             live.report(f"a message of {topic} is dropped ({type(error).__name__}: {error}).")
 
-    def _take_transforms(self, message: Any, now_s: float) -> None:
+    def _take_transforms(self, message: Any, now_s: float, frames: MutableMapping[str, _Transform]) -> None:
         for each in message.transforms:
             turn, move = each.transform.rotation, each.transform.translation
             position_m = np.array([move.x, move.y, move.z], dtype=np.float64)
@@ -104,12 +135,15 @@ class Listener:
             child, parent = each.child_frame_id.lstrip("/"), each.header.frame_id.lstrip("/")
             if not np.isfinite([*position_m, *quaternion]).all() or not quaternion.any():
                 raise ValueError(f"the transform from {parent!r} to {child!r} is not finite")
-            if child in self._frames or len(self._frames) < MOST_FRAMES:
-                self._frames[child] = _Transform(parent, Rotation.from_quat(quaternion).as_matrix(), position_m)
-        position_m, frame, passed = np.zeros(3), self.topics.robot_frame, set[str]()
-        while frame != self.live.frame and frame in self._frames and frame not in passed:
-            passed.add(frame)
+            frames.pop(child, None)  # the newest is the last
+            frames[child] = _Transform(parent, Rotation.from_quat(quaternion).as_matrix(), position_m)
+        position_m, frame, chain = np.zeros(3), self.topics.robot_frame.lstrip("/"), set[str]()
+        while frame != self.live.frame and frame in self._frames and frame not in chain:
+            chain.add(frame)
             frame, turn, origin_m = self._frames[frame]
             position_m = turn @ position_m + origin_m
-        if frame == self.live.frame and passed & {each.child_frame_id.lstrip("/") for each in message.transforms}:
+        others = [name for name in frames if name not in chain] if len(frames) > MOST_FRAMES else []
+        for name in others[:-MOST_FRAMES]:
+            del frames[name]
+        if frame == self.live.frame and chain & {each.child_frame_id.lstrip("/") for each in message.transforms}:
             self.live.on_pose(float(position_m[0]), float(position_m[1]), now_s)

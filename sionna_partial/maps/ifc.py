@@ -104,7 +104,7 @@ def map_from_ifc(
         import ifcopenshell.geom
         from ifcopenshell.util.unit import calculate_unit_scale
     except ImportError as error:
-        raise MapError(f"path = '{path}' needs ifcopenshell: pip install 'sionna-partial[ifc]'.") from error
+        raise MapError(f"path = '{path}' needs ifcopenshell: pip install '.[ifc]' in the repository.") from error
     content = read_bytes(path, "path", MapError, MAX_IFC_BYTES, "export the storey alone.")
     if not content.lstrip().startswith(b"ISO-10303-21;") or b"END-ISO-10303-21;" not in content[-1000:]:
         raise MapError(f"path = '{path}' is damaged or no IFC (it is no whole STEP file): export it again as .ifc.")

@@ -91,7 +91,7 @@ def load_map(
         exported scene: its folder or its `scene.xml`; the folder that `sionna-partial calibrate` wrote; a mesh in
         metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
         `.xml`, or a folder with one; a point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a
-        floor plan (DXF; see `map_from_drawing`); a building model (IFC, with the extra `sionna-partial[ifc]`), whose
+        floor plan (DXF; see `map_from_drawing`); a building model (IFC, with the extra `ifc`), whose
         walls, columns, windows and curtain walls are cut 1.2 m above a storey, and whose doors are open; or a rosbag
         (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
     strict : bool

@@ -328,7 +328,7 @@ def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats)
     except Exception as error:
         raise BackendError(
             f"Sionna RT {metadata.version('sionna-rt')} cannot solve the paths ({error!r}): lower samples_per_tx if "
-            "memory ran out, or run pip install sionna-partial again."
+            "memory ran out, or install sionna-partial again."
         ) from error
 
 

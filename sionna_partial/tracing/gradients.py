@@ -106,7 +106,7 @@ def gain_gradients(
     rx : (N, 3) array-like
         Receiver positions [m]; N may be 0.
     trace_settings : TraceSettings, optional
-        Refraction and diffuse reflection must be off; diffraction too on meshes.
+        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls.
     scene_settings : SceneSettings, optional
     progress : bool or callable, optional
         As in `predict_map`.
