@@ -70,16 +70,23 @@ def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
 
 
 def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
-    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall."""
+    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall.
+
+    Its cells are aligned to the world, so that unknown cells around the map change nothing.
+    """
     factor = math.floor(cell_m / partial.resolution_m + 1e-9)
     if factor < 2:
         return partial
-    padding = [(0, -count % factor) for count in partial.shape]
+    before = np.floor(np.round(np.array(partial.origin_m) / partial.resolution_m, 3)).astype(int) % factor
+    padding = [
+        (low, -(low + count) % factor) for low, count in zip(before[::-1].tolist(), partial.shape, strict=True)
+    ]
     state = np.pad(partial.state, padding, constant_values=CellState.UNKNOWN)
     blocks = state.reshape(state.shape[0] // factor, factor, state.shape[1] // factor, factor)
     wall, free = (blocks == CellState.WALL).any(axis=(1, 3)), (blocks == CellState.FREE).mean(axis=(1, 3)) >= 0.5
     coarse = np.select([wall, free], [CellState.WALL, CellState.FREE], CellState.UNKNOWN).astype(np.uint8)
-    return PartialMap(coarse, factor * partial.resolution_m, partial.origin_m)
+    x_m, y_m = np.array(partial.origin_m) - before * partial.resolution_m
+    return PartialMap(coarse, factor * partial.resolution_m, (float(x_m), float(y_m)))
 
 
 def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
@@ -112,7 +119,7 @@ def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[Sta
         known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
         top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
         state[top : top + known.shape[0], left : left + known.shape[1]] = known
-    return state, start - np.array([spans[1][0], spans[0][0]])
+    return state, np.round(start - np.array([spans[1][0], spans[0][0]]), 6)  # the same wherever the grid begins
 
 
 def overlaps(edges: Floats, count: int) -> Floats:
