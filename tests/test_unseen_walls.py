@@ -50,7 +50,26 @@ def test_no_walls_are_expected_in_what_is_known():
     assert walls[0] == 0.0
     assert (np.diff(walls) > 0.0).all()
     seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
-    assert not np.any(seen.per_m[0, 8:21, 8:21])
+    first_x, first_y = np.round(-seen.origin_m / CELL_M).astype(int)
+    assert not np.any(seen.per_m[0, first_y : first_y + 13, first_x : first_x + 13])
+
+
+@pytest.mark.parametrize("origin_m", [(3.0, -2.0), (-12.3456, 4_500_000.05)])
+def test_the_corner_of_the_grid_does_not_matter(origin_m):
+    """Padded or cropped by unknown cells, the walls that are expected are the same to the byte."""
+    base = half_known().state
+    rx = np.array([(x, 2.0, 1.5) for x in (2.0, 4.7, 5.3, 6.5)]) + (*origin_m, 0.0)
+    first = None
+    for below, above, left, right in ((0, 0, 0, 0), *np.random.default_rng(5).integers(0, 14, (5, 4)), (0, 0, 0, -13)):
+        state = np.pad(base, ((below, above), (left, max(right, 0))), constant_values=CellState.UNKNOWN)
+        state = state[:, : state.shape[1] + min(right, 0)]
+        partial = sp.PartialMap(state, 0.1, (origin_m[0] - 0.1 * left, origin_m[1] - 0.1 * below))
+        phi = sp.LinkModel(partial, trace_settings=WIFI).features(rx[0] - (1.0, 0.4, 0.0), rx)
+        density = UnseenWalls.shipped().of_map(partial)
+        first = first or density
+        assert density.per_m.numpy().tobytes() == first.per_m.numpy().tobytes()
+        assert density.origin_m.tobytes() == first.origin_m.tobytes()
+        np.testing.assert_allclose(density.counts(phi), first.counts(phi), rtol=1e-5)
 
 
 def test_a_grown_map_is_read_again():

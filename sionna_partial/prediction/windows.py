@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, aligned_blocks
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
 
@@ -70,22 +70,13 @@ def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
 
 
 def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
-    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall.
-
-    Its cells are aligned to the world, so that unknown cells around the map change nothing.
-    """
+    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall."""
     factor = math.floor(cell_m / partial.resolution_m + 1e-9)
     if factor < 2:
         return partial
-    before = np.floor(np.round(np.array(partial.origin_m) / partial.resolution_m, 3)).astype(int) % factor
-    padding = [
-        (low, -(low + count) % factor) for low, count in zip(before[::-1].tolist(), partial.shape, strict=True)
-    ]
-    state = np.pad(partial.state, padding, constant_values=CellState.UNKNOWN)
-    blocks = state.reshape(state.shape[0] // factor, factor, state.shape[1] // factor, factor)
+    blocks, (x_m, y_m) = aligned_blocks(partial, factor)
     wall, free = (blocks == CellState.WALL).any(axis=(1, 3)), (blocks == CellState.FREE).mean(axis=(1, 3)) >= 0.5
     coarse = np.select([wall, free], [CellState.WALL, CellState.FREE], CellState.UNKNOWN).astype(np.uint8)
-    x_m, y_m = np.array(partial.origin_m) - before * partial.resolution_m
     return PartialMap(coarse, factor * partial.resolution_m, (float(x_m), float(y_m)))
 
 
