@@ -122,6 +122,11 @@ def real_array(
     return array
 
 
+def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy: str) -> "NDArray[Any]":
+    """Return numbers as a float64 array: the one way in which positions and other real quantities enter."""
+    return real_array(name, values, error, remedy).astype("float64")
+
+
 def is_whole(value: object, low: int = 0) -> bool:
     """Whether `value` is a whole number of `low` or more."""
     number = plain(value)

@@ -166,19 +166,16 @@ class SceneSettings(Checked):
     material : Material or str
         Material of walls, floor and ceiling, or of those parts of a mesh that name none; or its name, as of
         `Material.named`.
-    outline_tolerance_cells : float
-        Largest distance of a simplified wall outline from the lattice outline [cells]; up to twice as much on maps
-        whose walls are thick and rough because of range noise, and twice as much again along ragged faces.
     bridge_gap_m : float
         Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
         closed, and 0.11 m.
-    floor_extent : {"observed", "map", "none"}
-        What floor and ceiling span: the observed area (nothing comes from unknown cells), the whole map, or nothing.
+    floor_extent : {"observed", "none"}
+        Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or no floor and ceiling.
     ceiling : bool
         Whether there is a ceiling above the floor.
     outline : {"lines", "cells"}
         Where walls stand: on few straight lines fitted to the wall cells, or on the staircase through the centres of
-        the wall cells as they are, for which neither `outline_tolerance_cells` nor `bridge_gap_m` counts.
+        the wall cells as they are, for which `bridge_gap_m` does not count.
 
     Raises
     ------
@@ -193,9 +190,8 @@ class SceneSettings(Checked):
     """
 
     material: Material = DRYWALL
-    outline_tolerance_cells: Annotated[float, Within(0.0, 2.0)] = 0.5
     bridge_gap_m: Annotated[float, Within(0.0, 1.0)] = 0.5
-    floor_extent: Literal["observed", "map", "none"] = "observed"
+    floor_extent: Literal["observed", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
 

@@ -20,7 +20,7 @@ SLOPES = (
 )
 FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
 OPEN = sp.SceneSettings(floor_extent="none")
-FLOOR = sp.SceneSettings(floor_extent="map", ceiling=False, material=sp.Material(thickness_m=0.02))
+FLOOR = sp.SceneSettings(ceiling=False, material=sp.Material(thickness_m=0.02))
 TX = np.array([1.03, 1.92, 1.4])
 RX = np.array([[3.2, 2.1, 1.1], [1.5, 3.3, 0.4], [5.1, 0.7, 2.2], [1.1, 1.8, 0.2]])
 SETTINGS = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)

@@ -55,7 +55,7 @@ ROOMS = {
         *("paper_networks", "map_networks", "unseen_walls", "predictor_files", "predictor", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
-    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.predict"),
+    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job", "coverage.predict"),
     "channels": (
         *("responses", "beams", "files"),
         *("joint", "samples"),
@@ -116,6 +116,7 @@ PLOTS_ARE_FOR = ("plots.", "app.", "cli.", "export", "demo", "reports")
 
 LATER = {
     "export:save_coverage": "`coverage.radio.save`",
+    "coverage.predict:predict_map": "`LinkModel.coverage`",
     **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
     "channels.beams:beam_gains": "`TracedLinks.beam_gains`",
 }

@@ -1,11 +1,17 @@
 """LinkModel: one way from a map to a prediction, the same warm as new."""
 
+from dataclasses import replace
+from functools import cache
+
 import numpy as np
 import pytest
+import trimesh
 import xarray as xr
+from extruded import drawn
 from predictor_links import QUIET
 
 import sionna_partial as sp
+from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.prediction import predictor as predictors
 
 pytestmark = QUIET
@@ -98,3 +104,83 @@ def test_a_predictor_is_read_once(tmp_path, monkeypatch):
     assert read == [path]
     sp.Predictor.load("map").save(path)
     assert sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predictor.reads_maps
+
+
+TWO_ROOMS = """
+##########
+#...#....#
+#...#....#
+#........#
+##########
+"""
+WIFI = sp.TraceSettings(5.2e9)
+ENDS = (1.0, 1.0, 1.5), [(3.0, 1.3, 1.5), (4.2, 2.0, 1.0)]
+
+
+def two_rooms(name):
+    """Two rooms of cells without a material, of brick, or of the triangles of a mesh."""
+    plan = drawn(TWO_ROOMS)
+    if name == "brick":
+        return replace(plan, material=sp.Material.named("brick"))
+    if name == "mesh":
+        box = trimesh.creation.box((2.0, 0.1, 2.5)).apply_translation((2.5, 1.9, 1.25))
+        mesh = SceneMesh(box.vertices, box.faces, np.zeros(12, np.uint8), height_range_m=(0.0, 2.5))
+        return sp.PartialMap(np.zeros((5, 10), np.uint8), 0.5, mesh=mesh)
+    return plan
+
+
+@cache
+def fresh_gains_db(name):
+    """Resolved settings and gains of a new model of two rooms."""
+    fresh = sp.LinkModel(two_rooms(name), trace_settings=WIFI)
+    return fresh.simulation.resolved, fresh.predict(*ENDS).gain_mean_db
+
+
+@pytest.mark.parametrize(
+    ("start", "first"), [("map", "mesh"), ("path", "brick"), ("simulation", "brick"), ("simulation", "mesh")]
+)
+def test_any_chain_of_updates_is_a_new_model(first, start, tmp_path):
+    """What a map has of its own, such as a material, or paths that meshes lack, does not outlive the map."""
+    scene, settings = two_rooms(first), {"trace_settings": WIFI}
+    if start == "path":
+        sp.save_map(scene, tmp_path / "map.npz")
+        scene = tmp_path / "map.npz"
+    elif start == "simulation":
+        scene, settings = sp.Simulation(scene, **settings), {}
+    model = sp.LinkModel(scene, **settings)
+    for name in ("plan", "mesh", "brick", "plan"):
+        model.update(two_rooms(name))
+        resolved, gains_db = fresh_gains_db(name)
+        assert model.simulation.resolved == resolved
+        assert (model.simulation.trace_settings, model.simulation.scene_settings) == (WIFI, sp.SceneSettings())
+        np.testing.assert_array_equal(model.predict(*ENDS).gain_mean_db, gains_db)
+
+
+def test_only_a_map_is_an_update():
+    with pytest.raises(sp.SionnaPartialError, match="partial is of type ndarray: give a PartialMap"):
+        sp.LinkModel(two_rooms("plan")).update(two_rooms("plan").state)
+
+
+POSITIONS = [(1, 1), [1, 1], np.array([1, 1]), np.float32([1, 1]), np.array([1, 1], np.uint8), (1.0, 1.0, 1.5)]
+"""The same transmitter in every form that an array-like has."""
+
+
+@pytest.mark.parametrize("several", [False, True])
+def test_positions_are_float64_in_any_form(several):
+    model, found = sp.LinkModel(two_rooms("plan")), []
+    for position in POSITIONS[:: 2 if several else 1]:
+        forms = [[position, position], {"a": position, "b": position}, np.stack([position] * 2)]
+        for tx in forms if several else [position]:
+            coverage = model.coverage(tx, spacing_m=1.0)
+            found.append(coverage["gain_mean_db"].to_numpy())
+            height_m = coverage["tx_z"].to_numpy() if several else coverage.attrs["transmitter_m"][2]
+            assert np.all(height_m == 1.5)
+    for gain_db in found[1:]:
+        np.testing.assert_array_equal(gain_db, found[0])
+
+
+def test_next_views_and_live_coverage_take_whole_numbers():
+    partial = half_open(sp.CellState.UNKNOWN)
+    views = [sp.next_views(partial, tx, goal="area").tx_m for tx in ((2, 2), (2.0, 2.0, 1.5), {"a": [2, 2]})]
+    assert [tx_m.tolist() for tx_m in views] == [[[2.0, 2.0, 1.5]]] * 3
+    assert sp.LiveCoverage((2, 2), print).tx_m["tx"].tolist() == [2.0, 2.0, 1.5]

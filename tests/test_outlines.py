@@ -604,5 +604,5 @@ def test_settings_choose_the_staircase() -> None:
     np.testing.assert_array_equal(cells.vertices_m, expected.vertices_m)
     np.testing.assert_array_equal(cells.segments, expected.segments)
     assert (len(lines.segments), len(cells.segments)) == (1, 3)
-    other = build_scene(partial, SceneSettings(outline="cells", outline_tolerance_cells=2.0, bridge_gap_m=1.0))
+    other = build_scene(partial, SceneSettings(outline="cells", bridge_gap_m=1.0))
     np.testing.assert_array_equal(other.vertices_m, cells.vertices_m)

@@ -19,7 +19,7 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 
 SETTINGS = sp.TraceSettings(power_tolerance_db=0.0, max_depth=1)
 FIELD = sp.PartialMap(np.zeros((40, 60), dtype=np.uint8), 0.1)
-FLOOR = sp.SceneSettings(floor_extent="map", ceiling=False)
+FLOOR = sp.SceneSettings(ceiling=False)
 NOTHING = sp.SceneSettings(floor_extent="none")
 CONCRETE_AT_5_GHZ = sp.SceneSettings(material=sp.Material(itu="concrete", thickness_m=0.1))
 MESH_TX_M, MESH_RX_M = np.array([1.03, 1.92, 1.4]), np.array([[2.2, 2.4, 1.1], [1.9, 0.9, 1.3]])

@@ -44,7 +44,6 @@ RANGES = {
     (Material, "conductivity_s_m"): ("[0, 1e+09]", (0, 0.0, 1e9), (-1e-9, 2e9)),
     (Material, "thickness_m"): ("(0, 10]", (1e-9, 10), (0, -0.1, 10.1)),
     (Material, "conductivity_exponent"): ("[0, 2]", (0, 0.0, 2), (-0.1, 2.1)),
-    (SceneSettings, "outline_tolerance_cells"): ("[0, 2]", (0, 2.0), (-0.1, 2.1)),
     (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
@@ -101,9 +100,9 @@ def test_switches(kind: type, name: str) -> None:
 def test_scene_choices() -> None:
     with pytest.raises(SettingsError, match=r"material = 5 is not allowed: give Material\(\.\.\.\)"):
         SceneSettings(material=5)  # type: ignore[arg-type]
-    for extent in ("observed", "map", "none"):
+    for extent in ("observed", "none"):
         assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]
-    expected = "floor_extent = 'all' is not allowed: choose one of observed, map, none."
+    expected = "floor_extent = 'all' is not allowed: choose one of observed, none."
     with pytest.raises(SettingsError, match=re.escape(expected)):
         SceneSettings(floor_extent="all")  # type: ignore[arg-type]
     for outline in ("lines", "cells"):

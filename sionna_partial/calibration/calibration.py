@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.calibration.material_fit import (
     INCOMPLETE_WEIGHT,
     LOSSLESS,
@@ -56,6 +56,7 @@ _NUMBERS = (
 )
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
@@ -239,7 +240,7 @@ def calibrate_materials(
     """
     require(start is None or isinstance(start, Material), "start", start, "give a Material, or None for the scene's.")
     simulation = simulation_of(scene, trace_settings, scene_settings)
-    partial, settings, scene_settings = simulation.partial, simulation.trace_settings, simulation.scene_settings
+    partial, (settings, scene_settings) = simulation.partial, simulation.resolved
     settings = settings if seed is None else replace(settings, seed=seed)
     measured = measurements_of(measurements)
     measured.require_transmitters()

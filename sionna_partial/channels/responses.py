@@ -14,7 +14,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.checks import real_array, require, require_bool, require_number, require_whole
+from sionna_partial.checks import float_array, require, require_bool, require_number, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.tracing.antennas import Antennas
@@ -318,7 +318,7 @@ def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = M
     """Frequency responses (`TracedLinks.cfr`)."""
     arrays = ArrayPaths.of(paths, **options)
     remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
-    offsets_hz = real_array("frequencies_hz", frequencies_hz, SettingsError, remedy).astype(np.float64)
+    offsets_hz = float_array("frequencies_hz", frequencies_hz, SettingsError, remedy)
     carrier_hz = paths.trace_settings.frequency_hz
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from sionna_partial.arrays import Floats, Indices, States
+from sionna_partial.arrays import Floats, Indices, States, read_only
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.checks import Progress, require_memory, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
@@ -49,6 +49,7 @@ _PATHS_OF_DRAW, _PATH_BYTES, _DRAW_BYTES = 20, 300, 130
 _STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class ChannelSamples(Shown):
     """n draws of the channels of links, from `sample_channels`.

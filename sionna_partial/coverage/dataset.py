@@ -1,4 +1,4 @@
-"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and what can be asked of one."""
+"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and its accessor."""
 
 import json
 import math
@@ -15,7 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
-from sionna_partial.checks import number_of, real_array, require, require_names, require_number, shown
+from sionna_partial.checks import float_array, number_of, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
@@ -23,7 +23,7 @@ from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import LinkPrediction, OtherPredictor, Predictor
+from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction
 from sionna_partial.tracing.antennas import MAX_GAIN_DBI
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
@@ -48,7 +48,7 @@ _OF_ALL = ("observed", "cell_state", "wall_parts")
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
-"""Attributes that are needed with the position of the transmitter, and what they are above."""
+"""Required attributes besides the position of the transmitter, and their lower limits."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
 """Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""
@@ -147,7 +147,7 @@ def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
 def link_columns(
     phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Values (N,) of each variable that depends on the links."""
+    """Return the values (N,) of each variable that depends on the links."""
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
@@ -170,12 +170,12 @@ def _versions() -> str:
     return ", ".join(f"{package} {number}" for package, number in versions.items())
 
 
-def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None) -> dict[str, Any]:
-    """Global attributes on where the numbers come from; without a model the trace predicts.
+def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, Any]:
+    """Return the global attributes on the origin of the numbers; without a model the trace predicts.
 
     No time of day: equal input gives equal files.
     """
-    partial, trace_settings = simulation.partial, simulation.trace_settings
+    partial, (trace_settings, scene_settings) = simulation.partial, simulation.resolved
     return {
         "Conventions": "CF-1.11",
         "title": "Predicted radio coverage of a partially observed environment",
@@ -189,7 +189,7 @@ def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None)
         "map_wall_height_m": partial.wall_height_m,
         "map_observed_fraction": partial.observed_fraction,
         "map_complete": int(model is None),
-        "scene_settings": json.dumps(asdict(simulation.scene_settings), sort_keys=True),
+        "scene_settings": json.dumps(asdict(scene_settings), sort_keys=True),
         "trace_settings": json.dumps(asdict(trace_settings), sort_keys=True),
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
@@ -199,7 +199,7 @@ def provenance(simulation: Simulation, model: Predictor | OtherPredictor | None)
 def coverage_map(
     partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Put the values (N,) of the valid receivers, by name, on their grid, with what the map shows there."""
+    """Put the values (N,) of the valid receivers, by name, on their grid, and add the layers of the map."""
     layers: dict[str, NDArray[Any]] = {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,
@@ -276,7 +276,7 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
         )
     for name, lowest in _LOWEST.items():
         require_number(f"coverage.{name}", coverage.attrs[name], lowest, 1e15, open_low=True)
-    position_m = real_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
+    position_m = float_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
     known = position_m.shape == (3,) and bool(np.isfinite(position_m).all())
     require(known, "coverage.transmitter_m", coverage.attrs["transmitter_m"], remedy)
     _require_values(coverage)
@@ -325,7 +325,7 @@ def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
 
 @xr.register_dataset_accessor("radio")
 class CoverageAccessor:
-    """What can be asked of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
+    """Methods of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
 
     Every method raises a SettingsError for a Dataset that is no coverage map.
 
@@ -341,8 +341,13 @@ class CoverageAccessor:
     """
 
     def __init__(self, coverage: xr.Dataset) -> None:
-        inner = ("y", "x") if {"y", "x"} <= coverage.sizes.keys() else ()
-        self._coverage = coverage.transpose(..., *inner)
+        self._given = coverage
+
+    @property
+    def _coverage(self) -> xr.Dataset:
+        """The coverage map as it is now: xarray keeps the accessor when variables are assigned."""
+        inner = ("y", "x") if {"y", "x"} <= self._given.sizes.keys() else ()
+        return self._given.transpose(..., *inner)
 
     def plot(self) -> Any:
         """Return the figure of `plot_coverage`."""
@@ -430,7 +435,7 @@ class CoverageAccessor:
             5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
             of TS 38.306.
         bandwidth_hz : float
-            Of the channel; in Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
+            Channel bandwidth [Hz]; for Wi-Fi 20, 40, 80, 160 and (802.11be) 320 MHz.
 
         Raises
         ------
@@ -497,7 +502,7 @@ class CoverageAccessor:
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
-        """Return what is added to path gains, () or (T, 1, 1) [dB]."""
+        """Return the sum of EIRP and receiver gain, () or (T, 1, 1) [dB]."""
         maps = transmitters_of(self._coverage)
         require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
         offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
@@ -550,7 +555,7 @@ class CoverageAccessor:
 
 
 def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
-    """Say where the transmitter is, or how many there are."""
+    """Return the position of the transmitter, or the number of transmitters, as a text."""
     if len(maps) > 1:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()

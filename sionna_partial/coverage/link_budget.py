@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import Checked, Within, real_array, require, require_choice
+from sionna_partial.checks import Checked, Within, float_array, require, require_choice
 from sionna_partial.errors import SettingsError
 
 NOISE_DENSITY_DBM_HZ = -174.0
@@ -32,7 +32,7 @@ _SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
 _NR_QPSK = (120, 157, 193, 251, 308, 379, 449, 526, 602, 679)
 _NR_16QAM = (340, 378, 434, 490, 553, 616, 658)
 _NR_64QAM = (466, 517, 567, 616, 666, 719, 772, 822, 873, 910, 948)
-"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1; compared with published copies but for 873 and 910); MCS 17,
+"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1; compared with published copies except 873 and 910); MCS 17,
 which is no faster than 16, is left out."""
 
 _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
@@ -44,7 +44,7 @@ _NR_SHANNON = 0.6
 
 @dataclass(frozen=True)
 class LinkBudget(Checked):
-    """What receivers and traffic of a network are like; the fields are arguments of `network_map`."""
+    """Receivers and traffic of a network; the fields are arguments of `network_map`."""
 
     noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
     bandwidth_hz: Annotated[float, Within(0.0, 1e12, open_low=True)] = 100e6
@@ -53,17 +53,17 @@ class LinkBudget(Checked):
 
     @property
     def noise_dbm(self) -> float:
-        """Thermal noise and that of the receiver [dBm]."""
+        """Thermal noise plus noise figure [dBm]."""
         return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
 
 
 def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power_dbm") -> Floats:
     """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
     remedy = f"give one power [dBm], or one for each of the {count} transmitters, from -200 to 200."
-    found = real_array(name, powers_dbm, SettingsError, remedy)
+    found = float_array(name, powers_dbm, SettingsError, remedy)
     allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())
     require(allowed, name, powers_dbm, remedy)
-    return np.array(np.broadcast_to(found, count), dtype=np.float64)
+    return np.broadcast_to(found, count).copy()
 
 
 class Scheme(NamedTuple):

@@ -75,16 +75,16 @@ def network_map(
     tx_power_dbm : float or (T,) array-like
         Transmit power [dBm].
     noise_figure_db : float
-        Of the receivers [dB].
+        Noise figure of the receivers [dB].
     bandwidth_hz : float
     load : float
         Fraction of time in which an interferer transmits, in [0, 1].
     sinr_threshold_db : float
-        Of `p_sinr_above` [dB].
+        Threshold of `p_sinr_above` [dB].
     n : int
         Number of draws, up to 1,000.
     seed : int
-        Of the draws.
+        Seed of the draws.
 
     Returns
     -------
@@ -150,7 +150,7 @@ def require_network(network: xr.Dataset) -> None:
 
 
 def _map_of(coverage: xr.Dataset) -> PartialMap:
-    """Return the map at the receivers, as far as the coverage shows it."""
+    """Return the part of the map that the coverage shows, at its receivers."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = (float(coverage["x"][0]) - spacing_m / 2, float(coverage["y"][0]) - spacing_m / 2)
     return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)

@@ -1,4 +1,4 @@
-"""Coverage: map + transmitter + predictor -> coverage map, an xarray.Dataset."""
+"""predict_map: map, transmitter and predictor -> coverage map, an xarray.Dataset."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from typing import Any
 import xarray as xr
 from numpy.typing import ArrayLike
 
-from sionna_partial.checks import Progress
+from sionna_partial.checks import Progress, require_choice, require_memory
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB
-from sionna_partial.link_model import RECEIVERS, LinkModel, TxAntenna, link_model_of
+from sionna_partial.coverage.job import TxAntenna, predict_coverage
+from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.simulation import Simulation
+
+RECEIVERS = ("indoor", "anywhere")
+"""Receivers that probabilities and gains refer to: indoors (default), or anywhere."""
 
 
 def predict_map(
@@ -35,16 +40,16 @@ def predict_map(
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
-    The known part of the map is traced, and the predictor makes distributions of what the trace found and of how much
-    was not observed (paper, Section III). On a complete map the trace itself is the prediction.
+    The known part of the map is traced. The predictor turns the traced links and the unobserved lengths into
+    distributions (paper, Section III). On a complete map the trace itself is the prediction.
 
-    Probabilities and gains are those of a receiver that is indoors, as in the paper; `p_indoor` is how likely that is.
-    With ``receivers="anywhere"`` it is mixed in: outdoors, every link counts as an outage. On a complete map
+    Probabilities and gains hold for a receiver that is indoors, as in the paper; `p_indoor` is the probability that it
+    is. With ``receivers="anywhere"`` they include receivers outdoors, whose links count as outages. On a complete map
     a receiver is indoors wherever a cell is free, and outdoors elsewhere.
 
-    No receiver is inside a wall, within 1.1 cm of one, or at the transmitter (nearer than 1.1 cm, or than the
-    distance of wavelength / 4 pi at which Friis' formula passes 0 dB): `valid` is False there, floating-point
-    variables are NaN and link states 255.
+    Receivers inside walls, within 1.1 cm of a wall or at the transmitter (within 1.1 cm, or within wavelength / 4 pi,
+    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables are NaN and link
+    states 255.
 
     Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
     probabilities and gains are averaged over 8 positions drawn from it.
@@ -52,22 +57,21 @@ def predict_map(
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        The map, or whatever `load_map` reads. A `LinkModel` stays warm from call to call.
+        The map, or a file that `load_map` reads. With a `LinkModel`, later calls are faster.
     tx : (3,) or (2,) array-like, (T, 3) array-like, mapping of names to positions, or None
         Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx0",
         "tx1" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
         1.5 m high unless they have its z.
     tx_antenna : Antenna, AntennaPattern or str, a sequence of these or mapping of names to them, optional
-        Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains are then
-        those of the antenna and the path together. Link states are those of the paths, whatever the antenna: a link
-        in a null of the pattern has a low gain, and is no outage.
+        Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains then
+        include the antenna. Link states do not depend on the antenna: a link in a null of the pattern has a low gain,
+        and is no outage.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
         Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
     predictor : None, "map", "paper", path or Predictor
-        None is the shipped default, which is "map", a path one that you saved. On a complete map it is read, but not
-        used.
+        None is the shipped default, "map"; a path is a predictor that you saved. On a complete map it is not used.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     measurements : Measurements, mapping, data frame or path, optional
@@ -77,7 +81,7 @@ def predict_map(
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float
-        How much memory the process may take [GB]. Receivers are traced and predicted in blocks that fit.
+        Memory limit of the process [GB]. Receivers are traced and predicted in blocks that fit.
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
         terminals and notebooks after 2 s.
@@ -89,7 +93,7 @@ def predict_map(
         With several transmitters what depends on them is on (tx, y, x); ``.sel(tx=name)`` is the map of one.
         Without `tx` also `p_transmitter` on (tx_y, tx_x), the probability of each cell; the attribute `transmitter_m`
         is then the position from which the expected distance is smallest, `transmitter_std_m` the root mean square
-        distance from it, and features are those of the drawn position next to it.
+        distance from it, and the features belong to the drawn position nearest to it.
 
     Raises
     ------
@@ -118,13 +122,8 @@ def predict_map(
     1.0
     """
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
-    return model.coverage(
-        tx,
-        tx_antenna=tx_antenna,
-        rx_height_m=rx_height_m,
-        spacing_m=spacing_m,
-        measurements=measurements,
-        receivers=receivers,
-        memory_gb=memory_gb,
-        progress=progress,
-    )
+    require_choice("receivers", receivers, RECEIVERS)
+    require_memory(memory_gb)
+    grid = {"rx_height_m": rx_height_m, "spacing_m": spacing_m, "receivers": receivers}
+    with reporting(progress) as report:
+        return predict_coverage(model, tx, tx_antenna, measurements, memory_gb, report, **grid)

@@ -11,7 +11,7 @@ from typing import get_args
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Floats, States
+from sionna_partial.arrays import Floats, States, read_only
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
 from sionna_partial.display import Pictured
@@ -38,6 +38,7 @@ _MARGIN_M = 2.0
 _REPORT_STEPS = 10
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     """The trajectory of a robot through a home, and what it had seen at several moments.

@@ -17,22 +17,23 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 from scipy.special import entr
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, read_only
 from sionna_partial.checks import (
-    real_array,
+    float_array,
     require_choice,
     require_number,
     require_whole,
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
+from sionna_partial.coverage.job import POSITIONS, transmitter_positions
 from sionna_partial.display import Pictured, Shown
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
-from sionna_partial.link_model import POSITIONS, LinkModel, link_model_of, transmitter_positions
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets
+from sionna_partial.link_model import LinkModel, link_model_of
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets, with_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.planar import largest_part
@@ -69,6 +70,7 @@ LOOK_M = 1.25
 _HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class NextView(Shown):
     """A pose from which a robot sees something that is not known.
@@ -110,6 +112,7 @@ class NextView(Shown):
     frontier_m: Floats
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_next_views"):
     """Poses to drive to, the best first: a sequence of `NextView`.
@@ -354,7 +357,7 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
         near = cells - cells.mean(axis=0)
     else:
         remedy = "give x and y of the robot in metres, in a free cell."
-        start_m = real_array("start", start, PositionError, remedy).astype(np.float64)
+        start_m = float_array("start", start, PositionError, remedy)
         stands = start_m.shape == (2,) and np.isfinite(start_m).all() and partial.state_at(start_m) == CellState.FREE
         if not stands:
             raise PositionError(f"start = {shown(start)} is not in a free cell: {remedy}")
@@ -377,9 +380,7 @@ def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measureme
 
 def _possible_m(partial: PartialMap) -> Floats:
     """Return positions that stand for all free cells (T, 3) [m]."""
-    cells_m = np.insert(
-        cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE)), 2, DEFAULT_HEIGHT_M, axis=1
-    )
+    cells_m = with_height(cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE)))
     cells_m = cells_m[clear_of_walls(partial, cells_m)]
     if not len(cells_m):
         raise PositionError("tx can be in no free cell clear of walls: give a transmitter.")

@@ -20,9 +20,9 @@ from sionna_partial.checks import (
     Checked,
     Progress,
     Within,
+    float_array,
     no_progress,
     number_of,
-    real_array,
     require,
     settings_or_default,
     shown,
@@ -33,7 +33,7 @@ from sionna_partial.errors import MapError, MeasurementError, PositionError, Set
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import OCCUPIED_PERCENT, map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
@@ -472,9 +472,7 @@ def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Float
     for name, position in given.items():
         if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name)):
             raise SettingsError(f"tx has the name {shown(name)}: give a letter, then letters, digits or _.")
-        values = real_array(f"tx {name}", position, PositionError, "give x, y and z in metres.").astype(np.float64)
-        if values.shape == (2,):
-            values = np.append(values, DEFAULT_HEIGHT_M)
+        values = with_height(float_array(f"tx {name}", position, PositionError, "give x, y and z in metres."))
         if values.shape != (3,) or not np.isfinite(values).all():
             raise PositionError(f"tx {name} = {shown(position)} is no position: give x, y and z in metres.")
         found[name] = values

@@ -12,9 +12,9 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
-from sionna_partial.checks import is_whole, number_of, real_array, require, require_number, shown
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
+from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
+from sionna_partial.checks import float_array, is_whole, number_of, real_array, require, require_number, shown
+from sionna_partial.constants import DEFAULT_HEIGHT_M, DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import FloorPlan, Mesh
@@ -55,6 +55,7 @@ _FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np
 _RANK = np.argsort(_FREEST)
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
@@ -118,7 +119,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         object.__setattr__(self, "state", _checked_state(self.state))
         object.__setattr__(self, "resolution_m", _number("resolution_m", self.resolution_m, 1e-3, 10.0))
         remedy = "give the (x, y) of the lower-left corner in metres."
-        origin = real_array("origin_m", self.origin_m, MapError, remedy)
+        origin = float_array("origin_m", self.origin_m, MapError, remedy)
         if origin.shape != (2,):
             raise MapError(f"origin_m = {shown(self.origin_m)}: {remedy}")
         object.__setattr__(self, "origin_m", tuple(_number("origin_m", value, -1e8, 1e8) for value in origin))
@@ -426,12 +427,17 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
 def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
     """Return positions (3,) or (N, 3) [m] as a float64 array, or raise a PositionError that names them."""
-    points = real_array(name, points_m, PositionError, "give x, y, z in metres.").astype(np.float64)
+    points = float_array(name, points_m, PositionError, "give x, y, z in metres.")
     if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
         raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
     if points.size < 3 * least:
         raise PositionError(f"{name} has shape {points.shape}: give at least {least} position.")
     return points
+
+
+def with_height(points_m: Floats) -> Floats:
+    """Return positions (..., 3) [m]; those of x and y alone, (..., 2), get the default height."""
+    return np.insert(points_m, 2, DEFAULT_HEIGHT_M, axis=-1) if points_m.shape[-1:] == (2,) else points_m
 
 
 def require_height(partial: PartialMap, name: str, height_m: object) -> None:

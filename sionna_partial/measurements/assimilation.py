@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
-from sionna_partial.arrays import States
+from sionna_partial.arrays import States, read_only
 from sionna_partial.checks import require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
@@ -277,6 +277,7 @@ def _hypotheses(
             yield each._replace(log_p=log_p + each.log_evidence(received))
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class Assimilation(Shown):
     """Posterior of the links to other receivers, given measurements of one transmitter: see `fit`.

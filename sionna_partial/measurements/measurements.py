@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import number_of, real_array, shown
+from sionna_partial.arrays import Bools, Floats, read_only
+from sionna_partial.checks import float_array, number_of, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
@@ -61,6 +61,7 @@ _GIVE = (
 )
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class Measurements(Shown):
     """Measured gains of N links.
@@ -309,7 +310,7 @@ def _ends(source: Any, name: str) -> Any:
 def _numbers(name: str, values: ArrayLike, *, known: bool = True) -> NDArray[np.float64]:
     """Return finite numbers, and NaN where they need not be known, as a new array, or raise a MeasurementError."""
     cells = list(np.asarray(values)) if getattr(values, "dtype", None) == np.dtype("O") else values
-    array = real_array(name, cells, MeasurementError, "give finite numbers.").astype(np.float64)
+    array = float_array(name, cells, MeasurementError, "give finite numbers.")
     good = np.isfinite(array) | (np.isnan(array) & (not known))
     _require(good, name, array, "give finite numbers, or leave the link out.")
     return array

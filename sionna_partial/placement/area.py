@@ -11,7 +11,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import OtherPredictor, Predictor
+from sionna_partial.prediction.predictor import AnyPredictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.tracing.simulation import clear_of_walls
 
@@ -102,7 +102,7 @@ def placement_area(
     partial: PartialMap,
     height_m: float,
     rx_height_m: float,
-    model: Predictor | OtherPredictor | None,
+    model: AnyPredictor | None,
     frequency_hz: float | None = None,
 ) -> PlacementArea:
     """Find where a transmitter may stand, and receivers wherever `predict_map` has valid ones.
@@ -144,7 +144,7 @@ def _room(partial: PartialMap) -> PartialMap:
     return PartialMap(room, cell_m, partial.origin_m, partial.wall_height_m)
 
 
-def _weights(area: PlacementArea, model: Predictor | OtherPredictor | None, frequency_hz: float | None) -> Floats:
+def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: float | None) -> Floats:
     """Weight (N,) of each receiver: 1 in free cells, else the mean P(indoor) over some transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():

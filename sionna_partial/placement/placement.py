@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Pictured
@@ -45,6 +45,7 @@ FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 """Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement"):
     """A position for a transmitter, and the search that found it.
@@ -221,8 +222,7 @@ def place_transmitter(
         provenance={
             "predictor": "none: the map is complete, the trace is the answer" if model is None else model.name,
             "predictor_sha256": "" if model is None else model.fingerprint,
-            "scene_settings": asdict(simulation.scene_settings),
-            "trace_settings": asdict(simulation.trace_settings),
+            **{name: asdict(settings) for name, settings in simulation.resolved._asdict().items()},
         },
     )
 

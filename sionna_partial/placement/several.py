@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Progress, require_whole
 from sionna_partial.constants import DEFAULT_HEIGHT_M
@@ -36,6 +36,7 @@ DRAWS = 100
 _SWAPS = 20
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placement"):
     """Positions for several transmitters, and the search that found them.

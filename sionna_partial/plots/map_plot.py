@@ -9,7 +9,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import real_array
+from sionna_partial.checks import float_array
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap, require_map
@@ -86,7 +86,7 @@ def _positions(name: str, values: ArrayLike | None) -> Floats:
     if values is None:
         return np.zeros((0, 2))
     remedy = "give x and y, or x, y and z, in metres: (3,) or (N, 3)."
-    points = np.atleast_2d(real_array(name, values, PositionError, remedy).astype(np.float64))
+    points = np.atleast_2d(float_array(name, values, PositionError, remedy))
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise PositionError(f"{name} has shape {np.shape(values)}: {remedy}")
     if not np.isfinite(points).all():

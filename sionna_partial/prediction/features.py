@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
 from sionna_partial.checks import number_of, require_bool, require_type, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
@@ -56,6 +56,7 @@ _BEYOND_CELLS = 2
 """Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class LinkContext(Shown):
     """What the paths of N links cross, what the map leaves possible, and what it shows around their transmitters.
@@ -355,6 +356,7 @@ def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats
     return np.where(alone, largest, 0)
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class LinkFeatures(Shown):
     """Features of N links, or T N: those of the paper (eq. 8), and what the other predictors need in addition.

@@ -5,21 +5,22 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, overload
+from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import ndtr
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError, SettingsError
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import (
     LinkFeatures,
     context_of,
@@ -47,7 +48,8 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
-from sionna_partial.prediction.through_walls import by_mean_losses
+from sionna_partial.prediction.through_walls import WALL_LOSSES, by_mean_losses
+from sionna_partial.prediction.unseen_walls import UnseenWalls, WallDensity
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
@@ -104,6 +106,7 @@ NOISY_TRUST = 0.5
 """Weight of the trace against the networks on nearly complete maps of full noise; it is 1 on exact ones."""
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class LinkPrediction(Shown):
     """Predictive distribution of link state and path gain of links; every array is (N,) or (T, N) float64.
@@ -623,6 +626,32 @@ class OtherPredictor:
         """P(indoor) of links (N,)."""
         own = getattr(self._model, "predict_indoor", None) or _from_file(None).predict_indoor
         return np.clip(link_numbers(f"{self.name}.predict_indoor", own(phi), phi.shape), 0.0, 1.0)
+
+
+class MeanLosses:
+    """Predictor of links through walls: the mean loss of known walls times the expected number of unseen ones.
+
+    P(indoor) is predicted by networks.
+    """
+
+    name = WALL_LOSSES
+
+    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap) -> None:
+        self._networks, self._partial = networks, partial
+        self.settings, self.fingerprint = networks.settings, networks.fingerprint
+        self.predict_indoor = networks.predict_indoor
+
+    @cached_property
+    def _walls(self) -> WallDensity:
+        return UnseenWalls.shipped().of_map(self._partial)
+
+    def predict(self, phi: LinkFeatures) -> LinkPrediction:
+        """Predict links (N,)."""
+        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi))
+
+
+AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses
+"""Predictors of links that are not complete."""
 
 
 @overload

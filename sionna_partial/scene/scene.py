@@ -176,8 +176,7 @@ def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
         if settings.outline == "cells":
             outlines = lattice_outlines(walls)
         else:
-            tolerance_cells, gap_m = settings.outline_tolerance_cells, settings.bridge_gap_m
-            outlines = wall_outlines(walls, tolerance_cells=tolerance_cells, bridge_gap_m=gap_m)
+            outlines = wall_outlines(walls, bridge_gap_m=settings.bridge_gap_m)
         outlines, material = cut_by_material(outlines, walls)
         height_m = np.full(len(material), min(top_m, partial.wall_height_m))
         parts.append(_Walls(replace(outlines, segments=outlines.segments + count), material, height_m))
@@ -455,11 +454,9 @@ def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
 
 
 def floor_cells(partial: PartialMap, extent: str) -> Bools:
-    """Cells (ny, nx) that floor and ceiling cover."""
+    """Return the cells (ny, nx) that floor and ceiling cover."""
     if extent == "none":
         return np.zeros(partial.shape, dtype=bool)
-    if extent == "map":
-        return np.ones(partial.shape, dtype=bool)
     free = partial.wall_levels[0][1].state == CellState.FREE
     beside = ndimage.binary_dilation(free, structure=np.ones((3, 3)))
     return free | (beside & (partial.state == CellState.WALL))

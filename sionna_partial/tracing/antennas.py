@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, read_only
 from sionna_partial.checks import (
     Checked,
     Within,
-    real_array,
+    float_array,
     require,
     require_choice,
     require_number,
@@ -112,7 +112,7 @@ class Antennas:
         )
         name = f"{side}_orientation_rad"
         remedy = f"give three angles of rotation about z, y and x [rad], or (N, 3) for the {count} ends."
-        angles = real_array(name, np.zeros(3) if orientation_rad is None else orientation_rad, SettingsError, remedy)
+        angles = float_array(name, np.zeros(3) if orientation_rad is None else orientation_rad, SettingsError, remedy)
         require(angles.shape in ((3,), (count, 3)) and bool(np.isfinite(angles).all()), name, orientation_rad, remedy)
         wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
         positions_m = wavelength_m * np.array(array.normalized_positions, dtype=np.float64).T
@@ -147,6 +147,7 @@ class Antennas:
         return np.einsum("pji,pj->pi", self.rotation[end], vectors)
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class AntennaPattern(Shown):
     """Power pattern of an antenna from its horizontal and vertical cut, vertically polarised.
@@ -186,7 +187,7 @@ class AntennaPattern(Shown):
         require_number("gain_dbi", self.gain_dbi, -MAX_GAIN_DBI, MAX_GAIN_DBI)
         for name in ("horizontal_db", "vertical_db"):
             remedy = f"give 360 losses below the largest gain, 0 to {MAX_LOSS_DB:g} dB."
-            values = real_array(name, getattr(self, name), SettingsError, remedy).astype(np.float64)
+            values = float_array(name, getattr(self, name), SettingsError, remedy)
             require(values.shape == (360,), name, f"array of shape {values.shape}", remedy)
             good = (values >= 0.0) & (values <= MAX_LOSS_DB)
             require(bool(good.all()), name, values[~good][:1], remedy)

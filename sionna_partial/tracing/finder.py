@@ -202,7 +202,7 @@ def write_scene_of(
 ) -> PlanScene | MeshScene:
     """Write the scene of a map to an existing folder, its origin the lower-left corner of the map.
 
-    Settings come from `checked_settings`.
+    Settings come from `resolved_settings`.
     """
     offset_m, frequency_hz = partial.origin_m, settings.frequency_hz
     xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz)

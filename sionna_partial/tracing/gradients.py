@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Floats, States
+from sionna_partial.arrays import Floats, States, read_only
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Shown
@@ -28,6 +28,7 @@ def one_transmitter(tx: ArrayLike) -> ArrayLike:
     return tx
 
 
+@read_only
 @dataclass(frozen=True)
 class GainGradients(Shown):
     """Path gain from one transmitter to N receivers, and its derivatives.
@@ -172,6 +173,5 @@ def gain_gradients(
         conductivity_db_per_s_m=slopes_db[4],
         thickness_db_per_m=slopes_db[5],
         frequency_db_per_hz=slopes_db[6],
-        trace_settings=simulation.trace_settings,
-        scene_settings=simulation.scene_settings,
+        **simulation.resolved._asdict(),
     )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 
+@read_only
 @dataclass(frozen=True)
 class TracedLinks(Shown):
     """Every traced path from one or T transmitters to N receivers.

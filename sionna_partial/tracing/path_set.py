@@ -13,9 +13,9 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.display import Shown
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, forward_passes
 from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, join_paths
@@ -27,6 +27,7 @@ Part = tuple[Candidates, SolvedPaths]
 """Candidates, in scene coordinates, and the paths that they are, one for one, in world coordinates."""
 
 
+@read_only
 @dataclass(frozen=True)
 class PathParameters(Shown):
     """What the power of paths depends on.
@@ -57,7 +58,7 @@ class _Simulation(Protocol):
     """What paths ask of the `Simulation` that found them."""
 
     trace_settings: TraceSettings
-    scene_settings: SceneSettings
+    resolved: Any
 
     @property
     def solver(self) -> SceneSolver: ...
@@ -136,8 +137,7 @@ class PathSet:
             link_state=link_state,
             gain_db=gain_db,
             **vars(paths),
-            trace_settings=self._simulation.trace_settings,
-            scene_settings=self._simulation.scene_settings,
+            **self._simulation.resolved._asdict(),
         )
 
     def at(self, parameters: PathParameters) -> tuple[Floats, Floats]:

@@ -118,7 +118,9 @@ class PathColumns:
                 first += len(values)
 
     def paths(self) -> SolvedPaths:
-        """Return all paths. Nothing may be added any more."""
+        """Return all paths, read-only. Nothing may be added any more."""
+        for column in self._columns.values():
+            column.setflags(write=False)
         return SolvedPaths(**self._columns)
 
 

@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, Protocol, get_args
+from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -47,6 +47,13 @@ SAMPLE = 100
 """Number of receivers from which the number of all paths is estimated."""
 
 
+class ResolvedSettings(NamedTuple):
+    """Settings on one map: defaults of the kind of map instead of None, and the map's own material, if it has one."""
+
+    trace_settings: TraceSettings
+    scene_settings: SceneSettings
+
+
 class Simulation:
     """The paths of any links in one map, found by Sionna RT: the forward model.
 
@@ -64,8 +71,10 @@ class Simulation:
     ----------
     partial : PartialMap
     trace_settings : TraceSettings
-        With defaults in place of None, as `scene_settings`.
+        As given; what they mean on this map is in `resolved`.
     scene_settings : SceneSettings
+        As given, likewise.
+    resolved : ResolvedSettings
 
     Raises
     ------
@@ -91,7 +100,9 @@ class Simulation:
         scene_settings: SceneSettings | None = None,
     ) -> None:
         self.partial = scene if isinstance(scene, PartialMap) else load_map(scene)
-        self.trace_settings, self.scene_settings = checked_settings(self.partial, trace_settings, scene_settings)
+        self.trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+        self.scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
+        self.resolved = resolved_settings(self.partial, self.trace_settings, self.scene_settings)
         self._origin_m = np.array([*self.partial.origin_m, 0.0])
 
     def links(
@@ -132,7 +143,7 @@ class Simulation:
             valid = np.ones((len(tx_m), len(rx_m)), dtype=bool)
         ends: dict[str, Any] = {"tx": tx_m.reshape(np.shape(tx)), "rx": rx_m}
         room = self.trace_settings.most_interactions, polarisations
-        settings: dict[str, Any] = {"trace_settings": self.trace_settings, "scene_settings": self.scene_settings}
+        settings = self.resolved._asdict()
         with reporting(progress) as report:
             report(0.0, "building the scene")
             self._require_memory(tx_m, rx_m, None if folder is not None else memory_gb, valid, path_bytes(*room))
@@ -220,7 +231,7 @@ class Simulation:
     def require_frequency(self, frequency_hz: float) -> None:
         """Raise a SettingsError unless all materials cover a frequency [Hz]."""
         settings = replace(self.trace_settings, frequency_hz=float(frequency_hz))
-        checked_settings(self.partial, settings, self.scene_settings)
+        resolved_settings(self.partial, settings, self.scene_settings)
 
     def require_exact(self) -> None:
         """Raise a SettingsError for paths that only rays find, and a BackendError where they must find all."""
@@ -240,7 +251,7 @@ class Simulation:
 
     @property
     def _only_by_rays(self) -> list[Interaction]:
-        return only_by_rays(self.trace_settings, self.partial.environment.kind)
+        return only_by_rays(self.resolved.trace_settings, self.partial.environment.kind)
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
@@ -250,10 +261,10 @@ class Simulation:
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
         with temporary_folder() as folder:
-            scene = write_scene_of(self.partial, folder, self.trace_settings, self.scene_settings)
+            scene = write_scene_of(self.partial, folder, *self.resolved)
             if self._only_by_rays or engine_fault():
                 return RayFinder(scene)
-            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, self.trace_settings))
+            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, self.resolved.trace_settings))
 
     def _groups(
         self, tx_m: Floats, rx_m: Floats, rx_of_tx: Iterable[Indices], report: Progress, polarisations: int = 1
@@ -427,18 +438,14 @@ def trace_links(
     return simulation.links(tx, rx, folder=folder, memory_gb=memory_gb, invalid=invalid, progress=progress)
 
 
-def checked_settings(
-    partial: PartialMap, trace_settings: TraceSettings | None, scene_settings: SceneSettings | None
-) -> tuple[TraceSettings, SceneSettings]:
-    """Put defaults in place of None, and the map's material in place of the settings'.
-
-    Raises a SettingsError unless all materials cover the frequency.
-    """
-    settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
+def resolved_settings(
+    partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings
+) -> ResolvedSettings:
+    """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency."""
     scene_settings = scene_settings_of(partial, scene_settings)
     for material in partial.environment.known_materials(scene_settings.material):
-        material.require_frequency(settings.frequency_hz)
-    return with_defaults(settings, partial.environment.kind), scene_settings
+        material.require_frequency(trace_settings.frequency_hz)
+    return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
 
 
 def nearest_m(frequency_hz: float) -> float:

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import real_array, shown
+from sionna_partial.checks import float_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.environment import Mesh
@@ -167,7 +167,7 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
 
 def _polygon(observed: ArrayLike) -> Any:
     remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres, or a PartialMap."
-    corners = real_array("observed", observed, MapError, remedy).astype(np.float64)
+    corners = float_array("observed", observed, MapError, remedy)
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3 or not np.isfinite(corners).all():
         raise MapError(f"observed has shape {corners.shape} or values that are not finite: {remedy}")
     polygon = shapely.Polygon(corners)

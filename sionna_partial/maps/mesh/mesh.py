@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import real_array, shown
+from sionna_partial.arrays import Bools, Floats, read_only
+from sionna_partial.checks import float_array, real_array, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError
@@ -34,6 +34,7 @@ DEGENERATE_M = 1e-6
 """Triangles lower than this over their longest edge have no direction, and are dropped [m]."""
 
 
+@read_only
 @dataclass(frozen=True, eq=False)
 class SceneMesh(Shown):
     """Triangles in world axes (x right, y up, z up), in metres. There may be none: nothing has been observed then.
@@ -150,7 +151,7 @@ def equal_fields(one: Any, other: Any) -> bool:
 
 
 def _vertices(values: ArrayLike) -> Floats:
-    vertices = real_array("vertices_m", values, MapError, "give x, y, z in metres, (V, 3).").astype(np.float64)
+    vertices = float_array("vertices_m", values, MapError, "give x, y, z in metres, (V, 3).")
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise MapError(f"vertices_m has shape {vertices.shape}: give x, y, z in metres, (V, 3).")
     wrong = ~(np.abs(vertices) <= MAX_COORDINATE_M).all(axis=1)
@@ -208,7 +209,7 @@ def _height_range(given: tuple[float, float] | None, vertices_m: Floats) -> tupl
 def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
     """Return two heights as numbers, or raise a MapError."""
     remedy = "give (low, high), z in metres, low < high."
-    pair = real_array(name, given, MapError, remedy)
+    pair = float_array(name, given, MapError, remedy)
     if pair.shape != (2,) or not -MAX_COORDINATE_M <= pair[0] < pair[1] <= MAX_COORDINATE_M:
         raise MapError(f"{name} = {shown(given)} is not allowed: {remedy}")
     return float(pair[0]), float(pair[1])

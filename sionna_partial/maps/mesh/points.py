@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import real_array
+from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, open_regular
@@ -328,7 +328,7 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
     if given is None:
         return None
     remedy = "give x, y (and z) in metres, (M, 2) or (M, 3)."
-    positions = real_array("sensor_positions_m", given, MapError, remedy).astype(np.float64)
+    positions = float_array("sensor_positions_m", given, MapError, remedy)
     if positions.ndim != 2 or positions.shape[1] not in (2, 3) or not np.isfinite(positions).all():
         raise MapError(f"sensor_positions_m has shape {positions.shape} or values that are not finite: {remedy}")
     if up == "y":

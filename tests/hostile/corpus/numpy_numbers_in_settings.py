@@ -1,5 +1,5 @@
 trace = sp.TraceSettings(max_depth=np.int64(2), frequency_hz=np.float64(28e9))
-scene = sp.SceneSettings(outline_tolerance_cells=np.float32(0.5))
+scene = sp.SceneSettings(bridge_gap_m=np.float32(0.5))
 coverage = sp.predict_map(room(), TX, spacing_m=np.float64(1.0), predictor="paper", trace_settings=trace, scene_settings=scene)
 sp.save_coverage(coverage, folder / "coverage.nc")
 sp.save_map(room(), folder / "map.yaml", extra={"score": np.float32(1.5), "steps": np.int64(3)})

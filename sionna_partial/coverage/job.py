@@ -1,0 +1,327 @@
+"""Coverage jobs: grid of receivers -> blocks of links -> mean over positions, measurements -> xarray.Dataset."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, TypeAlias
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike
+from scipy.spatial import cKDTree
+
+from sionna_partial.arrays import Bools, Floats
+from sionna_partial.checks import Progress, float_array, no_progress, require, require_names
+from sionna_partial.coverage.dataset import (
+    ANTENNA,
+    Receivers,
+    coverage_map,
+    grid_receivers,
+    join_transmitters,
+    link_columns,
+    provenance,
+    with_posterior,
+)
+from sionna_partial.errors import MemoryLimitError, PositionError
+from sionna_partial.link_model import LinkModel, PredictedLinks
+from sionna_partial.maps.partial_map import PartialMap, with_height
+from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
+from sionna_partial.measurements.measurements import (
+    SAME_TX_M,
+    Measurements,
+    measurements_of_each,
+    measurements_of_others,
+)
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.progress import part_of
+from sionna_partial.tracing.antennas import Antenna, AntennaPattern
+from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
+
+OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
+TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
+"""Antennas of transmitters: one of all, or one for each."""
+
+POSITIONS = 8
+"""Number of positions of an unknown transmitter over which coverage is averaged."""
+
+LARGE_OFFSET_DB = 15.0
+"""Offset between measurements and predictions from which on they are powers and not path gains [dB]."""
+
+UNSURE_P = 0.05
+"""Probability of the less probable kind of measurements, powers or path gains, from which on a warning is logged."""
+
+LOCATING_FRACTION = 0.3
+"""Fraction of the progress bar for finding a transmitter."""
+
+LIBRARIES_GB, CELL_BYTES, RECEIVER_BYTES, WORK_BYTES = 1.0, 40, 400, 120_000
+"""Memory of the process with all libraries [GB], of a cell of the map, of a receiver, and of a receiver of the block
+that is predicted [bytes]; `benchmarks/scale.py` measures them."""
+
+BLOCK_RECEIVERS = (500, 8_000)
+"""Smallest and largest number of receivers of a block."""
+
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class Transmitter:
+    """A transmitter to predict; `position_m` (3,) is None if it is to be found from the measurements."""
+
+    name: str
+    position_m: Floats | None
+    antenna: Antenna
+    grid: Receivers
+    measured: Measurements | None = None
+
+
+@dataclass(frozen=True)
+class _Source:
+    """Possible positions (K, 3) [m] of a transmitter, weights (K,), an assimilation for each, and the best estimate."""
+
+    tx_m: Floats
+    weights: Floats
+    assimilations: Sequence[Assimilation]
+    position_m: Floats
+    antenna: Antenna
+
+
+@dataclass(frozen=True)
+class CoverageJob:
+    """Predicts the coverage of one transmitter after the other, `block` receivers at a time."""
+
+    model: LinkModel
+    rx_height_m: float
+    spacing_m: float
+    receivers: str
+    block: int
+    others: Sequence[Assimilation] = ()
+
+    def coverage(self, transmitter: Transmitter, report: Progress) -> xr.Dataset:
+        """Predict the coverage map of a transmitter."""
+        model, measured, grid = self.model, transmitter.measured, transmitter.grid
+        posterior = None
+        if transmitter.position_m is None:
+            posterior = self._located(transmitter, report)
+            source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
+            grid = receivers_of(model, source.tx_m, self.rx_height_m, self.spacing_m)
+        else:
+            source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
+        blocks, complete = [], True
+        for links in self._averaged(source, grid.rx_m, report):
+            anywhere = self.receivers == "anywhere"
+            blocks.append(link_columns(links.phi, links.prediction, links.p_indoor, anywhere=anywhere))
+            complete &= bool(links.complete.all())
+        values = {name: np.concatenate([columns[name] for columns in blocks]) for name in blocks[0]}
+        attributes = provenance(model.simulation, None if complete else model.predictor) | {
+            "transmitter_m": source.position_m,
+            ANTENNA: str(source.antenna),
+            "rx_height_m": float(self.rx_height_m),
+            "spacing_m": float(self.spacing_m),
+            "receivers": self.receivers,
+        }
+        if measured is not None:
+            attributes |= _measurement_attributes(measured, source)
+        coverage = coverage_map(model.partial, grid, values, attributes)
+        return coverage if posterior is None else with_posterior(coverage, posterior)
+
+    def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
+        """Return the job with the measurements of other transmitters assimilated, each alone.
+
+        They give the prior of offset and loss of walls. Where walls are opaque, or where the transmitter is unknown,
+        they are not used.
+        """
+        settings = self.model.simulation.trace_settings
+        known_m = [each.position_m for each in transmitters if each.position_m is not None]
+        if measurements is None or not known_m or not settings.through_walls:
+            return self
+        others = measurements_of_others(
+            self.model.partial, [at_m[None] for at_m in known_m], measurements, settings.frequency_hz
+        )
+        return replace(self, others=[self._assimilated(other.tx[0], other, Antenna()) for other in others])
+
+    def _source(
+        self,
+        transmitter: Transmitter,
+        tx_m: Floats,
+        weights: Floats,
+        p_powers: Sequence[float | None],
+        position_m: Floats,
+    ) -> _Source:
+        """Assimilate the measurements for each possible position (K, 3) [m]."""
+        p_any = float(weights @ [p or 0.0 for p in p_powers])
+        if min(p_any, 1.0 - p_any) > UNSURE_P:
+            _log.warning(
+                "with probability %.2f powers were measured and no path gains: give gains if their offset is known",
+                p_any,
+            )
+        assimilations = []
+        if transmitter.measured is not None:
+            for at_m, p in zip(tx_m, p_powers, strict=True):
+                elsewhere = [other for other in self.others if np.linalg.norm(other.tx_m - at_m) > SAME_TX_M]
+                options = {"p_powers": p, "others": elsewhere}
+                assimilations.append(self._assimilated(at_m, transmitter.measured, transmitter.antenna, **options))
+        return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
+
+    def _averaged(self, source: _Source, rx_m: Floats, report: Progress) -> Iterator[PredictedLinks]:
+        """Yield blocks of the links to receivers (N, 3) [m], averaged over the positions."""
+        tx_m, begin = source.tx_m, LOCATING_FRACTION * (len(source.tx_m) > 1)
+        nearest = int(np.linalg.norm(tx_m - source.position_m, axis=1).argmin())
+        for start in range(0, len(rx_m), self.block):
+            block_m, found = rx_m[start : start + self.block], []
+            for index, at_m in enumerate(tx_m):
+
+                def within(fraction: float, message: str, start: int = start, index: int = index) -> None:
+                    done = (start + (index + fraction) / len(tx_m) * self.block) / len(rx_m)
+                    report(min(0.99, begin + (1.0 - begin) * done), message)
+
+                links = self.model.links(at_m, block_m, within, source.antenna)
+                if source.assimilations:
+                    updated = source.assimilations[index].update(block_m, links.prediction)
+                    links = links._replace(prediction=updated)
+                found.append(links)
+            yield found[nearest]._replace(
+                prediction=LinkPrediction.mixture([links.prediction for links in found], source.weights),
+                p_indoor=source.weights @ [links.p_indoor for links in found],
+                complete=np.all([links.complete for links in found], axis=0),
+            )
+
+    def _prior(self, tx_m: Floats, rx_m: Floats, antenna: Antenna) -> tuple[LinkPrediction, Floats]:
+        """Predict the links to any number of receivers (N, 3) [m], and the probability that each is indoors."""
+        starts = range(0, len(rx_m), self.block)
+        blocks = [self.model.links(tx_m, rx_m[start : start + self.block], no_progress, antenna) for start in starts]
+        p_indoor = np.concatenate([links.p_indoor for links in blocks])
+        return LinkPrediction.concatenate([links.prediction for links in blocks]), p_indoor
+
+    def _located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
+        """Find a transmitter from its measurements."""
+        partial, measured = self.model.partial, transmitter.measured
+        assert measured is not None
+        measured_at, limit_m = cKDTree(measured.rx), nearest_m(self.model.simulation.trace_settings.frequency_hz)
+
+        def allowed(points_m: Floats) -> Bools:
+            return clear_of_walls(partial, points_m) & (measured_at.query(points_m)[0] >= limit_m)
+
+        def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats]:
+            return self._prior(tx_m, rx_m, transmitter.antenna)
+
+        return locate_transmitter(partial, measured, allowed, predict, part_of(report, 0.0, LOCATING_FRACTION))
+
+    def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
+        """Predict the measured links of a transmitter at (3,) [m], and fit the process to them."""
+        prior, _ = self._prior(tx_m, measured.rx, antenna)
+        settings = self.model.simulation.trace_settings
+        options |= {"frequency_hz": settings.frequency_hz, "through_walls": settings.through_walls}
+        return Assimilation.fit(self.model.partial, tx_m, measured, prior, **options)
+
+
+def predict_coverage(
+    model: LinkModel,
+    tx: ArrayLike | Mapping[str, ArrayLike] | None,
+    tx_antenna: TxAntenna,
+    measurements: Any,
+    memory_gb: float,
+    report: Progress,
+    **grid: Any,
+) -> xr.Dataset:
+    """Predict the coverage of all transmitters; `grid` has `rx_height_m`, `spacing_m` and `receivers`."""
+    report(0.0, "building the scene")
+    names, transmitters = _transmitters(model, tx, tx_antenna, measurements, grid["rx_height_m"], grid["spacing_m"])
+    block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
+    job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
+    maps = []
+    for number, transmitter in enumerate(transmitters):
+        part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
+        maps.append(job.coverage(transmitter, part))
+    report(1.0, "done")
+    return maps[0] if names is None else join_transmitters(maps, names)
+
+
+def _transmitters(
+    model: LinkModel,
+    tx: ArrayLike | Mapping[str, ArrayLike] | None,
+    tx_antenna: TxAntenna,
+    measurements: Any,
+    rx_height_m: float,
+    spacing_m: float,
+) -> tuple[list[str] | None, list[Transmitter]]:
+    """Check the transmitters, and read their measurements; names are None for a single one."""
+    partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
+    names: list[str] | None = None
+    positions_m: list[Floats | None] = [None]
+    if tx is not None or measurements is None:
+        names, known_m = transmitter_positions(partial, tx)
+        positions_m = [*known_m]
+    antennas = antennas_of(tx_antenna, names)
+    sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
+    grids = [receivers_of(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
+    measured: list[Measurements | None] = [None] * len(sources_m)
+    if measurements is not None:
+        measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
+    rows = zip(names or [""], positions_m, antennas, grids, measured, strict=True)
+    return names, [Transmitter(*row) for row in rows]
+
+
+def receivers_of(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
+    """Return the grid of receivers for transmitters (K, 3) [m]."""
+    frequency_hz = model.simulation.trace_settings.frequency_hz
+    return grid_receivers(model.partial, tx_m, rx_height_m, spacing_m, frequency_hz)
+
+
+def transmitter_positions(
+    partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike] | None
+) -> tuple[list[str] | None, Floats]:
+    """Return the names of several transmitters, None for one, and positions (T, 3) [m]."""
+    if tx is None:
+        raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
+    positions = list(tx.values()) if isinstance(tx, Mapping) else tx
+    positions = float_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
+    tx_m = partial.require_positions("tx", with_height(positions))
+    names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
+    require_names("names of tx", names)
+    return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
+
+
+def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]:
+    """Return the antenna of each transmitter; `names` is None for one."""
+    if names is None or isinstance(tx_antenna, (Antenna, AntennaPattern, str, type(None))):
+        return [Antenna.of(tx_antenna)] * len(names or [""])  # type: ignore[arg-type]
+    remedy = f"give one antenna for all transmitters, or one for each of {', '.join(names)}."
+    by_name = tx_antenna if isinstance(tx_antenna, Mapping) else {}
+    sequence = isinstance(tx_antenna, Sequence) and len(tx_antenna) == len(names)
+    require(sequence or {*by_name} == {*names}, "tx_antenna", tx_antenna, remedy)
+    return [Antenna.of(by_name[name] if by_name else tx_antenna[at]) for at, name in enumerate(names)]  # type: ignore[index]
+
+
+def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: float) -> int:
+    """Return how many receivers are predicted together, or raise a MemoryLimitError if the limit is too low."""
+    count, (fewest, most) = len(receivers.rx_m), BLOCK_RECEIVERS
+    kept_gb = LIBRARIES_GB + (CELL_BYTES * partial.state.size + RECEIVER_BYTES * receivers.valid.size) / 1e9
+    needed_gb = kept_gb + WORK_BYTES * min(count, fewest) / 1e9
+    if needed_gb > memory_gb:
+        raise MemoryLimitError(
+            f"memory_gb = {memory_gb:g} is too little: {count:,} receivers on a map of {partial.state.size:,} cells "
+            f"take about {needed_gb:.2g} GB. Give more memory_gb, a larger spacing_m, or a part of the map."
+        )
+    fitting = (memory_gb - kept_gb) / WORK_BYTES * 1e9
+    return int(min(max(fitting, fewest), most))
+
+
+def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
+    """Return attributes of the measurements; a large offset is logged."""
+    of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
+    noise_db, offset_db, shadow_scale = source.weights @ of_each
+    if abs(offset_db) > LARGE_OFFSET_DB:
+        _log.warning(
+            "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
+            abs(offset_db),
+            "above" if offset_db > 0 else "below",
+        )
+    return {
+        "measured_links": len(measured),
+        "measured_noise_db": float(noise_db),
+        "measured_offset_db": float(offset_db),
+        "measured_shadow_scale": float(shadow_scale),
+    }
