@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import CellState
-from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write, read_bytes
+from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer, tf
+from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.windows import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 
@@ -102,8 +102,7 @@ class UnseenWalls(NamedTuple):
     def shipped(cls) -> Self:
         """Return those of the package."""
         networks = cls.untrained()
-        content = read_bytes(WEIGHTS_FILE, "path", PredictorError, _MAX_BYTES, "install sionna-partial again.")
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
             for name, network in networks._asdict().items():
                 network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
         return networks
@@ -121,10 +120,10 @@ class UnseenWalls(NamedTuple):
     def of_map(self, partial: PartialMap) -> WallDensity:
         """Read what is known of a map."""
         known = _known_part(partial)
-        corner_m = np.array(known.origin_m)
-        pooled_m = _POOLED * CELL_M
-        ends_m = np.stack([corner_m - _BORDER_M, corner_m + np.array(known.shape[::-1]) * known.resolution_m + _BORDER_M])
-        first, last = np.floor(np.round(ends_m[0] / pooled_m, 6)), np.ceil(np.round(ends_m[1] / pooled_m, 6))
+        x0, y0, x1, y1 = known.bounds_m
+        corner_m, pooled_m = np.array([x0, y0]), _POOLED * CELL_M
+        first = np.floor(np.round((corner_m - _BORDER_M) / pooled_m, 6))
+        last = np.ceil(np.round((np.array([x1, y1]) + _BORDER_M) / pooled_m, 6))
         nx, ny = ((last - first) * _POOLED).astype(int).tolist()
         start_m = first * pooled_m
         image = map_image(known, (ny, nx), np.round((start_m - corner_m) / known.resolution_m, 6))
