@@ -266,6 +266,11 @@ class TraceSettings(Checked):
     seed: Seed = 42
 
     @property
+    def tolerance_db(self) -> float:
+        """`power_tolerance_db`, or its default where only powers count [dB]."""
+        return POWER_TOLERANCE_DB if self.power_tolerance_db is None else self.power_tolerance_db
+
+    @property
     def through_walls(self) -> bool:
         """Whether paths go through walls at this frequency."""
         return self.frequency_hz < OPAQUE_FROM_HZ if self.refraction is None else self.refraction

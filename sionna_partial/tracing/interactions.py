@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from sionna_partial.maps.environment import EnvironmentKind
-from sionna_partial.settings import POWER_TOLERANCE_DB, TraceSettings
+from sionna_partial.settings import TraceSettings
 
 
 @dataclass(frozen=True)
@@ -59,9 +59,7 @@ def with_defaults(settings: TraceSettings, environment: EnvironmentKind) -> Trac
     """Return settings with values in place of None: by default, candidates alone find the paths."""
     unset = [kind for kind in INTERACTIONS if kind.setting and getattr(settings, kind.setting) is None]
     values: dict[str, Any] = {kind.setting: environment in kind.exact_on and kind.default(settings) for kind in unset}
-    if settings.power_tolerance_db is None:
-        values["power_tolerance_db"] = POWER_TOLERANCE_DB
-    return replace(settings, **values)
+    return replace(settings, **values, power_tolerance_db=settings.tolerance_db)
 
 
 def only_by_rays(settings: TraceSettings, environment: EnvironmentKind) -> list[Interaction]:
