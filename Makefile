@@ -9,6 +9,8 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_
 LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
+CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
+
 .PHONY: help demo test kernels docs hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
@@ -63,8 +65,10 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
+	@$(CHECKSUMS)
 	@$(BIN)/python -m sionna_partial.training.paths sionna_partial/predictors/paths.npz
 	@$(BIN)/python -m sionna_partial.training.walls sionna_partial/predictors/unseen_walls.npz
+	@$(CHECKSUMS)
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"
 

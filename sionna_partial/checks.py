@@ -172,6 +172,8 @@ class Checked:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
+    if NoneType in arguments and get_origin(arguments[0]) is Annotated:
+        return None if value is None else _checked(name, value, arguments[0])
     if get_origin(hint) is Annotated:
         number, allowed = arguments
         if number is int:

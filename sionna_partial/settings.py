@@ -40,6 +40,9 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 FREQUENCIES_HZ = (1e6, 1e12)
 """Lowest and highest carrier frequency [Hz]."""
 
+POWER_TOLERANCE_DB = 0.1
+"""Default of `TraceSettings.power_tolerance_db` where only powers count [dB]."""
+
 OPAQUE_FROM_HZ = 24e9
 """Frequency from which on walls are opaque unless set otherwise [Hz]."""
 
@@ -214,10 +217,11 @@ class TraceSettings(Checked):
         Largest number of reflections at walls of a floor plan before the diffraction, and after it: 0, 1 or 2.
     open_ends : bool
         Whether a wall of a floor plan diffracts also where it ends because observation did.
-    power_tolerance_db : float
+    power_tolerance_db : float or None
         By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
         every path. The power of all candidates is computed before any is verified, and is at least what Sionna RT finds
-        but for rounding.
+        but for rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir` and the like),
+        which are sums of fields: links that were traced with None are traced again for them.
     refraction : bool or None
         Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
         below.
@@ -253,13 +257,18 @@ class TraceSettings(Checked):
     diffraction: bool | None = None
     diffraction_walls: Annotated[int, Within(0, 2)] = 2
     open_ends: bool = False
-    power_tolerance_db: Annotated[float, Within(0.0, 1.0)] = 0.1
+    power_tolerance_db: Annotated[float, Within(0.0, 1.0)] | None = None
     refraction: bool | None = None
     max_walls: Annotated[int, Within(1, 16)] = 8
     wall_depth_m: Annotated[float, Within(0.0, 10.0)] = 0.6
     diffuse_reflection: bool = False
     samples_per_tx: Annotated[int, Within(1, 100_000_000)] = 1_000_000
     seed: Seed = 42
+
+    @property
+    def tolerance_db(self) -> float:
+        """`power_tolerance_db`, or its default where only powers count [dB]."""
+        return POWER_TOLERANCE_DB if self.power_tolerance_db is None else self.power_tolerance_db
 
     @property
     def through_walls(self) -> bool:

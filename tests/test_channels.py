@@ -16,6 +16,7 @@ from test_trace import _room
 from traced import made_links
 
 import sionna_partial as sp
+from sionna_partial.channels import responses
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
 from sionna_partial.scene.scene import export_scene
@@ -269,6 +270,41 @@ def some_links() -> sp.TracedLinks:
 @pytest.fixture(scope="module")
 def several() -> sp.TracedLinks:
     return some_links()
+
+
+class TestEveryPath:
+    """Channels are sums of fields: weak paths count, which the default tolerance leaves out of links."""
+
+    RX: ClassVar = [(5.2, 0.7, 1.5), (4.1, 3.3, 1.2)]
+    OFFSETS_HZ: ClassVar = np.linspace(-1e8, 1e8, 9)
+
+    def links(self, **settings: Any) -> sp.TracedLinks:
+        traced = sp.TraceSettings(max_depth=3, **settings)
+        return sp.trace_links(_room(), TX, self.RX, trace_settings=traced)
+
+    def test_channels_have_it_unless_a_tolerance_was_set(self) -> None:
+        links, every, set_by_user = self.links(), self.links(power_tolerance_db=0.0), self.links(power_tolerance_db=0.1)
+        assert len(links.a) == len(set_by_user.a) < len(every.a)
+        for name, arguments in (("cfr", (self.OFFSETS_HZ,)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
+            found, expected, weaker = (getattr(each, name)(*arguments) for each in (links, every, set_by_user))
+            xr.testing.assert_identical(found, expected)
+            assert not found.equals(weaker)
+            assert (found.power_tolerance_db, weaker.power_tolerance_db) == (0.0, 0.1)
+        assert vars(links)["every_path"].a.tobytes() == every.a.tobytes()
+        assert self.links().trace_settings.power_tolerance_db == 0.1
+
+    def test_links_without_their_map_keep_what_was_traced(self, caplog: pytest.LogCaptureFixture) -> None:
+        responses._log_tolerance.cache_clear()
+        links = replace(self.links())
+        with caplog.at_level("INFO", "sionna_partial"):
+            assert [links.cir().paths.sum(), links.cir().power_tolerance_db] == [len(links.a), 0.1]
+        assert sum("channels lack paths" in message for message in caplog.messages) == 1
+
+    def test_written_channels_have_every_path(self, tmp_path: Path) -> None:
+        sp.save_channels(self.links(), tmp_path / "channels.nc")
+        found = sp.load_channels(tmp_path / "channels.nc")
+        assert found.paths.sum() == len(self.links(power_tolerance_db=0.0).a)
+        assert found.power_tolerance_db == 0.0
 
 
 class TestResponses:

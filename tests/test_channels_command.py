@@ -44,6 +44,7 @@ def test_receivers_of_a_file(map_path: Path, tmp_path: Path) -> None:
     )
     expected = links.cir(tx_array=tx_array, rx_array=rx_array, tx_orientation_rad=(-0.5, 0.1, 0.0))
     np.testing.assert_array_equal(found.a[:, :, 0, :, :, 0], expected.a)
+    assert found.power_tolerance_db == expected.power_tolerance_db == 0.0
 
 
 def test_grid(map_path: Path, tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ ROOMS = {
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs", "through_walls"),
-        *("paper_networks", "map_networks", "unseen_walls", "predictor_files", "predictor", "path_model"),
+        *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
     ),
     "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job", "coverage.predict"),

@@ -184,3 +184,26 @@ def test_next_views_and_live_coverage_take_whole_numbers():
     views = [sp.next_views(partial, tx, goal="area").tx_m for tx in ((2, 2), (2.0, 2.0, 1.5), {"a": [2, 2]})]
     assert [tx_m.tolist() for tx_m in views] == [[[2.0, 2.0, 1.5]]] * 3
     assert sp.LiveCoverage((2, 2), print).tx_m["tx"].tolist() == [2.0, 2.0, 1.5]
+
+
+@pytest.mark.parametrize("frequency_hz", [28e9, 5e9])
+def test_unknown_cells_around_a_map_change_no_prediction(maps, tx, frequency_hz):
+    """Padded or cropped: a map that grows does not make predictions jump, nor measured ones."""
+    x0, y0, x1, y1 = maps[1].bounds_m
+    points = np.random.default_rng(2).uniform((x0 + 0.7, y0 + 0.7, 1.4), (x1 - 0.7, y1 - 0.7, 1.6), (40, 3))
+    rx = points[maps[1].radios_can_stand(points) & (np.linalg.norm(points - tx, axis=1) > 0.2)]
+    settings, known = sp.TraceSettings(frequency_hz), np.argwhere(maps[1].state != sp.CellState.UNKNOWN)
+    spare = np.minimum(known.min(axis=0), np.array(maps[1].shape) - 1 - known.max(axis=0)).min()
+    found = []
+    for below, left in ((0, 0), (1, 13), (7, 2), (-min(spare, 5), -min(spare, 7))):
+        state = np.pad(maps[1].state, ((max(below, 0), 3), (max(left, 0), 1)), constant_values=sp.CellState.UNKNOWN)
+        state = state[max(-below, 0) :, max(-left, 0) :]
+        corner_m = np.array(maps[1].origin_m) - maps[1].resolution_m * np.array([left, below])
+        partial = sp.PartialMap(state, maps[1].resolution_m, tuple(corner_m.tolist()))
+        model = sp.LinkModel(partial, trace_settings=settings)
+        prediction = model.predict(tx, rx)
+        measured = sp.Measurements(tx, rx[:10], prediction.gain_mean_db[:10] - 6.0)
+        posterior = sp.Assimilation.fit(partial, tx, measured, prediction.take(slice(10)), frequency_hz=frequency_hz)
+        found.append((prediction.gain_mean_db, posterior.update(rx, prediction).gain_mean_db))
+    assert len(rx) > 15
+    np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=0, atol=0.005)

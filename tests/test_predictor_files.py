@@ -1,6 +1,7 @@
 import io
 import json
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -19,11 +20,13 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import OutputError, PredictorError
+from sionna_partial.prediction import predictor_files
 from sionna_partial.prediction.inputs import GAIN_INPUTS, LINK_INPUTS
 from sionna_partial.prediction.map_networks import LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
 from sionna_partial.prediction.paper_networks import assemble, import_keras, parts
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.prediction.predictor_files import FORMAT, digest, pack
+from sionna_partial.prediction.predictor_files import CHECKSUMS, FORMAT, digest, pack, shipped_bytes
+from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
 
@@ -248,6 +251,33 @@ def test_bad_card(saved, change, message):
     path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
     with pytest.raises(PredictorError, match=re.escape(message)):
         Predictor.load(saved)
+
+
+@pytest.mark.parametrize(("networks", "named"), [("paper", "map"), ("map", "paper"), ("map", "paths")])
+def test_card_that_names_other_networks(saved, networks, named):
+    predictor = quick_predictor() if networks == "paper" else context_predictor(networks)
+    predictor.save(saved)
+    path = saved.with_suffix(".json")
+    card = json.loads(path.read_text())
+    path.write_text(json.dumps({**card, "settings": {**card["settings"], "networks": named}}))
+    message = f"settings.networks = '{named}', but the weights beside it are of '{networks}' networks: copy both"
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        Predictor.load(saved)
+
+
+def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path):
+    names = sorted(path.name for path in PREDICTORS_FOLDER.iterdir() if path.name != CHECKSUMS)
+    lines = (PREDICTORS_FOLDER / CHECKSUMS).read_text().splitlines()
+    assert sorted(line.split()[1] for line in lines) == names
+    for name in names:
+        assert len(shipped_bytes(PREDICTORS_FOLDER / name)) > 0
+        shutil.copy(PREDICTORS_FOLDER / name, tmp_path)
+    shutil.copy(PREDICTORS_FOLDER / CHECKSUMS, tmp_path)
+    monkeypatch.setattr(predictor_files, "PREDICTORS_FOLDER", tmp_path)
+    card = json.loads((tmp_path / "map.json").read_text())
+    (tmp_path / "map.json").write_text(json.dumps({**card, "settings": {**card["settings"], "frequency_hz": 60e9}}))
+    with pytest.raises(PredictorError, match=r"map\.json' has SHA-256 .* was changed; install sionna-partial again"):
+        predictor_files.read_files(tmp_path / "map.keras")
 
 
 @pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\xff"])

@@ -6,7 +6,15 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
+from sionna_partial.prediction.unseen_walls import (
+    CELL_M,
+    WEIGHTS_FILE,
+    UnseenWalls,
+    corrected,
+    map_image,
+    walls_met,
+    walls_per_m,
+)
 from sionna_partial.training.walls import Lines, fit_unseen_walls, lines_of
 
 WALLS_PER_M = 0.37
@@ -50,7 +58,26 @@ def test_no_walls_are_expected_in_what_is_known():
     assert walls[0] == 0.0
     assert (np.diff(walls) > 0.0).all()
     seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
-    assert not np.any(seen.per_m[0, 8:21, 8:21])
+    first_x, first_y = np.round(-seen.origin_m / CELL_M).astype(int)
+    assert not np.any(seen.per_m[0, first_y : first_y + 13, first_x : first_x + 13])
+
+
+@pytest.mark.parametrize("origin_m", [(3.0, -2.0), (-12.3456, 4_500_000.05)])
+def test_the_corner_of_the_grid_does_not_matter(origin_m):
+    """Padded or cropped by unknown cells, the walls that are expected are the same to the byte."""
+    base = half_known().state
+    rx = np.array([*origin_m, 0.0]) + [(x, 2.0, 1.5) for x in (2.0, 4.7, 5.3, 6.5)]
+    first = None
+    for below, above, left, right in ((0, 0, 0, 0), *np.random.default_rng(5).integers(0, 14, (5, 4)), (0, 0, 0, -13)):
+        state = np.pad(base, ((below, above), (left, max(right, 0))), constant_values=CellState.UNKNOWN)
+        state = state[:, : state.shape[1] + min(right, 0)]
+        partial = sp.PartialMap(state, 0.1, (origin_m[0] - 0.1 * left, origin_m[1] - 0.1 * below))
+        phi = sp.LinkModel(partial, trace_settings=WIFI).features(rx[0] - (1.0, 0.4, 0.0), rx)
+        density = UnseenWalls.shipped().of_map(partial)
+        first = first or density
+        assert density.per_m.numpy().tobytes() == first.per_m.numpy().tobytes()
+        assert density.origin_m.tobytes() == first.origin_m.tobytes()
+        np.testing.assert_allclose(density.counts(phi), first.counts(phi), rtol=1e-5)
 
 
 def test_a_grown_map_is_read_again():
@@ -83,6 +110,20 @@ def test_missing_weights(monkeypatch, tmp_path):
     monkeypatch.setattr("sionna_partial.prediction.unseen_walls.WEIGHTS_FILE", tmp_path / "unseen_walls.npz")
     with pytest.raises(PredictorError, match=r"unseen_walls\.npz' cannot be read"):
         UnseenWalls.shipped.__wrapped__(UnseenWalls)
+
+
+def test_damaged_weights(monkeypatch, tmp_path):
+    """The package lists the SHA-256: neither weights that are not finite nor bytes that are no archive are read."""
+    path = tmp_path / "unseen_walls.npz"
+    with np.load(WEIGHTS_FILE) as stored:
+        arrays = dict(stored)
+    arrays["lines_1"] = np.full_like(arrays["lines_1"], np.nan)
+    np.savez_compressed(path, **arrays)
+    monkeypatch.setattr("sionna_partial.prediction.unseen_walls.WEIGHTS_FILE", path)
+    for content in (path.read_bytes(), b"no archive at all", WEIGHTS_FILE.read_bytes()[:-1]):
+        path.write_bytes(content)
+        with pytest.raises(PredictorError, match=r"unseen_walls\.npz' has SHA-256 .* was changed; install"):
+            UnseenWalls.shipped.__wrapped__(UnseenWalls)
 
 
 def test_training_repeats_itself(unseen_home, tmp_path):

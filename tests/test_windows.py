@@ -143,6 +143,21 @@ class TestTransmitterWindow:
             corner_m = (origin_m[0] - left * resolution_m, origin_m[1] - below * resolution_m)
             assert_alike(transmitter_window(PartialMap(grown_state, resolution_m, corner_m), tx_m), one)
 
+    @pytest.mark.parametrize("resolution_m", [0.05, 0.02, 0.11])
+    @pytest.mark.parametrize("origin_m", [(0.0, 0.0), (-12.3456, 7.0625), (-0.025, 4_500_000.0)])
+    def test_the_corner_of_the_grid_does_not_matter(self, resolution_m, origin_m):
+        """Padded or cropped by unknown cells, a map has the same windows to the byte."""
+        state = np.random.default_rng(4).choice([FREE, WALL, UNKNOWN], size=(40, 50), p=[0.8, 0.05, 0.15])
+        state = np.pad(state, 13, constant_values=UNKNOWN)
+        tx_m = np.array([origin_m]) + np.array([21.3, 17.7]) * resolution_m
+        expected = map_windows(PartialMap(state, resolution_m, origin_m), tx_m)
+        for below, above, left, right in np.random.default_rng(5).integers(-13, 14, (12, 4)):
+            grown = np.pad(state, np.maximum([(below, above), (left, right)], 0), constant_values=UNKNOWN)
+            grown = grown[max(-below, 0) : len(grown) - max(-above, 0), max(-left, 0) : grown.shape[1] - max(-right, 0)]
+            corner_m = (origin_m[0] - left * resolution_m, origin_m[1] - below * resolution_m)
+            found = map_windows(PartialMap(grown, resolution_m, corner_m), tx_m)
+            assert found.tobytes() == expected.tobytes()
+
     @pytest.mark.parametrize(("coarse_m", "times"), [(0.5, 2), (0.3, 6)])
     def test_finer_cells_of_the_same_plan_change_nothing(self, coarse_m, times):
         state = np.random.default_rng(6).choice([FREE, WALL, UNKNOWN], size=(12, 9), p=[0.7, 0.1, 0.2])

@@ -45,7 +45,7 @@ _AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
 }
 """Kinds of dtypes, and choices of axes, of the variables of channels."""
 
-_ATTRIBUTES = ("frequency_hz", "synthetic_array", "normalize_delays", "bandwidth_hz")
+_ATTRIBUTES = ("frequency_hz", "power_tolerance_db", "synthetic_array", "normalize_delays", "bandwidth_hz")
 
 CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
@@ -215,7 +215,7 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
     paths = np.diff(arrays.first).reshape(-1, receivers)
     return xr.Dataset(
         {"a": (every, da.stack(of_tx[0])), "delay_s": (delays, da.stack(of_tx[1])), "paths": (("tx", "rx"), paths)},
-        attrs={"frequency_hz": each.trace_settings.frequency_hz},
+        attrs={name: getattr(each.trace_settings, name) for name in ("frequency_hz", "power_tolerance_db")},
     ).assign(tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx))
 
 

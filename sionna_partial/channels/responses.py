@@ -3,10 +3,11 @@
 And large-scale parameters of links: their spreads, K-factor and path loss.
 """
 
+import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -19,9 +20,12 @@ from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.tracing.antennas import Antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, REFLECTION
+from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import TracedLinks
+
+_log = logging.getLogger(__name__)
 
 BLOCK_BYTES = 4_000_000
 """Size of the coefficients that are computed together, which caches hold."""
@@ -61,6 +65,7 @@ class ArrayPaths:
         """Check arguments, which are those of `TracedLinks.cir`."""
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
             require_bool(name, value)
+        paths = with_every_path(paths)
         require(
             paths.transfer.shape[1:] == (2, 2),
             "transfer",
@@ -182,6 +187,28 @@ class ArrayPaths:
             ]
             longer_m[split] = unfolded.longer_at_edges_m(split, *moved)
         return longer_m
+
+
+def with_every_path(links: "TracedLinks") -> "TracedLinks":
+    """Return the links with the paths that the default tolerance left out; they are traced once for the same links."""
+    settings = links.trace_settings
+    if links._partial is None:
+        if settings.power_tolerance_db:
+            _log_tolerance(settings.power_tolerance_db)
+        return links
+    if "every_path" not in vars(links):
+        _log.info("tracing every path of %d links, which lack those within the default tolerance", links.gain_db.size)
+        every = Simulation(links._partial, replace(settings, power_tolerance_db=0.0), links.scene_settings)
+        vars(links)["every_path"] = every.links(links.tx, links.rx, invalid="nan", progress=False)
+    complete: TracedLinks = vars(links)["every_path"]
+    return complete
+
+
+@cache
+def _log_tolerance(tolerance_db: float) -> None:
+    """Log once that channels lack paths."""
+    message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: trace with 0 for all"
+    _log.info(message, tolerance_db)
 
 
 def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
@@ -345,7 +372,7 @@ def taps(
     require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
     arrays = ArrayPaths.of(paths, **options)
     if l_max is None:
-        delay_s = np.asarray(paths.delay_s)[:, None, None]
+        delay_s = np.asarray(arrays.paths.delay_s)[:, None, None]
         counted_s = _after_shortest(delay_s, arrays.first) if arrays.normalize_delays else delay_s
         l_max = MORE_TAPS + math.ceil(bandwidth_hz * counted_s.max(initial=0.0))
     require_whole("l_min", l_min, -1_000_000, 1_000_000)
@@ -399,6 +426,7 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
     positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), each.rx[rx], metre)}
     attributes = {
         **{"frequency_hz": each.trace_settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
+        "power_tolerance_db": each.trace_settings.power_tolerance_db,
         **{"synthetic_array": int(arrays.synthetic_array), "normalize_delays": int(arrays.normalize_delays)},
     }
     coordinates = {"tx": ("link", tx), "rx": ("link", rx), "axis": ["x", "y", "z"]}

@@ -1,7 +1,7 @@
 """Subcommands that predict: predict, network, channels, export-scene, explore, demo, info."""
 
 import re
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -283,6 +283,7 @@ def channels(
             receivers_m = grid_m[valid_links(partial, position, grid_m, settings["trace_settings"].frequency_hz)[2][0]]
         else:
             receivers_m = _read_positions(Path(rx))
+        settings["trace_settings"] = replace(settings["trace_settings"], power_tolerance_db=0.0)
         links = sp.trace_links(
             partial, position, receivers_m, **settings, memory_gb=memory, progress=part_of(report, 0.0, 0.5)
         )

@@ -480,6 +480,19 @@ def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
     return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
 
 
+def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
+    """Return the cells in blocks of `factor` cells a side (ny, factor, nx, factor), and the blocks' lower-left corner.
+
+    Blocks are aligned to the world and filled up with unknown cells, so that unknown cells around a map change nothing.
+    """
+    corner = np.floor(np.round(np.array(partial.origin_m) / partial.resolution_m, 3)).astype(int) % factor
+    padding = [(low, -(low + count) % factor) for low, count in zip(corner[::-1], partial.shape, strict=True)]
+    state = np.pad(partial.state, padding, constant_values=CellState.UNKNOWN)
+    ny, nx = state.shape
+    blocks = state.reshape(ny // factor, factor, nx // factor, factor)
+    return blocks, np.array(partial.origin_m) - corner * partial.resolution_m
+
+
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
     """Unknown cells of regions within the grid that hold no square of `POCKET_M`, as in furniture and pillars."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)

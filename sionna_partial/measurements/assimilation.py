@@ -16,12 +16,12 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
-from sionna_partial.arrays import read_only
-from sionna_partial.checks import real_array, require, require_number, require_type
+from sionna_partial.arrays import States, read_only
+from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
+from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.inputs import free_space_gain_db
@@ -134,12 +134,14 @@ class Walks:
         return max(1, round(CELL_M / self.partial.resolution_m))
 
     @cached_property
+    def _blocks(self) -> tuple[States, Floats]:
+        """The cells of the map in blocks, which are the cells of walks, and the lower-left corner."""
+        return aligned_blocks(self.partial, self._step)
+
+    @cached_property
     def _cost(self) -> Floats:
         """What it costs to cross a cell of walks, which is several cells of the map wide; 0 in walls."""
-        step = self._step
-        padding = [(0, -count % step) for count in self.partial.shape]
-        state = np.pad(self.partial.state, padding, constant_values=CellState.UNKNOWN)
-        blocks = state.reshape(state.shape[0] // step, step, -1, step)
+        blocks, _ = self._blocks
         unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
         return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
 
@@ -159,7 +161,7 @@ class Walks:
         return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
 
     def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:
-        cells = (points_m[:, :2] - self.partial.origin_m) / (self._step * self.partial.resolution_m)
+        cells = np.round(points_m[:, :2] - self._blocks[1], 9) / (self._step * self.partial.resolution_m)
         column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._cost.shape)[::-1] - 1).T
         return self._nearest[row, column]
 
@@ -390,7 +392,7 @@ class Assimilation(Shown):
         tx_m = position_array("tx_m", tx_m)
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
             raise PositionError(f"tx_m = {tx_m.tolist()} is not a position: give x, y, z of one transmitter in metres.")
-        gains_db = real_array("antenna_db", antenna_db, SettingsError, "give one gain [dB], or one for each link.")
+        gains_db = float_array("antenna_db", antenna_db, SettingsError, "give one gain [dB], or one for each link.")
         good = gains_db.shape in ((), (len(measured),)) and bool(np.isfinite(gains_db).all())
         require(good, "antenna_db", antenna_db, f"give one finite gain [dB], or one for each of {len(measured)} links.")
         sample = _Sample.of(measured, gains_db)

@@ -26,7 +26,7 @@ from sionna_partial.prediction.features import LinkContext, LinkFeatures, contex
 from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
 from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
-from sionna_partial.settings import PredictorSettings
+from sionna_partial.settings import NetworkKind, PredictorSettings
 
 if TYPE_CHECKING:
     import keras
@@ -157,6 +157,11 @@ def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.M
         x = layer(keras, "Dense", f"hidden_{number}", _HIDDEN_UNITS, **options)(x)
     outputs = layer(keras, "Dense", "outputs", LINK_OUTPUTS, kernel_initializer="zeros")(x)
     return keras.Model(link, outputs, name=LINK_NETWORK)
+
+
+def kind_of(networks: Networks) -> NetworkKind:
+    """Return which networks there are."""
+    return "map" if reads_maps(networks) else "paths" if LINK_NETWORK in networks else "paper"
 
 
 def reads_maps(networks: Networks) -> bool:

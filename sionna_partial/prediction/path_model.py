@@ -19,12 +19,12 @@ from scipy.special import expit
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write, read_bytes
+from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.process import core_count
 from sionna_partial.resources import PREDICTORS_FOLDER
@@ -203,8 +203,7 @@ class PathModel:
     @cache
     def load(cls) -> "PathModel":
         """Read the shipped model."""
-        path = PREDICTORS_FOLDER / "paths.npz"
-        content = read_bytes(path, "path", PredictorError, _MAX_BYTES, "install sionna-partial again.")
+        content = shipped_bytes(PREDICTORS_FOLDER / "paths.npz", _MAX_BYTES)
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             weights = tuple(stored[f"weights{number}"].astype(np.float64) for number in range(6))
             return cls(weights, **{column.name: stored[column.name] for column in fields(cls)[1:]})

@@ -35,6 +35,7 @@ from sionna_partial.prediction.map_networks import (
     MapReader,
     evaluate_context_networks,
     fit_context_networks,
+    kind_of,
     reads_maps,
 )
 from sionna_partial.prediction.paper_networks import (
@@ -580,6 +581,10 @@ class Predictor(Shown):
             raise PredictorError(
                 f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
             ) from error
+        found = kind_of(parts(model))
+        if settings.networks != found:
+            what = f"settings.networks = {settings.networks!r}, but the weights beside it are of {found!r} networks"
+            raise PredictorError(f"path = '{path.with_suffix('.json')}': {what}: copy both files again, or train anew.")
         return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
 
 

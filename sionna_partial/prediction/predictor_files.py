@@ -21,6 +21,7 @@ from sionna_partial.files import atomic_write, read_bytes, temporary_folder, unz
 from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
 from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS, import_keras, own_input
+from sionna_partial.resources import PREDICTORS_FOLDER
 
 if TYPE_CHECKING:
     import keras
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 FORMAT = "sionna_partial predictor 2"
 """First entry of every card."""
 
-SUFFIX, WEIGHTS_FILE = ".keras", "model.weights.h5"
+SUFFIX, WEIGHTS_FILE, CHECKSUMS = ".keras", "model.weights.h5", "SHA256SUMS"
 
 _MAX_BYTES = 64_000_000
 _MAX_CONFIG_BYTES, _MAX_SIZE = 1_000_000, 512
@@ -100,7 +101,23 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
     return _unpack(path, archive), archive, card
 
 
+def shipped_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
+    """Return the content of a file of the package, which must have its SHA-256; `make predictor` writes the list."""
+    remedy = "install sionna-partial again."
+    content = read_bytes(path, "path", PredictorError, most, remedy)
+    lines = read_bytes(PREDICTORS_FOLDER / CHECKSUMS, "path", PredictorError, most, remedy).decode().splitlines()
+    expected = {name: sum_of for sum_of, name in (line.split() for line in lines)}.get(path.name, "none")
+    if digest(content) != expected:
+        raise PredictorError(
+            f"path = '{path}' has SHA-256 {digest(content)}, but the package lists {expected}: the file is damaged or "
+            f"was changed; {remedy}"
+        )
+    return content
+
+
 def _read(path: Path) -> bytes:
+    if path.parent == PREDICTORS_FOLDER:
+        return shipped_bytes(path)
     remedy = f"a predictor is a {SUFFIX} file and a .json file of the same name beside it; train one and save it there."
     return read_bytes(path, "path", PredictorError, _MAX_BYTES, remedy)
 

@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import CellState
-from sionna_partial.errors import PredictorError
-from sionna_partial.files import atomic_write, read_bytes
+from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer, tf
+from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.windows import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 
@@ -45,7 +45,11 @@ _POINTS, _LENGTH_M = 96, 3.0
 _FIRST, _LEAST = -1.5, -4.0
 """What walls per metre begin with in training, and the least number of walls, as logits of a softplus."""
 
-_BORDER_CELLS, _POOLED = 8, 2 ** (len(_WIDTHS) - 1)
+_BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
+"""Width of the unknown border around what is known [m]; cells at the border of an image that the network blurs, and
+that are left out; number of cells that it joins. Images are aligned to the world by such groups of cells: neither the
+corner of a map's grid nor unknown cells around it change anything. Beyond the image, its outermost cells count."""
+
 _LINES_AT_ONCE = 16_384
 _MAX_BYTES = 10_000_000
 
@@ -98,8 +102,7 @@ class UnseenWalls(NamedTuple):
     def shipped(cls) -> Self:
         """Return those of the package."""
         networks = cls.untrained()
-        content = read_bytes(WEIGHTS_FILE, "path", PredictorError, _MAX_BYTES, "install sionna-partial again.")
-        with np.load(io.BytesIO(content), allow_pickle=False) as stored:
+        with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
             for name, network in networks._asdict().items():
                 network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
         return networks
@@ -115,12 +118,18 @@ class UnseenWalls(NamedTuple):
             np.savez_compressed(stream, **arrays)
 
     def of_map(self, partial: PartialMap) -> WallDensity:
-        """Read a map."""
-        image = map_image(partial)
-        sides = [(_BORDER_CELLS, _BORDER_CELLS + -(count + 2 * _BORDER_CELLS) % _POOLED) for count in image.shape[:2]]
-        image = np.pad(image, [*sides, (0, 0)])[None].astype(np.float32)
-        per_m = walls_per_m(self.cells, image)
-        return WallDensity(per_m, np.asarray(partial.origin_m) - _BORDER_CELLS * CELL_M, self.lines)
+        """Read what is known of a map."""
+        known = _known_part(partial)
+        x0, y0, x1, y1 = known.bounds_m
+        corner_m, pooled_m = np.array([x0, y0]), _POOLED * CELL_M
+        first = np.floor(np.round((corner_m - _BORDER_M) / pooled_m, 6))
+        last = np.ceil(np.round((np.array([x1, y1]) + _BORDER_M) / pooled_m, 6))
+        nx, ny = ((last - first) * _POOLED).astype(int).tolist()
+        start_m = first * pooled_m
+        image = map_image(known, (ny, nx), np.round((start_m - corner_m) / known.resolution_m, 6))
+        per_m = walls_per_m(self.cells, image[None].astype(np.float32))
+        inner = slice(_BLURRED_CELLS, -_BLURRED_CELLS)
+        return WallDensity(per_m[:, inner, inner], start_m + _BLURRED_CELLS * CELL_M, self.lines)
 
 
 def _cell_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
@@ -136,12 +145,29 @@ def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
     return keras.Model(line, layer(keras, "Dense", "outputs", 2, kernel_initializer="zeros")(x), name="lines")
 
 
-def map_image(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the fraction of free and wall of each coarse cell (ny, nx, 2) [1/255], from the origin of a map on."""
-    counts = [max(1, math.ceil(count * partial.resolution_m / CELL_M - 1e-9)) for count in partial.shape]
+def _known_part(partial: PartialMap) -> PartialMap:
+    """Return the smallest part of a map that has all known cells; the map itself if there are none."""
+    known = partial.state != CellState.UNKNOWN
+    if not known.any():
+        return partial
+    rows, columns = (np.flatnonzero(known.any(axis=axis)) for axis in (1, 0))
+    x_m, y_m = np.array(partial.origin_m) + partial.resolution_m * np.array([columns[0], rows[0]])
+    part = partial.state[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return PartialMap(part, partial.resolution_m, (float(x_m), float(y_m)))
+
+
+def map_image(
+    partial: PartialMap, shape: tuple[int, int] | None = None, start: Floats | tuple[float, float] = (0.0, 0.0)
+) -> NDArray[np.uint8]:
+    """Return the fraction of free and wall of each coarse cell (ny, nx, 2) [1/255].
+
+    The image begins at `start` (x, y), counted from the origin of the map [cells], and has by default its extent.
+    """
+    coarse = CELL_M / partial.resolution_m
+    counts = shape or [max(1, math.ceil(count / coarse - 1e-9)) for count in partial.shape]
     rows, columns = (
-        overlaps(np.arange(count + 1.0) * (CELL_M / partial.resolution_m), fine)
-        for count, fine in zip(counts, partial.shape, strict=True)
+        overlaps(first + np.arange(count + 1.0) * coarse, fine)
+        for first, count, fine in zip((start[1], start[0]), counts, partial.shape, strict=True)
     )
     kinds = CellState.FREE, CellState.WALL
     fractions = [rows @ (partial.state == kind).astype(np.float64) @ columns.T for kind in kinds]

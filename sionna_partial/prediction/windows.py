@@ -10,7 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, aligned_blocks
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
 
@@ -74,12 +74,10 @@ def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
     factor = math.floor(cell_m / partial.resolution_m + 1e-9)
     if factor < 2:
         return partial
-    padding = [(0, -count % factor) for count in partial.shape]
-    state = np.pad(partial.state, padding, constant_values=CellState.UNKNOWN)
-    blocks = state.reshape(state.shape[0] // factor, factor, state.shape[1] // factor, factor)
+    blocks, (x_m, y_m) = aligned_blocks(partial, factor)
     wall, free = (blocks == CellState.WALL).any(axis=(1, 3)), (blocks == CellState.FREE).mean(axis=(1, 3)) >= 0.5
     coarse = np.select([wall, free], [CellState.WALL, CellState.FREE], CellState.UNKNOWN).astype(np.uint8)
-    return PartialMap(coarse, factor * partial.resolution_m, partial.origin_m)
+    return PartialMap(coarse, factor * partial.resolution_m, (float(x_m), float(y_m)))
 
 
 def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
@@ -112,7 +110,7 @@ def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[Sta
         known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
         top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
         state[top : top + known.shape[0], left : left + known.shape[1]] = known
-    return state, start - np.array([spans[1][0], spans[0][0]])
+    return state, np.round(start - np.array([spans[1][0], spans[0][0]]), 6)  # the same wherever the grid begins
 
 
 def overlaps(edges: Floats, count: int) -> Floats:

@@ -105,7 +105,7 @@ class PlanScene:
         part = part_of(report, 0.0, 0.8)
         yield from _with_walls(solver, listed, through_walls, (tx_m, rx_m, power), self.settings, part)
         if self.settings.diffraction and len(rx_m):
-            fixed = crossing.building, self.settings.power_tolerance_db
+            fixed = crossing.building, self.settings.tolerance_db
             edges = CrossedEdgeCandidates(self.geometry, self.wedges, *fixed)
             strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
             doing = "verifying diffractions through walls"
@@ -233,7 +233,7 @@ def _strong_paths(
     if len(rx_m) == 0:
         return
     bounds = strengths_of(solver.materials.values(), settings.frequency_hz, len(rx_m))
-    tolerance_db = settings.power_tolerance_db
+    tolerance_db = settings.tolerance_db
     if tolerance_db == 0.0:
         yield from _verified(solver, listed(bounds), tx_m, rx_m, report)
         return

@@ -9,6 +9,7 @@ kind.
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 from sionna_partial.maps.environment import EnvironmentKind
 from sionna_partial.settings import TraceSettings
@@ -55,11 +56,10 @@ REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION = (kind.number for kind in INTERACT
 
 
 def with_defaults(settings: TraceSettings, environment: EnvironmentKind) -> TraceSettings:
-    """Return settings with True or False in place of None: by default, candidates alone find the paths."""
+    """Return settings with values in place of None: by default, candidates alone find the paths."""
     unset = [kind for kind in INTERACTIONS if kind.setting and getattr(settings, kind.setting) is None]
-    return replace(
-        settings, **{kind.setting: environment in kind.exact_on and kind.default(settings) for kind in unset}
-    )
+    values: dict[str, Any] = {kind.setting: environment in kind.exact_on and kind.default(settings) for kind in unset}
+    return replace(settings, **values, power_tolerance_db=settings.tolerance_db)
 
 
 def only_by_rays(settings: TraceSettings, environment: EnvironmentKind) -> list[Interaction]:

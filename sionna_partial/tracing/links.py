@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,6 +13,7 @@ from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.paths import SolvedPaths
@@ -52,7 +53,7 @@ class TracedLinks(Shown):
     vertices_m : (P, D, 3) float64 array
         Points of interaction [m]; NaN where there is none.
     trace_settings : TraceSettings
-        With `diffraction` True or False.
+        With values in place of None.
     scene_settings : SceneSettings
         With the map's material, if it has one.
 
@@ -80,6 +81,14 @@ class TracedLinks(Shown):
     vertices_m: Floats
     trace_settings: TraceSettings
     scene_settings: SceneSettings
+
+    _partial: ClassVar[PartialMap | None] = None
+    """Map of links that were traced with the default tolerance, which channels do not have."""
+
+    def of_map(self, partial: PartialMap) -> TracedLinks:
+        """Remember the map, so that `channels` can add the paths that were left out; return these links."""
+        object.__setattr__(self, "_partial", partial)
+        return self
 
     @property
     def a(self) -> NDArray[np.complex128]:
@@ -109,8 +118,11 @@ class TracedLinks(Shown):
     ) -> xr.Dataset:
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
-        Nothing is traced again. Paths that matter little between vertically polarised, isotropic antennas are left out
-        of the trace: use ``TraceSettings(power_tolerance_db=0.0)`` for others that are very directive or horizontal.
+        Channels have every path. Links that were traced with the default ``TraceSettings.power_tolerance_db`` lack weak
+        ones: such links are traced once more, without a tolerance, when channels are first asked for, and the paths of
+        a channel are then more than those of the links. Trace with ``power_tolerance_db=0.0`` to have the same paths in
+        both. A tolerance that was set, as 0.1 dB, is kept, as is that of links which were read from a folder or
+        changed. The attribute `power_tolerance_db` has the tolerance of the channels.
 
         Parameters
         ----------

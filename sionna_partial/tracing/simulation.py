@@ -151,7 +151,8 @@ class Simulation:
             if folder is None:
                 columns = PathColumns(*room)
                 ends |= self._fill(columns, tx_m, rx_m, valid, part, polarisations)
-                return TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
+                links = TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
+                return links if self.trace_settings.power_tolerance_db is not None else links.of_map(self.partial)
             with atomic_files(folder) as files:
                 paths = PathFiles(room[0], files, polarisations)
                 ends |= self._fill(paths, tx_m, rx_m, valid, part, polarisations)

@@ -290,12 +290,12 @@ def fold_line(node, target, images, largest, wavelength, face, points):  # type:
         p = plane[at]
         nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
         sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
+        behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
+        if behind * before >= 0.0:  # also where an image coincides with the receiver, at a length of 0
+            return -1.0
         length = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2)
         if k == depth - 1:
             power = (wavelength / (4.0 * np.pi * length)) ** 2
-        behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
-        if behind * before >= 0.0:
-            return -1.0
         fraction = behind / (behind - before)
         x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
         points[k, 0], points[k, 1], points[k, 2] = x, y, z

@@ -215,7 +215,7 @@ class MeshCrossings:
     """
 
     def __init__(self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings) -> None:
-        self._tolerance_db, self._rays = settings.power_tolerance_db, min(_RAYS, settings.samples_per_tx)
+        self._tolerance_db, self._rays = settings.tolerance_db, min(_RAYS, settings.samples_per_tx)
         exact = self._tolerance_db == 0.0
         most, rarer = (settings.max_depth, 1.0) if exact else (MOST_REFLECTIONS, RARER)
         limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)

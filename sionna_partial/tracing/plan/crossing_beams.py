@@ -475,7 +475,7 @@ def _add_pairs(beam, number, count, task, layers, pairs):  # type: ignore[no-unt
             r = alpha + beta
             if beta * area < -TOLERANCE_M * first or alpha * area < -TOLERANCE_M * second:
                 continue
-            if (r - 1.0) * area < -TOLERANCE_M * width:
+            if r <= 0.0 or (r - 1.0) * area < -TOLERANCE_M * width:  # r may be 0 where the image is close to its wall
                 continue
             rx = receivers.order[i]
             least = task.needed.power[rx] * (ex * ex + ey * ey) / beam.reflected

@@ -299,7 +299,7 @@ class CrossingCandidates:
     """
 
     def __init__(self, geometry: SceneGeometry, room: Room, interior: Interior, settings: TraceSettings) -> None:
-        self._geometry, self._tolerance_db = geometry, settings.power_tolerance_db
+        self._geometry, self._tolerance_db = geometry, settings.tolerance_db
         most, rarer = (settings.max_depth, 1.0) if self._tolerance_db == 0.0 else (MOST_REFLECTIONS, RARER)
         walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
         limits = Limits(settings.max_depth, min(settings.max_depth, most), walls, rarer)
