@@ -504,9 +504,9 @@ class TestAccessor:
 
     def test_values_that_are_assigned_later_count(self, coverage):
         before = coverage.radio.power(eirp_dbm=20.0)["power_mean_dbm"]
-        coverage["gain_mean_db"] = coverage["gain_mean_db"] - 10.0
+        coverage["gain_mean_db"] = coverage["gain_mean_db"] + 10.0
         after = coverage.radio.power(eirp_dbm=20.0)["power_mean_dbm"]
-        np.testing.assert_allclose(after, before - 10.0, atol=1e-4)
+        np.testing.assert_allclose(after, before + 10.0, atol=1e-4)
 
     @pytest.mark.parametrize("call", ["probability_above", "power", "rate", "area", "at", "__repr__"])
     def test_other_datasets_are_refused(self, call):

@@ -180,8 +180,8 @@ def test_positions_are_float64_in_any_form(several):
 
 
 def test_next_views_and_live_coverage_take_whole_numbers():
-    partial = half_open(sp.CellState.UNKNOWN)
-    views = [sp.next_views(partial, tx, goal="area").tx_m for tx in ((2, 2), (2.0, 2.0, 1.5), {"a": [2, 2]})]
+    model = sp.LinkModel(half_open(sp.CellState.UNKNOWN))
+    views = [sp.next_views(model, tx).tx_m for tx in ((2, 2), (2.0, 2.0, 1.5), {"a": [2, 2]})]
     assert [tx_m.tolist() for tx_m in views] == [[[2.0, 2.0, 1.5]]] * 3
     assert sp.LiveCoverage((2, 2), print).tx_m["tx"].tolist() == [2.0, 2.0, 1.5]
 

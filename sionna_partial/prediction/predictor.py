@@ -49,8 +49,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
-from sionna_partial.prediction.through_walls import WALL_LOSSES, by_mean_losses
-from sionna_partial.prediction.unseen_walls import UnseenWalls, WallDensity
+from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
 from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
