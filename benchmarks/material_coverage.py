@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 
 def main() -> None:

@@ -5,7 +5,7 @@ import numpy as np
 from sionna_partial.errors import SettingsError
 from sionna_partial.scene.scene import constants_of
 from sionna_partial.settings import WALL_MATERIALS
-from sionna_partial.tracing.slab import transmission_coefficients
+from sionna_partial.tracing.power import transmission_coefficients
 
 BANDS_GHZ = 2.4, 5.0, 28.0, 60.0
 

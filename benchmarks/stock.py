@@ -12,9 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.tracing.engine import load_sionna
-from sionna_partial.tracing.finder import listed_before
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
+from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]
 """Paths of one receiver: `a` and `delay_s` (P,), `interactions` (P, D), `vertices_m` (P, D, 3), NaN where none is."""

@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import stock_paths, write_scene_of
+from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan import crossings
-from sionna_partial.tracing.simulation import checked_settings
+from sionna_partial.tracing.simulation import resolved_settings
+from sionna_partial.tracing.stock import stock_paths
 
 REFRACTION = 4
 CASES = {"drywall": 28e9, "brick": 5e9}
@@ -84,7 +85,7 @@ def _compare(
     name: str, partial: sp.PartialMap, material: str, frequency_hz: float, arguments: argparse.Namespace
 ) -> None:
     tx_m, rx_m = ends(partial, arguments.receivers, arguments.seed)
-    settings, scene_settings = checked_settings(
+    settings, scene_settings = resolved_settings(
         partial,
         sp.TraceSettings(
             frequency_hz,

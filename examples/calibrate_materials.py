@@ -11,7 +11,7 @@ import numpy as np
 
 import sionna_partial as sp
 from sionna_partial.resources import scenes_folder
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 THICKNESS_M = 0.03  # taken to be known
 HIDDEN = sp.Material(relative_permittivity=5.24, conductivity_s_m=0.626, thickness_m=THICKNESS_M)  # concrete

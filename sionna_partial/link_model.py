@@ -172,7 +172,7 @@ class LinkModel:
 
     @cached_property
     def _every_path(self) -> Simulation:
-        """Simulation without a tolerance: an antenna may amplify paths that are weak without it."""
+        """Simulation without a tolerance, for antennas at receivers, which no selection of paths considers."""
         settings = replace(self.simulation.trace_settings, power_tolerance_db=0.0)
         return Simulation(self.partial, settings, self.simulation.scene_settings)
 
@@ -271,7 +271,8 @@ class LinkModel:
             antenna_db = np.zeros(len(phi))
         else:
             sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
-            paths = sums.added(self._every_path.blocks(tx_m, rx_m, report, polarisations=2))
+            found = self._every_path.blocks(tx_m, rx_m, report, Antenna()) if at_rx else None
+            paths = sums.added(found or self.simulation.blocks(tx_m, rx_m, report, antenna))
             phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
             phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))

@@ -1,7 +1,7 @@
 """Extruded floor plans, and the textbook image method that exact beams are compared with."""
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -10,10 +10,11 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
-from sionna_partial.tracing.bounds import Strengths, strengths_of
 from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+from sionna_partial.tracing.power import Materials, materials_of
+from sionna_partial.tracing.select import Listed
 
 Floats = NDArray[np.float64]
 Blocks = list[tuple[Candidates, float]]
@@ -167,11 +168,16 @@ def heights_m(geometry: SceneGeometry, low_m: float, high_m: float, bounces: int
     return heights
 
 
-def everything(receivers: int) -> Strengths:
-    """Ask for all candidates of so many receivers, in drywall at 28 GHz."""
+def drywall() -> Materials:
+    """Materials of drywall at 28 GHz."""
     material = Material()
     constants = np.array([material.relative_permittivity, material.conductivity_s_m, material.thickness_m])
-    return strengths_of([constants], 28e9, receivers)
+    return materials_of([constants], 28e9)
+
+
+def blocks_of(parts: Iterable[Listed]) -> Blocks:
+    """Write all candidates of each part, with the fraction of the work done."""
+    return [(part.write(np.arange(len(part.rx))), part.done) for part in parts]
 
 
 def room_of(geometry: SceneGeometry, tx_m: Floats, rx_m: Floats) -> Room:
@@ -183,8 +189,8 @@ def specular_blocks(
     geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, max_depth: int, pairs_at_once: int = 200_000
 ) -> Blocks:
     """List all specular candidates, and the fraction of the work done with each block."""
-    candidates = SpecularCandidates(geometry, room_of(geometry, tx_m, rx_m), max_depth)
-    return list(candidates.blocks(everything(len(rx_m)), pairs_at_once=pairs_at_once))
+    candidates = SpecularCandidates(geometry, room_of(geometry, tx_m, rx_m), max_depth, drywall())
+    return blocks_of(candidates.listed(np.zeros(len(rx_m)), pairs_at_once=pairs_at_once))
 
 
 def diffracted_blocks(
@@ -196,5 +202,6 @@ def diffracted_blocks(
     walls_a_side: int = MAX_REFLECTIONS,
 ) -> Blocks:
     """List all candidates with a diffraction, and the fraction of the work done with each block."""
-    candidates = DiffractionCandidates(geometry, wedges, room_of(geometry, tx_m, rx_m), max_depth, walls_a_side)
-    return list(candidates.blocks(everything(len(rx_m))))
+    room, bounds = room_of(geometry, tx_m, rx_m), drywall()
+    candidates = DiffractionCandidates(geometry, wedges, room, max_depth, bounds, walls_a_side)
+    return blocks_of(candidates.listed(np.zeros(len(rx_m))))

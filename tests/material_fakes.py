@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.calibration.material_fit import MaterialTarget, Point
 from sionna_partial.calibration.measured_building import LinkPaths
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03
 ANGLES_DEG = np.linspace(2.0, 78.0, 60)

@@ -17,6 +17,7 @@ from sionna_partial.cli.app import app
 from sionna_partial.errors import SettingsError
 from sionna_partial.scene.scene import export_scene
 from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.power import gain_at_azimuth, gain_between, gain_towards
 
 TX, DEPTH = (1.03, 2.93, 1.4), 2
 SECTOR = sp.Antenna("tr38901", azimuth_deg=-70.0, downtilt_deg=25.0)
@@ -79,6 +80,37 @@ def test_what_is_seen_and_unseen_changes_as_the_pattern_says() -> None:
         np.testing.assert_allclose(away[name], alone[name], atol=0.02)
 
 
+@pytest.mark.parametrize("antenna", [SECTOR, PANEL], ids=str)
+def test_paths_are_left_out_that_are_weak_with_the_antenna(antenna: sp.Antenna) -> None:
+    """Behind a sector, the strongest path without the antenna may be the weakest with it."""
+    settings = sp.TraceSettings(frequency_hz=5e9, max_depth=3, diffraction=False)
+    rx_m = np.array([(x, y, 1.5) for x in (0.6, 2.1, 4.6) for y in (0.6, 2.2, 3.4)])
+    power, count = {}, {}
+    for tolerance_db in (0.0, 0.1):
+        simulation = sp.Simulation(_room(), replace(settings, power_tolerance_db=tolerance_db))
+        paths = list(simulation.blocks(np.array(TX), rx_m, lambda *_: None, antenna))
+        of_path = [(each.path_rx, antenna.power(each, 5e9)) for each in paths]
+        power[tolerance_db] = sum(np.bincount(rx, weights, len(rx_m)) for rx, weights in of_path)
+        count[tolerance_db] = sum(len(rx) for rx, _ in of_path)
+    missing_db = 10.0 * np.log10(power[0.0] / power[0.1])
+    assert missing_db.min() > -1e-6
+    assert missing_db.max() < 0.1
+    assert count[0.1] < 0.6 * count[0.0]
+
+
+def test_no_gain_exceeds_its_bound() -> None:
+    gains = PANEL.largest_gains(28e9)
+    zenith, azimuth = np.random.default_rng(0).uniform((0.0, -np.pi), np.pi, (300, 2)).T
+    x, y, z = np.sin(zenith) * np.cos(azimuth), np.sin(zenith) * np.sin(azimuth), np.cos(zenith)
+    field = PANEL.fields(np.stack([zenith, azimuth], axis=1), 28e9)
+    for direction, gain in zip(zip(x, y, z, strict=True), (np.abs(field) ** 2).sum(axis=1), strict=True):
+        assert gain <= 1.001 * gain_towards(gains, *direction) + 1e-9
+        assert gain_towards(gains, *direction) <= gain_at_azimuth(gains, *direction[:2])
+    first, second = (np.cos(3.0), np.sin(3.0)), (np.cos(-2.5), np.sin(-2.5))
+    within = [gain_at_azimuth(gains, np.cos(angle), np.sin(angle)) for angle in np.linspace(3.0, 2 * np.pi - 2.5, 99)]
+    assert gain_between(gains, first, second) == pytest.approx(max(within))
+
+
 def test_a_warm_model_keeps_antennas_apart() -> None:
     settings = sp.TraceSettings(max_depth=1, diffraction=False)
     model = sp.LinkModel(_room(), trace_settings=settings)
@@ -92,7 +124,8 @@ def test_a_warm_model_keeps_antennas_apart() -> None:
 
 def test_links_are_traced_from_either_end() -> None:
     """Localisation traces from the measured positions: the antenna is then where paths arrive."""
-    model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=DEPTH, diffraction=False))
+    settings = sp.TraceSettings(max_depth=DEPTH, diffraction=False, power_tolerance_db=0.0)
+    model = sp.LinkModel(_room(), trace_settings=settings)
     tx_m, rx_m = np.array(TX), np.array([[1.6, 1.2, 1.5], [4.2, 3.3, 1.2]])
     there = model.links(tx_m, rx_m, antenna=SECTOR)
     back = [model.links(each_m, tx_m[None], antenna=SECTOR, at_rx=True) for each_m in rx_m]

@@ -1,4 +1,4 @@
-"""Bounds of the power of candidates hold for what Sionna RT finds, and what is left out changes no link."""
+"""Materials of the power of candidates hold for what Sionna RT finds, and what is left out changes no link."""
 
 import numpy as np
 import pytest
@@ -6,20 +6,18 @@ from extruded import ROOM, SPLINTERS, drawn, extrude
 
 import sionna_partial as sp
 from sionna_partial.constants import LinkState
-from sionna_partial.tracing.bounds import (
-    LEVELS,
+from sionna_partial.tracing.power import (
     at_edge,
-    dropped_power,
-    level_of,
-    levels_needed,
+    at_wall,
+    materials_of,
     most_at_edge,
-    strengths_of,
+    reflection_coefficients,
     utd_term,
     utd_terms,
     wedge_angle,
     wedge_constants,
 )
-from sionna_partial.tracing.slab import reflection_coefficients
+from sionna_partial.tracing.select import LEVELS, Selection, levels_of, missing_power
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
 
@@ -32,7 +30,7 @@ def _indirect_power(links: sp.TracedLinks) -> np.ndarray:
 class TestReflection:
     def test_no_angle_reflects_more_than_its_bound(self) -> None:
         cosine = np.random.default_rng(0).uniform(0.0, 1.0, 20_000)
-        table = strengths_of([DRYWALL], 28e9, 1).largest[0]
+        table = materials_of([DRYWALL], 28e9).largest[0]
         te, tm = reflection_coefficients(*DRYWALL, 28e9, cosine)
         bound = table[np.minimum((cosine * len(table)).astype(int), len(table) - 1)]
         found = np.abs([te, tm, te + tm, te]).T
@@ -43,7 +41,7 @@ class TestReflection:
 
 def _diffracted(arrival: float, departure: float, exterior: float = 1.5 * np.pi, boundary: float = 20.0) -> complex:
     """Sum of the terms of a wedge that absorbs no field and reflects none: the diffracted incident field alone."""
-    strengths, terms = strengths_of([DRYWALL], 28e9, 1), np.empty((4, 3))
+    strengths, terms = materials_of([DRYWALL], 28e9), np.empty((4, 3))
     wedge = wedge_constants(np.array([exterior]))[0]
     utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
     return sum(utd_term(strengths.transition, terms, k, boundary) for k in (0, 1))
@@ -57,44 +55,53 @@ class TestDiffraction:
             assert abs(_diffracted(0.7, 0.7 + np.pi + side)) == pytest.approx(half, rel=0.05)
 
     def test_the_transition_function_is_continuous_where_its_series_takes_over(self) -> None:
-        strengths = strengths_of([DRYWALL], 28e9, 1)
+        strengths = materials_of([DRYWALL], 28e9)
         term = np.array([[1.0, 1.0, 1.0]])
         inside, outside = (utd_term(strengths.transition, term, 0, y) for y in (3.0 - 1e-9, 3.0 + 1e-9))
         assert inside == pytest.approx(outside, abs=1e-3)
 
     def test_the_rough_bound_is_no_less(self) -> None:
         rng, terms, exterior = np.random.default_rng(3), np.empty((4, 3)), 1.7 * np.pi
-        table, wedge = strengths_of([DRYWALL], 28e9, 1), wedge_constants(np.array([exterior]))[0]
+        table, wedge = materials_of([DRYWALL], 28e9), wedge_constants(np.array([exterior]))[0]
         for arrival, departure in rng.uniform(0.0, exterior, (300, 2)):
             utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
             for boundary in (1.0, 10.0, 100.0):
                 level = 1.0, 0.0, (1.0, 0.0, 1.0)
-                exact = at_edge((table.faces, table.transition), 0, terms, boundary, (-1.0, -1.0), *level)
+                exact = at_edge((table.reflection, table.transition), 0, terms, boundary, (-1.0, -1.0), *level)
                 assert exact[0] <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
+
+    def test_a_wall_that_is_grazed_has_a_finite_bound(self) -> None:
+        """Rounding must not take the root of a negative number: the bound of a whole link would be NaN."""
+        table, terms = materials_of([DRYWALL], 28e9), np.ones((4, 3))
+        for sine in np.linspace(0.01, 0.99, 500):
+            level = float(sine), float(np.sqrt(1.0 - sine**2)), (1.0, 0.0, 1.0)
+            assert np.isfinite(at_edge((table.reflection, table.transition), 0, terms, 10.0, (0.0, -1.0), *level)).all()
+            assert np.isfinite(at_wall(table.largest, 0, 0.0, *level)).all()
 
 
 class TestLevels:
     def test_levels_fall_with_the_power(self) -> None:
-        levels = [level_of(power) for power in 10.0 ** -np.arange(0.0, 25.0, 0.1)]
+        levels = levels_of(10.0 ** -np.arange(0.0, 25.0, 0.1)).tolist()
         assert levels == sorted(levels)
-        assert (levels[0], levels[-1], level_of(0.0)) == (1, LEVELS - 1, LEVELS - 1)
+        assert (levels[0], levels[-1]) == (1, LEVELS - 1)
+        assert levels_of(np.array([np.inf, 0.0])).tolist() == [0, LEVELS - 1]
 
     def test_what_is_beyond_the_needed_levels_is_at_most_what_may_be_missing(self) -> None:
         power = np.random.default_rng(1).uniform(0.0, 1.0, (50, LEVELS)) ** 8
         allowed = np.random.default_rng(2).uniform(0.0, 5.0, 50)
-        needed = levels_needed(power, allowed)
+        needed = Selection([], power).needed(allowed / 0.25, 10.0 * np.log10(1.25))
         for row, count, most in zip(power, needed, allowed, strict=True):
             assert row[count:].sum() <= most
             assert count == 1 or row[count - 1 :].sum() > most
 
     def test_a_link_without_paths_may_miss_what_no_receiver_notices(self) -> None:
-        assert dropped_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)])
+        assert missing_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)])
 
 
 @pytest.mark.parametrize("walls", [ROOM, np.concatenate([ROOM, SPLINTERS])], ids=["room", "splinters"])
 def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, tmp_path) -> None:
     """Sum of |a|^2 over all paths of a link, against the sum of all bounds."""
-    from extruded import everything, room_of
+    from extruded import drywall, room_of
 
     from sionna_partial.scene.scene import write_scene
     from sionna_partial.tracing.engine import SceneSolver
@@ -106,15 +113,16 @@ def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, 
     room, wedges = room_of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
     solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), geometry.shapes, sp.TraceSettings())
     for kind in ("reflected", "diffracted"):
-        strengths = everything(len(rx))
-        blocks = (
-            SpecularCandidates(geometry, room, 4).blocks(strengths)
+        candidates = (
+            SpecularCandidates(geometry, room, 4, drywall())
             if kind == "reflected"
-            else DiffractionCandidates(geometry, wedges, room, 3).blocks(strengths)
+            else DiffractionCandidates(geometry, wedges, room, 3, drywall())
         )
-        paths = [solver.verify(block, tx, rx)[0] for block, _ in blocks if len(block.rx)]
-        found = sum(np.bincount(each.path_rx, np.abs(each.a) ** 2, len(rx)) for each in paths)
-        bound = strengths.power.sum(axis=1)
+        found, bound = np.zeros(len(rx)), np.zeros(len(rx))
+        for part in candidates.listed(np.zeros(len(rx))):
+            paths, _ = solver.verify(part.write(np.flatnonzero(np.isfinite(part.bound))), tx, rx)
+            found += np.bincount(paths.path_rx, np.abs(paths.a) ** 2, len(rx))
+            bound += np.bincount(part.rx, np.where(np.isfinite(part.bound), part.bound, 0.0), len(rx))
         assert (found <= bound * (1 + 1e-3)).all()
         assert (found > 0).all()
 

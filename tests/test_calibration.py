@@ -18,7 +18,7 @@ from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.scene.scene import constants_of
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)
 THIN_M = 0.01

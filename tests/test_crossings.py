@@ -11,11 +11,11 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.plan.diffraction import find_wedges
-from sionna_partial.tracing.simulation import checked_settings
-from sionna_partial.tracing.slab import transmission_coefficients
+from sionna_partial.tracing.power import transmission_coefficients
+from sionna_partial.tracing.simulation import resolved_settings
+from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 
 BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
@@ -129,7 +129,7 @@ def same_path(
 @pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
 def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> None:
     """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
-    settings, scene_settings = checked_settings(partial, EVERY, sp.SceneSettings(material=BRICK))
+    settings, scene_settings = resolved_settings(partial, EVERY, sp.SceneSettings(material=BRICK))
     ours = sp.trace_links(partial, TX, RX, trace_settings=settings, scene_settings=scene_settings)
     folder = sp.export_scene(replace(partial, origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
     scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
@@ -146,7 +146,7 @@ def test_stock_is_diffracted_at_no_other_edges(tmp_path: Path) -> None:
     """Paths over an edge and through walls; those with the most interactions have the power that stock gives them."""
     every = replace(EVERY, diffraction=True, max_depth=3)
     wedges = find_wedges(build_scene(rooms()), open_ends=True)
-    settings, scene_settings = checked_settings(rooms(), every, sp.SceneSettings(material=BRICK))
+    settings, scene_settings = resolved_settings(rooms(), every, sp.SceneSettings(material=BRICK))
     ours = sp.trace_links(rooms(), TX, RX, trace_settings=settings, scene_settings=scene_settings)
     folder = sp.export_scene(replace(rooms(), origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
     scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
@@ -210,7 +210,7 @@ def test_weak_paths_that_are_left_out_do_not_matter() -> None:
 def test_on_by_default_below_24_ghz() -> None:
     for frequency_hz, through in ((5e9, True), (23.9e9, True), (24e9, False), (60e9, False)):
         assert sp.TraceSettings(frequency_hz).through_walls is through
-        assert sp.Simulation(rooms(), sp.TraceSettings(frequency_hz)).trace_settings.refraction is through
+        assert sp.Simulation(rooms(), sp.TraceSettings(frequency_hz)).resolved.trace_settings.refraction is through
     assert sp.TraceSettings(5e9, refraction=False).through_walls is False
 
 

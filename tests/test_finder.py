@@ -14,8 +14,9 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import simulation
-from sionna_partial.tracing.finder import PlanScene, diffracted_as_exact, write_scene_of
+from sionna_partial.tracing.finder import PlanScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, Wedges
+from sionna_partial.tracing.stock import diffracted_as_exact
 
 TX = np.array([1.03, 1.52, 1.4])
 RX = np.array([[1.47, 2.51, 1.7], [4.35, 0.61, 1.2], [3.82, 3.57, 1.3], [2.02, 0.33, 2.2]])

@@ -45,12 +45,11 @@ ROOMS = {
     "worlds": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
-        *("interactions", "slab", "bounds", "paths", "links", "engine"),
-        *("plan.beams", "plan.specular", "plan.legs", "plan.crossing_beams", "plan.crossings", "plan.obstacles"),
+        *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
+        *("plan.beams", "plan.specular", "plan.legs", "plan.obstacles", "plan.crossing_beams", "plan.crossings"),
         *("plan.diffraction", "plan.crossed_edges"),
-        *("mesh.faces", "mesh.sequences", "mesh.candidates", "mesh.walls", "mesh.crossings", "finder"),
+        *("mesh.sequences", "mesh.candidates", "mesh.crossings", "stock", "finder"),
         *("path_set", "simulation", "gradients"),
-        "antennas",
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs"),

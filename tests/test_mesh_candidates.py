@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from extruded import everything
+from extruded import blocks_of, drywall
 from mesh_rays import TURN, joined, load_meshes, shapes_of
 from numpy.typing import NDArray
 
@@ -33,7 +33,7 @@ def candidates_of(
 ) -> Candidates:
     shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
     mesh = group_planes(*joined(*meshes)), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
-    parts = list(MeshCandidates(*mesh, shot, tx, rx, depth).blocks(everything(len(rx)), **options))
+    parts = blocks_of(MeshCandidates(*mesh, shot, tx, rx, depth, drywall()).listed(np.zeros(len(rx)), **options))
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
     assert depth == 0 or shares[-1] == 1.0
@@ -154,7 +154,7 @@ class TestRoom:
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole = candidates_of(scene, room(), TX, RX)
-        parts = candidates_of(scene, room(), TX, RX, receivers_per_block=50)
+        parts = candidates_of(scene, room(), TX, RX, receivers_per_part=50)
         for name in ("rx", "kind", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
@@ -177,5 +177,5 @@ class TestOpenMesh:
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
 
     def test_without_rays_there_is_line_of_sight(self) -> None:
-        kind = MeshCandidates(group_planes(*joined(self.TRIANGLE)), np.zeros(1, np.int64), [], TX, RX, 2)
-        assert [part.rx.tolist() for part, _ in kind.blocks(everything(len(RX)))] == [list(range(len(RX)))]
+        kind = MeshCandidates(group_planes(*joined(self.TRIANGLE)), np.zeros(1, np.int64), [], TX, RX, 2, drywall())
+        assert [part.rx.tolist() for part, _ in blocks_of(kind.listed(np.zeros(len(RX))))] == [list(range(len(RX)))]

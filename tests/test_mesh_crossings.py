@@ -11,9 +11,9 @@ from test_crossings import BRICK, EVERY, LONELY, REFRACTION, RX, STRAIGHT, TX, l
 
 import sionna_partial as sp
 from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import stock_paths
 from sionna_partial.tracing.mesh.faces import face_tree, faces_between, group_planes, scratch
-from sionna_partial.tracing.simulation import checked_settings
+from sionna_partial.tracing.simulation import resolved_settings
+from sionna_partial.tracing.stock import stock_paths
 
 ENDS = (3.0, 2.97, 1.5), (6.0, 3.41, 1.5)
 COSINE = 3.0 / np.hypot(3.0, 0.44)
@@ -90,7 +90,7 @@ def test_plans_and_meshes_agree(meshed: sp.PartialMap, depth_m: float) -> None:
 
 def test_stock_finds_no_other_paths(meshed: sp.PartialMap, tmp_path: Path) -> None:
     """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
-    settings, scene_settings = checked_settings(meshed, replace(EVERY, samples_per_tx=300_000), None)
+    settings, scene_settings = resolved_settings(meshed, replace(EVERY, samples_per_tx=300_000), sp.SceneSettings())
     ours = sp.trace_links(meshed, TX - SHIFT, RX - SHIFT, trace_settings=settings)
     folder = sp.export_scene(meshed, tmp_path / "scene", scene_settings)
     scene = open_scene(folder / "scene.xml", 5e9)
@@ -112,7 +112,7 @@ def test_opaque_paths_stay_and_slopes(meshed: sp.PartialMap) -> None:
     through = (leaky.interactions == REFRACTION).any(axis=1)
     assert through.any()
     assert np.sort(leaky.a[~through]).tobytes() == np.sort(opaque.a).tobytes()
-    assert sp.Simulation(meshed, sp.TraceSettings(5e9)).trace_settings.refraction
+    assert sp.Simulation(meshed, sp.TraceSettings(5e9)).resolved.trace_settings.refraction
 
 
 def test_faces_between_points_are_those_of_brute_force() -> None:

@@ -13,8 +13,8 @@ from sionna_partial.errors import MapError
 from sionna_partial.files import temporary_folder
 from sionna_partial.scene.scene import build_scene, write_scene
 from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import stock_paths
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.stock import stock_paths
 
 
 def hall() -> sp.PartialMap:

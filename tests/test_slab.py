@@ -5,7 +5,7 @@ import pytest
 
 from sionna_partial.errors import SettingsError
 from sionna_partial.tracing.engine import load_sionna
-from sionna_partial.tracing.slab import VACUUM_F_M, reflection_loss_db
+from sionna_partial.tracing.power import VACUUM_F_M, reflection_loss_db
 
 FREQUENCY_HZ = 28e9
 ANGLES_DEG = np.array([0.0, 20.0, 45.0, 70.0, 85.0])

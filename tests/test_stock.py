@@ -14,8 +14,8 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import build_scene, write_scene
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene
-from sionna_partial.tracing.finder import listed_before, stock_paths
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
+from sionna_partial.tracing.stock import listed_before, stock_paths
 
 NOWHERE = np.zeros((0, 3))
 

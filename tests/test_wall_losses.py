@@ -15,7 +15,7 @@ from sionna_partial.datasets.home_links import home_links
 from sionna_partial.prediction.features import mean_wall_loss_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unseen_walls import WALL_LOSSES
-from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db
+from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
 

@@ -12,7 +12,7 @@ import yaml
 import sionna_partial as sp
 from sionna_partial.errors import MapError
 from sionna_partial.scene.scene import build_scene
-from sionna_partial.tracing.slab import wall_loss_db
+from sionna_partial.tracing.power import wall_loss_db
 
 CONCRETE, GLASS = sp.Material.named("concrete"), sp.Material.named("glass")
 

@@ -39,8 +39,8 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, simulation_of
-from sionna_partial.tracing.slab import Polarisation, reflection_loss_db
 
 DETERMINED = 0.35
 """Largest standard deviation of a parameter that counts as determined, as a fraction of that of the prior."""

@@ -21,7 +21,7 @@ from sionna_partial.calibration.measured_building import LinkPaths, link_gains_d
 from sionna_partial.checks import Progress
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Shown
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
 MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)

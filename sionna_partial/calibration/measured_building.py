@@ -16,8 +16,8 @@ from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import constants_of
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathSet
+from sionna_partial.tracing.power import VACUUM_F_M
 from sionna_partial.tracing.simulation import Simulation, nearest_m
-from sionna_partial.tracing.slab import VACUUM_F_M
 
 FEWEST_LINKS = 10
 """Smallest number of usable measured links."""

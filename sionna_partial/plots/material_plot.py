@@ -10,7 +10,7 @@ from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.checks import require_type
 from sionna_partial.plots.style import BLUE, RED, Figure
 from sionna_partial.settings import Material
-from sionna_partial.tracing.slab import reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 ANGLES_DEG = np.linspace(0.0, 85.0, 171)
 """Angles of incidence at which reflections are drawn [degrees]."""

@@ -32,7 +32,7 @@ from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.slab import MOST_LOSS_DB, wall_loss_db
+from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""

@@ -4,11 +4,13 @@ import logging
 import math
 import re
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter
 from scipy.spatial.transform import Rotation
 
 from sionna_partial.arrays import Floats, read_only
@@ -28,6 +30,7 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.files import read_bytes
 from sionna_partial.tracing.engine import load_sionna, to_device
 from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
+from sionna_partial.tracing.power import ISOTROPIC, Gains
 
 PATTERNS, POLARISATIONS = ("iso", "dipole", "hw_dipole", "tr38901"), ("V", "H", "VH", "cross")
 """Antenna patterns and polarisations that Sionna RT has."""
@@ -141,7 +144,7 @@ class Antennas:
         return self.rotation if len(self.rotation) == 1 else self.rotation[end]
 
     def advance_m(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> Floats:
-        """How much shorter plane waves from zenith and azimuth (P, 2) are at each antenna position: (P, A) [m]."""
+        """Return the path advance (P, A) [m] of plane waves from zenith and azimuth (P, 2) at each antenna position."""
         return self._local(directions(angles_rad)[0], end) @ self.positions_m.T
 
     def fields(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> NDArray[np.complex128]:
@@ -173,7 +176,7 @@ class AntennaPattern(Shown):
     gain_dbi : float
         Gain in the main direction [dBi].
     horizontal_db, vertical_db : (360,) array-like
-        How far below it the gain is at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
+        Loss relative to it at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
         above, and downwards from the horizon.
     frequency_hz : float, optional
         Frequency at which it was measured. Traces at a frequency that differs by a factor of more than 1.3 log a
@@ -396,7 +399,7 @@ class Antenna(Checked):
     downtilt_deg : float
         Below the horizon; negative for an elevation [degree].
     rows, columns : int
-        Of the array, whose antennas are half a wavelength apart.
+        Numbers of antennas of the array, which are half a wavelength apart.
     beam : int
         Row of ``dft_codebook(rows, columns)``; 0 is the beam in the main direction.
 
@@ -451,7 +454,7 @@ class Antenna(Checked):
         return value
 
     def __str__(self) -> str:
-        """Return what it is, for titles and attributes."""
+        """Return a description, for titles and attributes."""
         pattern = self.pattern
         parts = [f"{pattern.name}, {pattern.gain_dbi:g} dBi" if isinstance(pattern, AntennaPattern) else pattern]
         parts += [f"{self.rows} x {self.columns}, beam {self.beam}"] if self.rows * self.columns > 1 else []
@@ -496,6 +499,10 @@ class Antenna(Checked):
         """Gain (P,) of vertical polarisation towards zenith and azimuth (P, 2)."""
         return np.asarray(np.abs(self.fields(angles_rad, frequency_hz)[:, 0]) ** 2)
 
+    def largest_gains(self, frequency_hz: float) -> Gains:
+        """Return upper bounds of the gain of both polarisations, within a degree of each direction."""
+        return _largest_gains(self, frequency_hz)
+
     def power(self, paths: SolvedPaths, frequency_hz: float, *, at_rx: bool = False) -> Floats:
         """Power (P,) of paths that were traced for both polarisations, with an isotropic, vertical antenna opposite."""
         fields = self.fields(paths.arrival_rad if at_rx else paths.departure_rad, frequency_hz)
@@ -518,6 +525,17 @@ def _sphere() -> tuple[Floats, Floats]:
     angles_rad = np.stack(np.meshgrid(zenith_rad, azimuth_rad, indexing="ij"), axis=-1).reshape(-1, 2)
     weights = np.sin(angles_rad[:, 0])
     return angles_rad, weights / weights.sum()
+
+
+@lru_cache(8)
+def _largest_gains(antenna: Antenna, frequency_hz: float) -> Gains:
+    if antenna.uniform_gain_dbi == 0.0:
+        return ISOTROPIC
+    angles_deg = np.stack(np.meshgrid(np.arange(181.0), np.arange(360.0), indexing="ij"), axis=-1)
+    fields = antenna.fields(np.radians(angles_deg.reshape(-1, 2)), frequency_hz)
+    gain = (np.abs(fields) ** 2).sum(axis=1).reshape(181, 360)
+    table = maximum_filter(gain, 3, mode=("nearest", "wrap"))
+    return Gains(table, table.max(axis=0), float(table.max()))
 
 
 def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:

@@ -219,14 +219,14 @@ def to_device(kind: Any, values: NDArray[Any]) -> Any:
 
 @dataclass(frozen=True)
 class Variables:
-    """What the power of paths depends on, as `mitsuba.Float`, to which derivatives lead back.
+    """Variables of the power of paths, as `mitsuba.Float`, to which derivatives lead back.
 
     Parameters
     ----------
     shift_m : tuple of 3
         Added to the x, y, z of the transmitters, each with 1 or T entries [m].
     relative_permittivity, conductivity_s_m, thickness_m : tuples
-        Of each of `SceneSolver.materials`; [S/m] and [m]. What an ITU material gains with the frequency comes on top.
+        One entry for each of `SceneSolver.materials`; [S/m] and [m]. ITU materials add their change with the frequency.
         They are values, not additions, which would drown in the conductivity of a metal.
     frequency_hz
         Added to the carrier frequency [Hz].
@@ -255,7 +255,7 @@ class SceneSolver:
     """Verifies candidates in one exported scene.
 
     Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none. Antennas
-    are vertically polarised, but for those of `polarised`.
+    are vertically polarised, except after `polarised`.
     """
 
     def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:

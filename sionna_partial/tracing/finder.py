@@ -1,61 +1,49 @@
 """The scene of a map on disk, and where its paths come from: exact candidates of a floor plan, rays in a mesh."""
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from importlib import metadata
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
-from sionna_partial.errors import BackendError
 from sionna_partial.maps.mesh.cells import narrow_areas
 from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.bounds import Strengths, dropped_power, expected_power, levels_needed, strengths_of
-from sionna_partial.tracing.engine import SceneSolver, load_sionna, open_scene, set_antennas
-from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
+from sionna_partial.tracing.antennas import Antenna
+from sionna_partial.tracing.engine import SceneSolver, open_scene, set_antennas
 from sionna_partial.tracing.mesh.candidates import MeshCandidates
 from sionna_partial.tracing.mesh.crossings import MeshCrossings
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.sequences import shoot_rays
-from sionna_partial.tracing.mesh.walls import Bodies, Cells, SolidMesh, closed_bodies
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges
 from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
 from sionna_partial.tracing.plan.crossings import CrossingCandidates
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates, find_wedges
-from sionna_partial.tracing.plan.legs import Interior, solid_sides
-from sionna_partial.tracing.plan.obstacles import Lowered
+from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
-from sionna_partial.tracing.slab import slabs_of
+from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
+from sionna_partial.tracing.select import Block, Kind, rounds
+from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
+from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
 CANDIDATES_AT_ONCE = 100_000
 """Number of candidates that Sionna RT verifies together, which bounds the memory."""
 
-_Blocks = Iterator[tuple[Candidates, float, str]]
-"""Candidates, the fraction of them that is listed with these, and what is being done."""
-
 Found = tuple[Candidates | None, SolvedPaths]
 """Paths in scene coordinates, and the candidates that they were, one for one; None where rays found them."""
 
-TABLE_SIZE = 3_000_000
-"""Entries of the hash table, at least: more lose fewer paths where refraction makes many, and take more memory."""
+_DIRECTED = 0.5
+"""Factor of the tolerance with an antenna, whose gain is bounded within a degree only."""
 
-SAME_POINT_M = 0.03
-"""Paths of the same interactions at points closer than this are one path [m]."""
-
-SAME_EDGE_M = 1e-3
-"""Distance from an edge within which a diffraction is at that edge [m]."""
+Kinds = tuple[list[Kind], list[Kind]]
+"""Kinds of candidates between opaque walls, and kinds of candidates that go through walls."""
 
 
 @dataclass(frozen=True)
@@ -75,56 +63,32 @@ class PlanScene:
 
     @cached_property
     def interior(self) -> Interior:
-        """What lies between its walls, for paths through them."""
+        """The space between its walls, for paths through them."""
         depth_m, partial = self.settings.wall_depth_m, self.partial
         walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
         solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
         return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
-    def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
-        """Find the paths between a transmitter (3,) and receivers (N, 3) that are strong enough to matter."""
-        room = Room.of(self.geometry, tx_m, rx_m, solver.material_of_face)
-        kinds = self._kinds(room)
-        ends = (0.0, 1.0) if len(kinds) == 1 else (0.0, 0.2, 1.0)
-
-        def listed(strengths: Strengths) -> _Blocks:
-            for (message, kind), (low, high) in zip(kinds.items(), itertools.pairwise(ends), strict=True):
-                for candidates, fraction in kind.blocks(strengths):
-                    yield candidates, low + (high - low) * fraction, message
-
-        if not self.settings.through_walls:
-            yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
-            return
-        crossing = CrossingCandidates(self.geometry, room, self.interior, self.settings)
-        lowered = Lowered.of(self.geometry, room, self.interior, self.settings.max_walls)
-
-        def through_walls(power: Floats) -> Iterator[tuple[Candidates, float]]:
-            return ((lowered(block), fraction) for block, fraction in crossing.blocks(power))
-
-        power = np.zeros(len(rx_m))
-        part = part_of(report, 0.0, 0.8)
-        yield from _with_walls(solver, listed, through_walls, (tx_m, rx_m, power), self.settings, part)
-        if self.settings.diffraction and len(rx_m):
-            fixed = crossing.building, self.settings.tolerance_db
-            edges = CrossedEdgeCandidates(self.geometry, self.wedges, *fixed)
-            strengths = strengths_of(solver.materials.values(), self.settings.frequency_hz, len(rx_m))
-            doing = "verifying diffractions through walls"
-            blocks = ((lowered(block), done, doing) for block, done in edges.blocks(strengths, power))
-            yield from _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.8, 1.0))
-
-    def _kinds(self, room: Room) -> dict[str, SpecularCandidates | DiffractionCandidates]:
-        """Kinds of candidates, by what is done with them."""
+    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
+        """Return the kinds of candidates between a transmitter (3,) with an antenna and receivers (N, 3)."""
         geometry, settings = self.geometry, self.settings
-        specular = SpecularCandidates(geometry, room, settings.max_depth)
+        room = Room.of(geometry, tx_m, rx_m, solver.material_of_face, gains)
+        materials = materials_of(solver.materials.values(), settings.frequency_hz)
+        opaque: list[Kind] = [SpecularCandidates(geometry, room, settings.max_depth, materials)]
+        if settings.diffraction:
+            walls = settings.diffraction_walls
+            opaque.append(DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, materials, walls))
+        if not settings.through_walls:
+            return opaque, []
+        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials)
         if not settings.diffraction:
-            return {"verifying reflections": specular}
-        diffracted = DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, settings.diffraction_walls)
-        return {"verifying reflections": specular, "verifying diffractions": diffracted}
+            return opaque, [crossing]
+        return opaque, [crossing, CrossedEdgeCandidates(geometry, self.wedges, crossing)]
 
 
 @dataclass(frozen=True)
 class MeshScene:
-    """A mesh on disk, its shapes likewise, with vertices (V, 3) in scene coordinates [m] and triangles (F, 3)."""
+    """A mesh on disk, with the names of its shapes, vertices (V, 3) in scene coordinates [m] and triangles (F, 3)."""
 
     xml: Path
     shapes: tuple[str, ...]
@@ -133,24 +97,17 @@ class MeshScene:
     triangles: NDArray[np.int64]
     cells: Cells
 
-    def paths(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, report: Progress) -> Iterator[Found]:
-        """Find the paths likewise, by the sequences of planes that rays meet."""
+    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
+        """Return the kinds of candidates, by the sequences of planes that rays meet."""
         depth, frequency_hz = self.settings.max_depth, self.settings.frequency_hz
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, self.settings.samples_per_tx, depth)
-        kind = MeshCandidates(self.planes, solver.material_of_face, rays, tx_m, rx_m, depth)
-
-        def listed(strengths: Strengths) -> _Blocks:
-            return ((*block, "verifying reflections") for block in kind.blocks(strengths))
-
+        materials = materials_of(solver.materials.values(), frequency_hz)
+        mesh = self.planes, solver.material_of_face
+        opaque: list[Kind] = [MeshCandidates(*mesh, rays, tx_m, rx_m, depth, materials, gains)]
         if not self.settings.through_walls:
-            yield from _strong_paths(solver, listed, tx_m, rx_m, self.settings, report)
-            return
-        slabs = slabs_of(solver.materials.values(), solver.material_of_face, frequency_hz)
-        largest = strengths_of(solver.materials.values(), frequency_hz, 0).largest
-        solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, slabs)
-        crossing = MeshCrossings(solid, tx_m, rx_m, largest, self.settings)
-        ends = tx_m, rx_m, np.zeros(len(rx_m))
-        yield from _with_walls(solver, listed, crossing.blocks, ends, self.settings, report)
+            return opaque, []
+        solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, materials, solver.material_of_face)
+        return opaque, [MeshCrossings(solid, tx_m, rx_m, self.settings, gains)]
 
     @cached_property
     def planes(self) -> MeshPlanes:
@@ -175,9 +132,27 @@ class ExactFinder:
     written: PlanScene | MeshScene
     solver: SceneSolver
 
-    def paths(self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress) -> Iterator[Found]:
-        """Find the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m]."""
-        return self.written.paths(self.solver.polarised(polarisations), tx_m, rx_m, report)
+    def paths(
+        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
+    ) -> Iterator[Found]:
+        """Find the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m].
+
+        Weak paths are left out by their power with the transmit antenna, for which both polarisations are traced.
+        """
+        if not len(rx_m):
+            return
+        solver, power, settings = self.solver.polarised(polarisations), np.zeros(len(rx_m)), self.written.settings
+        gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
+        tolerance_db = settings.tolerance_db * (1.0 if gains is ISOTROPIC else _DIRECTED)
+        opaque, through_walls = self.written.kinds(solver, tx_m, rx_m, gains)
+        for select in rounds(opaque, through_walls, len(rx_m), tolerance_db, report):
+            for candidates, paths in _verified(solver, select(power), tx_m, rx_m, report):
+                indirect = ~paths.is_direct
+                strength = paths.power
+                if antenna is not None and gains is not ISOTROPIC:
+                    strength = antenna.power(paths, settings.frequency_hz)
+                np.add.at(power, paths.path_rx[indirect], strength[indirect])
+                yield candidates, paths
 
 
 class RayFinder:
@@ -186,8 +161,10 @@ class RayFinder:
     def __init__(self, written: PlanScene | MeshScene) -> None:
         self._written, self._scene = written, open_scene(written.xml, written.settings.frequency_hz)
 
-    def paths(self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress) -> Iterator[Found]:
-        """Find the paths likewise."""
+    def paths(
+        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
+    ) -> Iterator[Found]:
+        """Find the paths as `ExactFinder.paths` does; the antenna does not matter, as none is left out."""
         settings = self._written.settings
         set_antennas(self._scene, polarisations)
         for number, paths in enumerate(stock_paths(self._scene, settings, tx_m, rx_m), start=1):
@@ -217,195 +194,20 @@ def write_scene_of(
     return PlanScene(xml, geometry.shapes, settings, geometry, wedges, partial, floor)
 
 
-def _strong_paths(
-    solver: SceneSolver,
-    listed: Callable[[Strengths], _Blocks],
-    tx_m: Floats,
-    rx_m: Floats,
-    settings: TraceSettings,
-    report: Progress,
-) -> Iterator[Found]:
-    """Verify the candidates that are strong enough to matter.
-
-    First the bounds of all candidates are added up. Those that a link can do without, if its strongest candidates are
-    as strong as their bounds, are left out. Where Sionna RT finds less than that, more of them follow.
-    """
-    if len(rx_m) == 0:
-        return
-    bounds = strengths_of(solver.materials.values(), settings.frequency_hz, len(rx_m))
-    tolerance_db = settings.tolerance_db
-    if tolerance_db == 0.0:
-        yield from _verified(solver, listed(bounds), tx_m, rx_m, report)
-        return
-    nothing = np.ones(len(rx_m), np.int64)
-    for _, fraction, _ in listed(bounds._replace(first=nothing, last=nothing)):
-        report(0.4 * fraction, "listing paths")
-    power, done = np.zeros(len(rx_m)), bounds.first
-    expected = expected_power(bounds.power)
-    for low, high in ((0.4, 0.9), (0.9, 1.0)):
-        needed = levels_needed(bounds.power, dropped_power(expected, tolerance_db))
-        more = needed > done
-        if not more.any():
-            return
-        strengths = bounds._replace(first=done, last=np.where(more, needed, 0), power=bounds.power[:0])
-        for candidates, paths in _verified(solver, listed(strengths), tx_m, rx_m, part_of(report, low, high)):
-            indirect = ~paths.is_direct
-            np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
-            yield candidates, paths
-        done, expected = needed, power
-
-
-def _with_walls(
-    solver: SceneSolver,
-    listed: Callable[[Strengths], _Blocks],
-    through_walls: Callable[[Floats], Iterator[tuple[Candidates, float]]],
-    ends: tuple[Floats, Floats, Floats],
-    settings: TraceSettings,
-    report: Progress,
-) -> Iterator[Found]:
-    """Verify the candidates without walls, and those that `through_walls` lists for links of so much power (N,).
-
-    The powers of the links are added to the third of `ends`, but for the direct path.
-    """
-    tx_m, rx_m, power = ends
-    for candidates, paths in _strong_paths(solver, listed, tx_m, rx_m, settings, part_of(report, 0.0, 0.6)):
-        indirect = ~paths.is_direct
-        np.add.at(power, paths.path_rx[indirect], paths.power[indirect])
-        yield candidates, paths
-    blocks = ((*block, "verifying paths through walls") for block in through_walls(power))
-    for candidates, paths in _verified(solver, blocks, tx_m, rx_m, part_of(report, 0.6, 1.0)):
-        np.add.at(power, paths.path_rx, paths.power)
-        yield candidates, paths
-
-
 def _verified(
-    solver: SceneSolver,
-    blocks: _Blocks,
-    tx_m: Floats,
-    rx_m: Floats,
-    report: Progress,
+    solver: SceneSolver, blocks: Iterator[Block], tx_m: Floats, rx_m: Floats, report: Progress
 ) -> Iterator[Found]:
     """Verify candidates, many blocks of one kind at once."""
-    waiting: list[Candidates] = []
-    doing = ""
-    for candidates, fraction, message in itertools.chain(blocks, [(None, 1.0, "")]):
-        full = sum(len(each.rx) for each in waiting) >= CANDIDATES_AT_ONCE
-        if waiting and (candidates is None or full or not candidates.is_like(waiting[0])):
-            together = Candidates.concatenate(waiting)
+    waiting: list[Block] = []
+    for block in itertools.chain(blocks, [None]):
+        full = sum(len(each.candidates.rx) for each in waiting) >= CANDIDATES_AT_ONCE
+        if waiting and (block is None or full or not block.candidates.is_like(waiting[0].candidates)):
+            together = Candidates.concatenate([each.candidates for each in waiting])
             for start in range(0, len(together.rx), CANDIDATES_AT_ONCE):
                 part = together.rows(np.arange(start, min(start + CANDIDATES_AT_ONCE, len(together.rx))))
                 paths, rows = solver.verify(part, tx_m, rx_m)
-                report(fraction, doing)
+                report(waiting[-1].done, waiting[-1].message)
                 yield part.rows(rows), paths
             waiting = []
-        if candidates is not None and len(candidates.rx):
-            waiting.append(candidates)
-            doing = message
-
-
-def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats) -> Iterator[SolvedPaths]:
-    """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
-
-    `scene` comes from `open_scene`; positions and paths are in its coordinates. Most paths are found, not all: the more
-    rays, the more. Sionna RT counts the sequences of surfaces that rays meet in a hash table which all receivers of a
-    call share, where a collision drops a path: each receiver has a call of its own, and its paths do not depend on the
-    others. Sionna RT 2.2 takes paths that are reflected after a diffraction, and have fewer than `max_depth`
-    interactions, for longer than they are, and some dB too weak. Raises a BackendError if LLVM or Sionna RT cannot be
-    used.
-    """
-    if len(rx_m) == 0:
-        return
-    rt = load_sionna()
-    try:
-        receiver = rt.Receiver("rx", position=_point(rx_m[0]))
-        for device in (rt.Transmitter("tx", position=_point(tx_m)), receiver):
-            scene.remove(device.name)
-            scene.add(device)
-        solver = rt.PathSolver(deterministic=True)
-        for index, position_m in enumerate(rx_m):
-            receiver.position = _point(position_m)
-            yield _read_paths(solver(scene, **_options(settings)), max(1, settings.max_depth), index, tx_m, rx_m)
-    except Exception as error:
-        raise BackendError(
-            f"Sionna RT {metadata.version('sionna-rt')} cannot solve the paths ({error!r}): lower samples_per_tx if "
-            "memory ran out, or install sionna-partial again."
-        ) from error
-
-
-def _point(position_m: Floats) -> Any:
-    """Position as an array on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
-    import mitsuba as mi
-
-    return mi.Point3f(*(mi.Float([float(value)]) for value in position_m))
-
-
-def _options(settings: TraceSettings) -> dict[str, Any]:
-    """Arguments of Sionna RT's path solver."""
-    rays = settings.samples_per_tx
-    every_ray = 1 + rays * settings.max_depth if settings.diffuse_reflection else 0
-    return {
-        "max_depth": settings.max_depth,
-        "max_num_paths_per_src": max(TABLE_SIZE, every_ray),
-        "samples_per_src": rays,
-        "los": True,
-        "seed": settings.seed,
-        **{argument: kind.is_on(settings) for kind in INTERACTIONS for argument in kind.arguments},
-    }
-
-
-def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
-    """Copy the valid paths of one receiver out of Dr.Jit, each once."""
-    real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
-    transfer = real + 1j * imaginary
-    valid = np.flatnonzero(found.valid.numpy().ravel() & (transfer[:, 0, 0] != 0.0))
-    interactions = found.interactions.numpy().reshape(depth, -1)[:, valid].T.astype(np.uint8)
-    vertices_m = np.moveaxis(found.vertices.numpy().reshape(depth, -1, 3)[:, valid], 0, 1)
-    kept = ~listed_before(interactions, vertices_m)
-    return SolvedPaths.of_vertices(
-        path_rx=np.full(kept.sum(), index, np.int32),
-        transfer=transfer[valid][kept].astype(np.complex128),
-        delay_s=found.tau.numpy().ravel()[valid].astype(np.float64)[kept],
-        interactions=interactions[kept],
-        vertices_m=vertices_m[kept],
-        tx_m=tx_m,
-        rx_m=rx_m,
-    )
-
-
-def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -> Bools:
-    """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
-
-    Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
-    a diffuse reflection are samples of a rough surface, however close, and never repeats.
-    """
-    repeated = np.zeros(len(interactions), dtype=bool)
-    exact = np.flatnonzero((interactions != DIFFUSE).all(axis=1))
-    points = np.where(interactions[exact, :, None] > 0, vertices_m[exact], 0.0)
-    tree = cKDTree(points.reshape(len(exact), 3 * interactions.shape[1]))
-    pairs = tree.query_pairs(SAME_POINT_M, p=np.inf, output_type="ndarray")
-    first, second = exact[pairs].T
-    repeated[second[(interactions[first] == interactions[second]).all(axis=1)]] = True
-    return repeated
-
-
-def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> Bools:
-    """Whether each path (P,) is diffracted as exact candidates are, if it is at all.
-
-    Sionna RT's rays are diffracted at the rims of floor and ceiling and at junctions of walls as well, and with any
-    number of reflections around it.
-    """
-    diffracted = (paths.interactions == DIFFRACTION).any(axis=1)
-    kept = ~diffracted
-    if diffracted.any() and len(wedges.edge_m):
-        which = (paths.interactions == DIFFRACTION).argmax(axis=1)
-        x, y, z = paths.vertices_m[np.arange(len(diffracted)), which][diffracted].T
-        distance_m, edge = cKDTree(wedges.edge_m).query(np.column_stack([x, y]))
-        beside, top_m = distance_m < SAME_EDGE_M, wedges.height_m[edge]
-        reflected = paths.interactions[diffracted] == REFLECTION
-        height_m = paths.vertices_m[diffracted, :, 2]
-        at_walls = reflected & (height_m > SAME_EDGE_M) & (height_m < wedges.height_m.max() - SAME_EDGE_M)
-        before = np.arange(reflected.shape[1]) < which[diffracted, None]
-        few = reflected.sum(axis=1) <= MAX_REFLECTIONS
-        few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
-        kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < top_m - SAME_EDGE_M)
-    return kept
+        if block is not None and len(block.candidates.rx):
+            waiting.append(block)

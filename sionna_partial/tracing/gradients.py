@@ -33,7 +33,7 @@ def one_transmitter(tx: ArrayLike) -> ArrayLike:
 class GainGradients(Shown):
     """Path gain from one transmitter to N receivers, and its derivatives.
 
-    The derivatives are those of the paths that exist: they do not include paths that appear or vanish. They are 0 in
+    The derivatives include the paths that exist, not paths that appear or vanish. They are 0 in
     an outage, where the gain is -150 dB.
 
     Parameters
@@ -93,14 +93,14 @@ def gain_gradients(
 ) -> GainGradients:
     """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
 
-    The paths are those of `trace_links` with the same arguments. The power of a link is the sum of the powers of its
+    The paths are as in `trace_links` with the same arguments. The power of a link is the sum of the powers of its
     paths, without their phases. Candidates are verified first; Dr.Jit then differentiates the image method and the
     field calculator of Sionna RT for the paths among them, in forward mode, one parameter after the other.
 
     Parameters
     ----------
     scene : PartialMap, path or Simulation
-        What is known of the building; unknown space is free.
+        Map of the building; unknown space is free.
     tx : (3,) array-like
         Transmitter position [m].
     rx : (N, 3) array-like

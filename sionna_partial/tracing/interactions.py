@@ -1,10 +1,10 @@
 """The kinds of interactions of paths: who finds them, and which setting switches them on.
 
-What depends on the kind of an interaction is decided by this table. One more kind is one more row. Sionna RT's rays
-then find its paths. To find every one, on a plan or a mesh, it takes candidates as well: a class with `blocks` in
-`tracing/plan` or `tracing/mesh`, which writes the number of the kind into `Candidates.kind`, leaves out what is weak by
-a bound of its power (`bounds.py`), and is listed by the scene in `finder.py`. Sionna RT verifies candidates of any
-kind.
+This table decides everything that depends on the kind of an interaction. One more kind is one more row. Sionna RT's
+rays then find its paths. To find every path, on a plan or a mesh, it takes candidates as well: a `Kind` of `select.py`
+in `tracing/plan` or `tracing/mesh`, which lists candidates with a bound of their power (`power.py`) and writes the
+selected ones, with the number of the kind in `Candidates.kind`. The scenes in `finder.py` return their kinds. Sionna RT
+verifies candidates of any kind.
 """
 
 from collections.abc import Callable
@@ -28,9 +28,9 @@ class Interaction:
     arguments : tuple of str
         Arguments of Sionna RT's path solver that switch it on where rays find its paths.
     exact_on : tuple
-        Kinds of maps on which candidates find every path. These paths can be differentiated; those of rays cannot.
+        Kinds of maps on which candidates find every path. These paths can be differentiated; paths of rays cannot.
     default : callable
-        Whether paths have it where the setting is None and candidates find it.
+        Returns whether paths have it where the setting is None and candidates find it.
     """
 
     number: int
@@ -40,7 +40,7 @@ class Interaction:
     default: Callable[[TraceSettings], bool] = lambda _: True
 
     def is_on(self, settings: TraceSettings) -> bool:
-        """Whether settings without None ask for it."""
+        """Return whether settings without None ask for it."""
         return not self.setting or bool(getattr(settings, self.setting))
 
 

@@ -138,7 +138,7 @@ class TracedLinks(Shown):
         normalize_delays : bool
             Count delays from the shortest path of each link.
         memory_gb : float
-            How much memory the result, and the work for it, may take [GB].
+            Largest memory of the result and of the work for it [GB].
 
         Returns
         -------
@@ -173,7 +173,7 @@ class TracedLinks(Shown):
         Parameters
         ----------
         frequencies_hz : (F,) array-like
-            Frequencies relative to the carrier [Hz], such as those of subcarriers.
+            Frequencies relative to the carrier [Hz], such as the frequencies of subcarriers.
         **options
             Arguments of `cir`.
 
@@ -241,13 +241,13 @@ class TracedLinks(Shown):
     ) -> xr.Dataset:
         """Return the gain of every pair of beams of each link.
 
-        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are those of `cir`
+        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are as in `cir`
         for plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
 
         Parameters
         ----------
         codebook : (C, tx_ant) array-like
-            Weights of the transmitting antennas, a beam in each row, such as those of `dft_codebook`.
+            Weights of the transmitting antennas, a beam in each row, such as `dft_codebook` returns.
         rx_codebook : (B, rx_ant) array-like, optional
             Those of the receiving antennas. By default each antenna alone.
         tx_array, rx_array, tx_orientation_rad, rx_orientation_rad, memory_gb
@@ -332,7 +332,7 @@ class TracedLinks(Shown):
         -------
         xarray.Dataset
             On "rx", and "tx" where there are several. `path_loss_db`; `k_factor_db`, the power of the line of sight
-            over that of all other paths; `delay_spread_s`, the standard deviation of the delay; and four circular
+            over the power of all other paths; `delay_spread_s`, the standard deviation of the delay; and four circular
             standard deviations `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`,
             `zenith_arrival_spread_rad` and `azimuth_arrival_spread_rad`. NaN without paths, and K without line of
             sight.

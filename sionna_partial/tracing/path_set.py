@@ -30,14 +30,14 @@ Part = tuple[Candidates, SolvedPaths]
 @read_only
 @dataclass(frozen=True)
 class PathParameters(Shown):
-    """What the power of paths depends on.
+    """Parameters of the power of paths.
 
     Parameters
     ----------
     tx_m : (3,) or (T, 3) float64 array
         Transmitter positions [m].
     relative_permittivity, conductivity_s_m, thickness_m : (M,) float64 arrays
-        Of each material: real relative permittivity, conductivity [S/m] and thickness [m]. ITU materials follow the
+        Real relative permittivity, conductivity [S/m] and thickness [m] of each material. ITU materials follow the
         frequency on top of that, as Sionna RT has them.
     frequency_hz : () float64 array
         Carrier frequency [Hz].
@@ -55,7 +55,7 @@ MATERIAL_PARAMETERS = PARAMETERS[1:4]
 
 
 class _Simulation(Protocol):
-    """What paths ask of the `Simulation` that found them."""
+    """Members of the `Simulation` that found the paths."""
 
     trace_settings: TraceSettings
     resolved: Any
@@ -84,7 +84,7 @@ class PathSet:
     interactions : (P, D) uint8 array
         Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
     is_direct : (P,) bool array
-        Whether each is the line of sight.
+        True for the line of sight.
     vertices_m : (P, D, 3) float64 array
         Positions of the interactions at `base` [m]; NaN where there is none.
     """
@@ -166,7 +166,7 @@ class PathSet:
     ) -> dict[str, Floats]:
         """Differentiate the power of each path with respect to the K entries of fields of `PathParameters`: (P, K).
 
-        Of the transmitters, that is the x, y, z of each path's own; with `together` all materials change by as much.
+        For transmitters, these are x, y, z of the path's own; with `together` all materials change by as much.
         Dr.Jit passes forward once for each entry. Backwards, one pass takes longer than these seven of a floor plan,
         and its derivatives of the position differ from run to run.
         """
@@ -227,7 +227,7 @@ class PathSet:
     def _variables(
         self, parameters: PathParameters, names: Sequence[str] = (), *, together: bool = False
     ) -> tuple[dict[str, list[Any]], Variables]:
-        """Return what is differentiated with respect to, by name, and all variables for the solver."""
+        """Return the variables of the derivatives, by name, and all variables for the solver."""
         import drjit as dr
         import mitsuba as mi
 

@@ -41,7 +41,7 @@ class SolvedPaths:
 
     @property
     def is_direct(self) -> Bools:
-        """Whether each path (P,) is the line of sight."""
+        """Return whether each path (P,) is the line of sight."""
         return (self.interactions == 0).all(axis=1)
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
@@ -226,7 +226,7 @@ class Candidates:
     `rx` (C,) is the receiver of each. `kind` (C, D) is Sionna RT's `InteractionType` of every interaction in order from
     the transmitter, 0 where there is none. `face` (C, D) is the face of the scene there, counted through its shapes:
     any of the faces in one plane stands for all, the 0-face for an edge, and -1 for none. `vertices_m` (C, D, 3) are
-    the points of interaction [m]. If all candidates are diffracted, `wedge` (C,) is the one of `wedges` where each is.
+    the points of interaction [m]. If all candidates are diffracted, `wedge` (C,) are their numbers in `wedges`.
     If any candidate goes through walls, `same_wall` (C, D) is True for refractions at further faces of a wall that
     has been crossed: they cost nothing.
     """
@@ -240,7 +240,7 @@ class Candidates:
     same_wall: Bools | None = None
 
     def is_like(self, other: "Candidates") -> bool:
-        """Whether both can be verified together."""
+        """Return whether both can be verified together."""
         same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
         return same and (self.same_wall is None) == (other.same_wall is None)
 

@@ -25,6 +25,7 @@ from sionna_partial.maps.partial_map import PartialMap, position_array
 from sionna_partial.progress import part_of, reporting
 from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
 from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
 from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
@@ -33,7 +34,7 @@ from sionna_partial.tracing.path_set import PathParameters, PathSet
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
 
 InvalidLinks = Literal["raise", "nan"]
-"""What becomes of links that cannot be traced."""
+"""Treatment of links that cannot be traced."""
 
 _log = logging.getLogger(__name__)
 
@@ -63,7 +64,7 @@ class Simulation:
     Parameters
     ----------
     scene : PartialMap or path
-        What is known of the building; unknown space is free.
+        Map of the building; unknown space is free.
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
 
@@ -186,9 +187,15 @@ class Simulation:
             report(1.0, "traced")
         return found
 
-    def blocks(self, tx_m: Floats, rx_m: Floats, report: Progress, polarisations: int = 1) -> Iterator[SolvedPaths]:
-        """Find all paths from a transmitter (3,) to receivers (N, 3) that have been checked, some at a time."""
-        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report, polarisations):
+    def blocks(
+        self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
+    ) -> Iterator[SolvedPaths]:
+        """Find all paths from a transmitter (3,) to receivers (N, 3) that have been checked, some at a time.
+
+        With an antenna, both polarisations are traced, and paths are left out that are weak with it.
+        """
+        polarisations = 1 if antenna is None else 2
+        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report, polarisations, antenna):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
@@ -219,7 +226,7 @@ class Simulation:
         return tuple(self.solver.materials)
 
     def parameters(self, tx_m: ArrayLike) -> PathParameters:
-        """Return those of the scene, with transmitters (3,) or (T, 3) [m]."""
+        """Return the parameters of the scene, with transmitters (3,) or (T, 3) [m]."""
         permittivity, conductivity_s_m, thickness_m = np.reshape([*self.solver.materials.values()], (-1, 3)).T
         return PathParameters(
             tx_m=np.array(tx_m, dtype=np.float64),
@@ -256,7 +263,7 @@ class Simulation:
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
-        """What finds the paths, with the scene in memory; a warning is logged where only rays do."""
+        """Return the finder of the paths, with the scene in memory; a warning is logged where only rays do."""
         if self._only_by_rays:
             names = [f"{kind.setting} on a mesh" if kind.exact_on else kind.setting for kind in self._only_by_rays]
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
@@ -268,7 +275,13 @@ class Simulation:
             return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, self.resolved.trace_settings))
 
     def _groups(
-        self, tx_m: Floats, rx_m: Floats, rx_of_tx: Iterable[Indices], report: Progress, polarisations: int = 1
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        rx_of_tx: Iterable[Indices],
+        report: Progress,
+        polarisations: int = 1,
+        antenna: Antenna | None = None,
     ) -> Iterator[Iterator[Found]]:
         """Find the paths from transmitters (T, 3) to some receivers each, for so many receivers at once as fit."""
         at_once = self.partial.environment.receivers_at_once
@@ -279,13 +292,12 @@ class Simulation:
         ]
         for number, (tx, chosen) in enumerate(groups):
             part = part_of(report, number / len(groups), (number + 1) / len(groups))
-            yield self._group(tx, chosen, tx_m[tx], rx_m[chosen], part, polarisations)
+            ends = self.in_scene(tx_m[tx]), self.in_scene(rx_m[chosen])
+            yield self._in_world(tx, chosen, self._finder.paths(*ends, polarisations, part, antenna))
 
-    def _group(
-        self, tx: int, chosen: NDArray[np.int32], tx_m: Floats, rx_m: Floats, report: Progress, polarisations: int
-    ) -> Iterator[Found]:
-        ends = self.in_scene(tx_m), self.in_scene(rx_m)
-        for candidates, paths in self._finder.paths(*ends, polarisations, report):
+    def _in_world(self, tx: int, chosen: NDArray[np.int32], found: Iterator[Found]) -> Iterator[Found]:
+        """Return paths in coordinates of the world, with the numbers of their transmitter and receivers."""
+        for candidates, paths in found:
             if len(paths.a):
                 world = replace(paths, vertices_m=self.in_world(paths.vertices_m))
                 yield candidates, world.between(tx, chosen)
@@ -341,7 +353,7 @@ def _shaped(ends: dict[str, Any]) -> dict[str, Any]:
 
 
 class Simulated(Protocol):
-    """What has a simulation, such as a LinkModel."""
+    """An object with a simulation, such as a LinkModel."""
 
     simulation: Simulation
 
@@ -378,14 +390,14 @@ def trace_links(
     (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
     RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays determine
     the sequences of planes; line of sight and nearly all specular reflections are found. Paths through walls are found
-    likewise. With diffuse reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver shoots rays
-    instead, receiver by receiver, which is slow and finds most paths, not all. It also does with another release of
-    Sionna RT than 2.2. The answer for a receiver does not depend on the other receivers.
+    in the same way. With diffuse reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver
+    shoots rays instead, receiver by receiver, which is slow and finds most paths, not all. It also does with another
+    release of Sionna RT than 2.2. The answer for a receiver does not depend on the other receivers.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        What is known of the building; unknown space is free (paper, Section III-B). A simulation stays warm.
+        Map of the building; unknown space is free (paper, Section III-B). A simulation stays warm.
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].
     rx : (N, 3) array-like
@@ -393,12 +405,12 @@ def trace_links(
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     folder : path, optional
-        Where the paths are written while they are traced, an `.npy` file for each array. The arrays of the result are
-        then read from there when they are needed, and `memory_gb` does not limit them.
+        Folder to which the paths are written while they are traced, an `.npy` file for each array. The arrays of the
+        result are then read from there when they are needed, and `memory_gb` does not limit them.
     memory_gb : float
-        How much memory the paths may take [GB]. Their size is estimated first, from some of the receivers.
+        Largest memory of the paths [GB]. Their size is estimated first, from some of the receivers.
     invalid : {"raise", "nan"}
-        What becomes of links whose receiver can stand nowhere (it is not finite, outside the map, in a wall, not
+        Treatment of links whose receiver can stand nowhere (it is not finite, outside the map, in a wall, not
         between floor and ceiling) or is at the transmitter: an error, or a link without paths, of link state 255 and
         gain NaN.
     progress : bool or callable, optional
@@ -454,7 +466,7 @@ def nearest_m(frequency_hz: float) -> float:
 
 
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
-    """Whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    """Return whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
     clear, lower_m = ~partial.is_wall_at(points_m), 0.0 if partial.obstacle is None else -SHORTEST_M
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         clear &= ~partial.is_wall_at(points_m + np.array([*corner, lower_m]))

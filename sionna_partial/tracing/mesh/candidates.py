@@ -6,18 +6,21 @@ receiver that lies there, or a little beside, is a candidate if the line to it, 
 """
 
 from collections.abc import Iterable, Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
-from sionna_partial.tracing.bounds import LEVELS, Strengths, level_of, reflected_power
 from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.mesh.faces import MeshPlanes, face_at
 from sionna_partial.tracing.mesh.sequences import Rays, Sequences, Views, collect_sequences, view_sequences
 from sionna_partial.tracing.paths import Candidates
+from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, gain_towards, reflected_power
+from sionna_partial.tracing.select import Listed
 
 REACH, REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
@@ -42,7 +45,7 @@ class Boxes(NamedTuple):
 
 
 class View(NamedTuple):
-    """Where receivers of one sequence are: image (3,), box of directions, width by which it is enlarged, and reach."""
+    """The view of one sequence: image (3,), box of directions, width by which it is enlarged, and reach."""
 
     source: NDArray[np.float64]
     low: NDArray[np.float32]
@@ -60,20 +63,14 @@ class Images(NamedTuple):
     material: NDArray[np.int64]
 
 
-class _Found(NamedTuple):
-    """Columns of candidates, as in `Candidates`."""
-
-    rx: NDArray[np.int32]
-    face: NDArray[np.int32]
-    points: NDArray[np.float64]
-
-
 class MeshCandidates:
     """All paths by the sequences of planes that rays have met, between a transmitter (3,) and receivers (N, 3).
 
     The faces of the mesh, in some planes, are each of one of the materials of the bounds (F,). `rays` come from
-    `shoot_rays`, with the same transmitter and `max_depth`, and count the faces likewise.
+    `shoot_rays`, with the same transmitter and `max_depth`, and count the faces as here.
     """
+
+    name = "reflections"
 
     def __init__(
         self,
@@ -83,38 +80,29 @@ class MeshCandidates:
         tx_m: NDArray[np.float64],
         rx_m: NDArray[np.float64],
         max_depth: int,
+        materials: Materials,
+        gains: Gains = ISOTROPIC,
     ) -> None:
         sequences, self._size = collect_sequences(rays, planes), max(1, max_depth)
         views = view_sequences(sequences, planes, np.asarray(tx_m, np.float64))
         self._images = Images(sequences, views, planes, material)
-        self._rx_m = np.ascontiguousarray(rx_m, dtype=np.float64)
-        self._boxes = divide(self._rx_m)
-        self._best = np.zeros(sequences.size, np.uint8)  # level of the strongest candidate of each sequence
+        self._rx_m, self._materials = np.ascontiguousarray(rx_m, dtype=np.float64), materials
+        self._antenna = np.array(tx_m, np.float64), gains
 
-    def blocks(
-        self, strengths: Strengths, *, receivers_per_block: int = 1_000_000
-    ) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all.
-
-        Direct paths come first, then sequence after sequence.
-        """
-        direct = np.flatnonzero((strengths.first == 0) & (strengths.last > 0)).astype(np.int32)
-        face, points = np.full((len(direct), self._size), -1, np.int32), np.zeros((len(direct), self._size, 3))
-        yield Candidates(direct, np.zeros(face.shape, np.uint8), face, points), 0.0
-        count, done = len(self._best), 0
+    def listed(self, found: Floats, *, receivers_per_part: int = 1_000_000) -> Iterator[Listed]:
+        """List direct paths, then the candidates of sequence after sequence; none is negligible."""
+        count, done, boxes = self._images.sequences.size, 0, divide(self._rx_m)
+        every = np.arange(len(self._rx_m), dtype=np.int32)
+        yield Listed(every, np.full(len(every), np.inf), partial(self._written, np.full(len(every), -1), every), 0.0)
         while done < count:
-            rx, face, points, done = _next_block(
-                done,
-                self._images,
-                self._boxes,
-                self._rx_m,
-                self._size,
-                strengths,
-                self._best,
-                receivers_per_block,
+            node, rx, bound, done = _list_part(
+                done, self._images, boxes, self._rx_m, self._size, self._materials, self._antenna, receivers_per_part
             )
-            kind = np.where(face < 0, 0, REFLECTION).astype(np.uint8)
-            yield Candidates(rx, kind, face, points), done / count
+            yield Listed(rx, bound, partial(self._written, node, rx), done / count)
+
+    def _written(self, node: Indices, rx: NDArray[np.int32], rows: Indices) -> Candidates:
+        face, points = _write_folded(node[rows], rx[rows], self._images, self._rx_m, self._size, self._materials)
+        return Candidates(rx[rows], np.where(face < 0, 0, REFLECTION).astype(np.uint8), face, points)
 
 
 @njit(cache=True)
@@ -143,32 +131,43 @@ def divide(points):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_block(first, images, boxes, rx_m, depth, strengths, best, block):  # type: ignore[no-untyped-def]
-    """Candidates of the sequences from number `first` in the order on, and where to go on.
+def _list_part(first, images, boxes, rx_m, depth, materials, antenna, most):  # type: ignore[no-untyped-def]
+    """List the candidates from sequence `first` in the order on: sequence, receiver, bound (C,); where to go on.
 
-    A block ends once the sequences in it have been in view of `block` receivers in sum.
+    A part ends once the sequences in it have been in view of `most` receivers in sum.
     """
-    sequences, views, planes, _ = images
-    out = _Found(np.empty(1024, np.int32), np.empty((1024, depth), np.int32), np.empty((1024, depth, 3)))
-    seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
-    count, in_view, done, weakest = 0, 0, first, strengths.last.max()
-    while done < len(views.order) and in_view < block:
+    (sequences, views, planes, _), (tx_m, gains) = images, antenna
+    out_node, out_rx, bound, count = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), 0
+    face, points = np.empty(depth, np.int32), np.empty((depth, 3))
+    seen, stack, box = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    in_view, done = 0, first
+    while done < len(views.order) and in_view < most:
         node = views.order[done]
         done += 1
-        if best[node] >= weakest:
-            continue
-        best[node] = LEVELS
         reach = REACH * sequences.reach_m[node] + REACH_M
         view = View(views.source_m[node], sequences.low[node], sequences.high[node], views.margin[node], reach)
-        bound_view(view, farthest(view.source, boxes), planes, sequences.plane[node], bounds)
-        number = receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
-        if number > 0:
-            size = count + number
-            out = _Found(grow(out.rx, size), grow(out.face, size), grow(out.points, size))
-            ends = seen[:number]
-            count = _fold(node, ends, images, rx_m, strengths, best, out, count)
-            in_view += number
-    return out.rx[:count].copy(), out.face[:count].copy(), out.points[:count].copy(), done
+        bound_view(view, farthest(view.source, boxes), planes, sequences.plane[node], box)
+        number = receivers_in_view(view, boxes, rx_m, box, stack, seen)
+        in_view += number
+        for rx in seen[:number]:
+            power = fold_line(node, rx_m[rx], images, materials, face, points)
+            if power < 0.0:
+                continue
+            out_node, out_rx, bound = grow(out_node, count + 1), grow(out_rx, count + 1), grow(bound, count + 1)
+            gain = gain_towards(gains, points[0, 0] - tx_m[0], points[0, 1] - tx_m[1], points[0, 2] - tx_m[2])
+            out_node[count], out_rx[count], bound[count] = node, rx, power * gain
+            count += 1
+    return out_node[:count].copy(), out_rx[:count].copy(), bound[:count].copy(), done
+
+
+@njit(cache=True)
+def _write_folded(nodes, rx, images, rx_m, depth, materials):  # type: ignore[no-untyped-def]
+    """Write faces (C, D) and points (C, D, 3) of candidates; the sequence -1 is the direct path."""
+    face, points = np.full((len(nodes), depth), -1, np.int32), np.zeros((len(nodes), depth, 3))
+    for c in range(len(nodes)):
+        if nodes[c] >= 0:
+            fold_line(nodes[c], rx_m[rx[c]], images, materials, face[c], points[c])
+    return face, points
 
 
 @njit(cache=True)
@@ -237,7 +236,7 @@ def bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-de
 
 @njit(cache=True)
 def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
-    """Whether no point of a box is in view."""
+    """Return whether no point of a box is in view."""
     for axis in range(3):
         if low[axis] > bounds[1, axis] or high[axis] < bounds[0, axis]:
             return True
@@ -253,35 +252,12 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fold(node, found, images, rx_m, strengths, best, out, count):  # type: ignore[no-untyped-def]
-    """Append the candidates among the receivers found for a sequence, and return the new number of candidates."""
-    rx, face, points = out
-    depth = images.views.depth[node]
-    for target in found:
-        power = fold_line(
-            node, rx_m[target], images, strengths.largest, strengths.wavelength_m, face[count], points[count]
-        )
-        if power >= 0.0:
-            level = level_of(power)
-            best[node] = min(best[node], level)
-            if len(strengths.power):
-                strengths.power[target, level] += power
-            if not strengths.first[target] <= level < strengths.last[target]:
-                continue
-            rx[count] = target
-            face[count, depth:] = -1
-            points[count, depth:] = 0.0
-            count += 1
-    return count
-
-
-@njit(cache=True)
-def fold_line(node, target, images, largest, wavelength, face, points):  # type: ignore[no-untyped-def]
+def fold_line(node, target, images, materials, face, points):  # type: ignore[no-untyped-def]
     """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
 
     Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
     """
-    sequences, views, planes, material = images
+    (sequences, views, planes, material), largest, wavelength = images, materials.largest, materials.wavelength_m
     parent, plane, sources, depth = sequences.parent, sequences.plane, views.source_m, views.depth[node]
     normals, offsets, bins = planes.normal, planes.offset_m, planes.bins
     x, y, z = target[0], target[1], target[2]

@@ -1,18 +1,18 @@
 """Candidates of meshes that go through walls: sequences of planes that rays meet behind walls, and all legs cast.
 
 At every face a ray splits into one that is reflected and one that goes on. The sequences of their reflections list
-candidates as those of opaque meshes do, without regard to what lies between. Then every leg is cast through the mesh,
+candidates as in opaque meshes, without regard to faces between them. Then every leg is cast through the mesh,
 the faces on it are grouped to walls, and the power of the path follows.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.settings import TraceSettings
@@ -38,12 +38,19 @@ from sionna_partial.tracing.mesh.sequences import (
     rehash,
     view_sequences,
 )
-from sionna_partial.tracing.mesh.walls import SolidMesh, cosine_at, is_inside, is_one_wall, mark_walls, trail
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.crossing_beams import Limits, matters, rarer_by
-from sionna_partial.tracing.plan.crossings import MOST_REFLECTIONS, RARER, least_power, weakest_needed
 from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
-from sionna_partial.tracing.slab import COSINES, at_slab, received_power, vertical_field
+from sionna_partial.tracing.power import (
+    COSINES,
+    ISOTROPIC,
+    Gains,
+    at_slab,
+    gain_towards,
+    received_power,
+    vertical_field,
+)
+from sionna_partial.tracing.select import Limits, Listed, discount_after, matters, needs_by_distance
+from sionna_partial.tracing.walls import SolidMesh, cosine_at, is_inside, is_one_wall, mark_walls, met_faces
 
 _RAYS = 20_000
 """Number of rays that are split at faces; fewer where fewer are asked for."""
@@ -64,45 +71,23 @@ _ENTRIES = 160
 """Most faces that a path may meet."""
 
 
-class Least(NamedTuple):
-    """What a ray must bring to matter, from receivers (N,) sorted by their distance from the transmitter.
-
-    `relative` is the smallest power that matters, relative to free space, to any receiver at least that far away,
-    `near` the smallest to any at most that far away, times (4 pi / wavelength)^2.
-    """
-
-    distance_m: Floats
-    relative: Floats
-    near: Floats
-
-
-class Fixed(NamedTuple):
-    """What all paths of a call have in common; `largest` is that of `Strengths`."""
+class CrossingInput(NamedTuple):
+    """The mesh, both ends of all paths of a call, their limits, and the gains of the transmit antenna."""
 
     mesh: SolidMesh
     tx_m: Floats
     rx_m: Floats
     limits: Limits
-    largest: Floats
-    wavelength_m: float
+    gains: Gains
 
 
-class _Waiting(NamedTuple):
+class _RayStack(NamedTuple):
     """Rays that have been split off: origin, direction, length and loss (K, 8); sequence, reflections, walls (K, 3)."""
 
     value: Floats
     number: NDArray[np.int64]
     end: Floats
     met: Met
-
-
-def least_needed(tx_m: Floats, rx_m: Floats, needed: Floats, wavelength_m: float) -> Least:
-    """Sort what matters to receivers (N, 3) by their distance."""
-    distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
-    order = np.argsort(distance_m, kind="stable")
-    distance_m, needed = distance_m[order], needed[order] * (4.0 * np.pi / wavelength_m) ** 2
-    relative = np.minimum.accumulate((needed * np.maximum(distance_m, 1e-3) ** 2)[::-1])[::-1].copy()
-    return Least(distance_m, relative, np.minimum.accumulate(needed))
 
 
 @njit(cache=True)
@@ -112,11 +97,12 @@ def split_rays(sequences, loss, directions, least, fixed, far):  # type: ignore[
     No line within the mesh is longer than `far`.
     """
     room = MOST_FACES * (fixed.limits.reflections + 1)
-    waiting = _Waiting(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
+    waiting = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
     for i in range(len(directions)):
         for axis in range(3):
             waiting.value[0, axis], waiting.value[0, 3 + axis] = fixed.tx_m[axis], directions[i, axis]
-        waiting.value[0, 6], waiting.value[0, 7] = 0.0, 1.0
+        gain = gain_towards(fixed.gains, directions[i, 0], directions[i, 1], directions[i, 2])
+        waiting.value[0, 6], waiting.value[0, 7] = 0.0, gain
         waiting.number[0, 0], waiting.number[0, 1], waiting.number[0, 2] = -1, 0, 0
         top = 1
         while top > 0:
@@ -135,8 +121,7 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
     for axis in range(3):
         end[axis] = a[axis] + far * d[axis]
     own = sequences.plane[node] if node >= 0 else -1
-    rare = rarer_by(limits, depth)
-    rarer = rarer_by(limits, depth + 1)
+    discount, next_discount = discount_after(limits, depth), discount_after(limits, depth + 1)
     stop, start, steep = far, 0.0, 1.0
     for j in range(faces_between(mesh.tree, a, end, own, -1, met)):
         face, t = met.face[j], met.at[j]
@@ -145,18 +130,18 @@ def _go_on(sequences, loss, waiting, top, least, fixed, far):  # type: ignore[no
         same = j > 0 and (t - start) * far * steep <= mesh.cells.depth_m
         if same and is_one_wall(mesh, met.face[j - 1], face, a, end, met.at[j - 1], t):
             continue
-        material = mesh.slabs.material[face]
-        after = left * mesh.slabs.most_reflected[material, int(cosine * COSINES)]
-        if depth < limits.reflections and matters(after * rarer, near, least):
+        material = mesh.material[face]
+        after = left * mesh.materials.most_reflected[material, int(cosine * COSINES)]
+        if depth < limits.reflections and matters(after * next_discount, near, least):
             sequences, loss, child = _add_sequence(sequences, loss, node, mesh.planes.plane[face])
             _reflect(sequences, child, a, d, t * far, mesh.planes, waiting.value[top])
             loss[child] = max(loss[child], after)
             waiting.value[top, 6], waiting.value[top, 7] = near, after
             waiting.number[top, 0], waiting.number[top, 1], waiting.number[top, 2] = child, depth + 1, crossed
             top += 1
-        left *= mesh.slabs.most_transmitted[material, int(cosine * COSINES)]
+        left *= mesh.materials.most_transmitted[material, int(cosine * COSINES)]
         crossed, start, steep = crossed + 1, t, cosine
-        if crossed > limits.walls or not matters(left * rare, near, least):
+        if crossed > limits.walls or not matters(left * discount, near, least):
             stop = t * far
             break
     if node >= 0:
@@ -209,24 +194,28 @@ class Pairs(NamedTuple):
 
 
 class MeshCrossings:
-    """Paths between a transmitter (3,) and receivers (N, 3) that go through walls of a mesh, without diffraction.
+    """Paths between a transmitter (3,) and receivers (N, 3) that go through walls of a mesh, without diffraction."""
 
-    `largest` is that of `Strengths`, of the materials of the mesh.
-    """
+    name = "paths through walls"
 
-    def __init__(self, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, largest: Floats, settings: TraceSettings) -> None:
-        self._tolerance_db, self._rays = settings.tolerance_db, min(_RAYS, settings.samples_per_tx)
-        exact = self._tolerance_db == 0.0
-        most, rarer = (settings.max_depth, 1.0) if exact else (MOST_REFLECTIONS, RARER)
-        limits = Limits(settings.max_depth, min(settings.max_depth, most), settings.max_walls, rarer)
-        tx_m, rx_m = np.array(tx_m, np.float64), np.array(rx_m, np.float64)
-        self._fixed = Fixed(mesh, tx_m, rx_m, limits, largest, SPEED_OF_LIGHT_M_S / settings.frequency_hz)
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        tx_m: Floats,
+        rx_m: Floats,
+        settings: TraceSettings,
+        gains: Gains = ISOTROPIC,
+    ) -> None:
+        self._rays = min(_RAYS, settings.samples_per_tx)
+        limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1)
+        ends = np.array(tx_m, np.float64), np.array(rx_m, np.float64)
+        self._fixed = CrossingInput(mesh, *ends, limits, gains)
 
-    def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the paths that links may need whose indirect paths without walls have the power `found` (N,)."""
         nothing = self._traced(None)
         straight = _straight(nothing, self._fixed)
-        needed = weakest_needed(found + straight.power, self._tolerance_db)
+        needed = self._fixed.limits.min_power(found + straight.power)
         traced = self._traced(needed) if self._fixed.limits.reflections else nothing
         boxes = divide(self._fixed.rx_m)
 
@@ -237,17 +226,13 @@ class MeshCrossings:
         starts = range(0, len(traced.views.order), _SEQUENCES_AT_ONCE)
         parts = [straight, *in_order(of_sequences, starts)]
         node, rx, power = (np.concatenate(column) for column in zip(*parts, strict=True))
-        some = power > 0.0
-        pairs = Pairs(node[some], rx[some], power[some])
-        least = least_power(pairs.rx, pairs.power, found, self._tolerance_db)
-        chosen = np.flatnonzero(pairs.power >= least[pairs.rx])
-        for start in range(0, len(chosen), _AT_ONCE):
-            rows = chosen[start : start + _AT_ONCE]
-            face, kind, vertices_m, same_wall = _written(pairs.node[rows], pairs.rx[rows], traced, self._fixed)
-            used = max(1, int((kind > 0).sum(axis=1).max()))
-            columns = kind[:, :used], face[:, :used], vertices_m[:, :used]
-            candidates = Candidates(pairs.rx[rows].astype(np.int32), *columns, same_wall=same_wall[:, :used])
-            yield candidates, min(1.0, (start + _AT_ONCE) / len(chosen))
+        yield Listed(rx, power, partial(self._written, traced, node, rx), 1.0, at_once=_AT_ONCE)
+
+    def _written(self, traced: Traced, node: Indices, rx: Indices, rows: Indices) -> Candidates:
+        face, kind, vertices_m, same_wall = _written(node[rows], rx[rows], traced, self._fixed)
+        used = max(1, int((kind > 0).sum(axis=1).max()))
+        columns = kind[:, :used], face[:, :used], vertices_m[:, :used]
+        return Candidates(rx[rows].astype(np.int32), *columns, same_wall=same_wall[:, :used])
 
     def _traced(self, needed: Floats | None) -> Traced:
         """Split rays at all faces; without `needed`, there are none."""
@@ -255,12 +240,12 @@ class MeshCrossings:
         sequences, loss = collect_sequences([], fixed.mesh.planes), np.empty(1024)
         if needed is not None and len(needed) and len(fixed.mesh.tree.order):
             direction = lattice(np.arange(self._rays), self._rays).astype(np.float64)
-            least = least_needed(fixed.tx_m, fixed.rx_m, _PART * needed, fixed.wavelength_m)
+            least = needs_by_distance(fixed.tx_m, fixed.rx_m, _PART * needed, fixed.mesh.materials.wavelength_m)
             sequences, loss = split_rays(sequences, loss, direction, least, fixed, _spread_m(fixed))
         return Traced(sequences, view_sequences(sequences, fixed.mesh.planes, fixed.tx_m, _MARGIN), loss)
 
 
-def _spread_m(fixed: Fixed) -> float:
+def _spread_m(fixed: CrossingInput) -> float:
     """Length that no line within the mesh exceeds."""
     tree = fixed.mesh.tree
     low, high = np.minimum(tree.low_m[0], fixed.tx_m), np.maximum(tree.high_m[0], fixed.tx_m)
@@ -269,7 +254,7 @@ def _spread_m(fixed: Fixed) -> float:
 
 @njit(cache=True)
 def _follow(node, target, traced, fixed, met, entries, faces, points):  # type: ignore[no-untyped-def]
-    """Write what a path meets; its number of entries, -1 if there is no path through walls that could matter."""
+    """Write the faces that a path meets; return their number, -1 if no path through walls can matter."""
     mesh, limits = fixed.mesh, fixed.limits
     reflections, count, crossed = 0 if node < 0 else traced.views.depth[node], 0, 0
     a, own = fixed.tx_m, np.int64(-1)
@@ -298,7 +283,7 @@ def _follow(node, target, traced, fixed, met, entries, faces, points):  # type: 
 
 @njit(cache=True)
 def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
-    """Whether no leg of a path is so short that Sionna RT drops it."""
+    """Return whether no leg of a path is so short that Sionna RT drops it."""
     for k in range(count + 1):
         square = 0.0
         for axis in range(3):
@@ -311,14 +296,20 @@ def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _gain_to(point, fixed):  # type: ignore[no-untyped-def]
+    """Gain of the transmit antenna towards a point."""
+    return gain_towards(fixed.gains, point[0] - fixed.tx_m[0], point[1] - fixed.tx_m[1], point[2] - fixed.tx_m[2])
+
+
+@njit(cache=True)
 def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
     """Power of a path between vertical antennas."""
-    planes, slabs, tx = fixed.mesh.planes, fixed.mesh.slabs, fixed.tx_m
+    planes, materials, tx = fixed.mesh.planes, fixed.mesh.materials, fixed.tx_m
     first = entries.point_m[0] if count else target
     kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
     total = np.sqrt(kx * kx + ky * ky + kz * kz)
     k = kx / total, ky / total, kz / total
-    e = vertical_field(k)
+    e, gain = vertical_field(k), _gain_to(first, fixed)
     for j in range(count):
         here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
         total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
@@ -326,15 +317,15 @@ def _power(entries, count, target, fixed):  # type: ignore[no-untyped-def]
             face = entries.face[j]
             p = planes.plane[face]
             normal = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
-            k, e = at_slab(k, e, normal, slabs, slabs.material[face], entries.kind[j])
-    return (fixed.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e)
+            k, e = at_slab(k, e, normal, materials, fixed.mesh.material[face], entries.kind[j])
+    return (fixed.mesh.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain
 
 
 @njit(cache=True, nogil=True)
 def _straight(traced, fixed):  # type: ignore[no-untyped-def]
     """Straight lines to all receivers, of power 0 where no wall is on them, or too many."""
     count = len(fixed.rx_m)
-    met, entries, power = scratch(), trail(_ENTRIES), np.zeros(count)
+    met, entries, power = scratch(), met_faces(_ENTRIES), np.zeros(count)
     faces, points = np.empty(0, np.int32), np.empty((0, 3))
     for rx in range(count):
         number = _follow(-1, fixed.rx_m[rx], traced, fixed, met, entries, faces, points)
@@ -347,13 +338,13 @@ def _straight(traced, fixed):  # type: ignore[no-untyped-def]
 def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
     """Paths through walls by some sequences that matter to receivers in their view."""
     sequences, views, mesh = traced.sequences, traced.views, fixed.mesh
-    images = Images(sequences, views, mesh.planes, mesh.slabs.material)
-    met, entries, count = scratch(), trail(_ENTRIES), 0
+    images = Images(sequences, views, mesh.planes, mesh.material)
+    met, entries, count = scratch(), met_faces(_ENTRIES), 0
     all_node, all_rx, all_power = np.empty(1024, np.int64), np.empty(1024, np.int64), np.empty(1024)
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     seen, stack, bounds = np.empty(len(fixed.rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     for node in nodes:
-        rarer = rarer_by(fixed.limits, views.depth[node])
+        discount = discount_after(fixed.limits, views.depth[node])
         reach = REACH * sequences.reach_m[node] + REACH_M
         source = views.source_m[node]
         view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)
@@ -361,10 +352,11 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
         for k in range(receivers_in_view(view, boxes, fixed.rx_m, bounds, stack, seen)):
             target = fixed.rx_m[seen[k]]
             square = (target[0] - source[0]) ** 2 + (target[1] - source[1]) ** 2 + (target[2] - source[2]) ** 2
-            least = needed[seen[k]] / rarer
-            if traced.loss[node] * (fixed.wavelength_m / (4.0 * np.pi)) ** 2 < _PART * least * square:
+            least = needed[seen[k]] / discount
+            if traced.loss[node] * (fixed.mesh.materials.wavelength_m / (4.0 * np.pi)) ** 2 < _PART * least * square:
                 continue
-            if fold_line(node, target, images, fixed.largest, fixed.wavelength_m, faces, points) < least:
+            bound = fold_line(node, target, images, fixed.mesh.materials, faces, points)
+            if bound < 0.0 or bound * _gain_to(points[0], fixed) < least:
                 continue
             number = _follow(node, target, traced, fixed, met, entries, faces, points)
             if number < 0:
@@ -381,15 +373,15 @@ def _pairs(nodes, traced, boxes, needed, fixed):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _written(nodes, rx, traced, fixed):  # type: ignore[no-untyped-def]
     """Faces and kinds (C, D) of chosen paths, vertices (C, D, 3), and whether each is of a wall that is crossed."""
-    images = Images(traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.slabs.material)
-    met, entries, shape = scratch(), trail(_ENTRIES), (len(nodes), _ENTRIES)
+    images = Images(traced.sequences, traced.views, fixed.mesh.planes, fixed.mesh.material)
+    met, entries, shape = scratch(), met_faces(_ENTRIES), (len(nodes), _ENTRIES)
     face, kind, same_wall = np.full(shape, -1, np.int32), np.zeros(shape, np.uint8), np.zeros(shape, np.bool_)
     vertices = np.zeros((len(nodes), _ENTRIES, 3))
     faces, points = np.empty(fixed.limits.depth, np.int32), np.empty((fixed.limits.depth, 3))
     for c in range(len(nodes)):
         target = fixed.rx_m[rx[c]]
         if nodes[c] >= 0:
-            fold_line(nodes[c], target, images, fixed.largest, fixed.wavelength_m, faces, points)
+            fold_line(nodes[c], target, images, fixed.mesh.materials, faces, points)
         number = _follow(nodes[c], target, traced, fixed, met, entries, faces, points)
         face[c, :number], kind[c, :number] = entries.face[:number], entries.kind[:number]
         vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]

@@ -37,7 +37,7 @@ class FaceTree(NamedTuple):
 
     Box k holds the part `start` to `stop` of the faces in `order` (F,), whose corners are `corner_m` (F, 3, 3) in that
     order, and `child` is the first of the two boxes in it, or -1. `low_m`, `high_m` (K, 3) are the corners of the
-    boxes. `plane` (F,) is that of each face, counted as the mesh counts them.
+    boxes. `plane` (F,) is the plane of each face, counted as the mesh counts them.
     """
 
     order: NDArray[np.int64]
@@ -107,7 +107,7 @@ def scratch():  # type: ignore[no-untyped-def]
 def faces_between(tree, a, b, own, other, met):  # type: ignore[no-untyped-def]
     """Write the faces between two points, but those in the planes `own` and `other`, and return their number.
 
-    Of several faces in one plane there is one.
+    Several faces in one plane count once.
     """
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     ix = 1.0 / dx if dx != 0.0 else 1e300
@@ -194,7 +194,7 @@ class FaceBins(NamedTuple):
 class MeshPlanes(NamedTuple):
     """F faces of a mesh, grouped by P planes.
 
-    `plane` (F,) is that of every face; one without area has a plane of its own. A point lies in a plane where
+    `plane` (F,) is the plane of every face; a face without area has its own. A point lies in a plane where
     ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane.
     """
 
@@ -280,7 +280,7 @@ def _plane_ids(order, normal, offset, corner):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _in_plane(first, f, normal, offset, corner):  # type: ignore[no-untyped-def]
-    """Whether a face lies in the plane of the face `first`."""
+    """Return whether a face lies in the plane of the face `first`."""
     nx, ny, nz = normal[first]
     sign = 1.0 if nx * normal[f, 0] + ny * normal[f, 1] + nz * normal[f, 2] > 0.0 else -1.0
     for k in range(3):
@@ -295,7 +295,7 @@ def _in_plane(first, f, normal, offset, corner):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no-untyped-def]
-    """First entry of every bin, and the faces in bin after bin: row by row, what a face covers of a row of bins."""
+    """First entry of every bin, and the faces in bin after bin: row by row, the bins of a row that a face covers."""
     start = np.zeros(first_bin[-1] + 1, np.int64)
     items = np.empty(0, np.int32)
     for stored in (False, True):
@@ -341,7 +341,7 @@ def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _inside(corner, f, x, y):  # type: ignore[no-untyped-def]
-    """Whether a point lies on a face or at most the tolerance beyond its edges."""
+    """Return whether a point lies on a face or at most the tolerance beyond its edges."""
     px, py, qx, qy = corner[f, 1, 0], corner[f, 1, 1], corner[f, 2, 0], corner[f, 2, 1]
     turn = (px - corner[f, 0, 0]) * (qy - corner[f, 0, 1]) - (py - corner[f, 0, 1]) * (qx - corner[f, 0, 0])
     sign = 1.0 if turn > 0.0 else -1.0

@@ -80,7 +80,7 @@ def _launch(mi_scene: Any, first_face: Any, rays: Any, max_depth: int) -> list[t
 
     legs, active = [], mi.Bool(True)
     for _ in range(max_depth + 1):
-        # coherent rays decide in packets what is hit, and lose hits
+        # coherent rays are intersected in packets, and lose hits
         met = mi_scene.ray_intersect(rays, ray_flags=mi.RayFlags.Minimal, coherent=False, active=active)
         active &= met.is_valid()
         shape: Any = dr.reinterpret_array(mi.UInt32, met.shape)
@@ -117,7 +117,7 @@ class Sequences(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Where receivers of each of M sequences are looked for.
+    """Views of M sequences, in which their receivers are.
 
     `order` has each sequence after its parent, with all that begin like it behind it; `depth` is the number of planes,
     `source_m` (M, 3) the image of the transmitter, and `margin` the width by which the box of directions is enlarged.

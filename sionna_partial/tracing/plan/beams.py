@@ -1,4 +1,4 @@
-"""Which sequences of walls can join two points of an extruded floor plan, by exact beam tracing in the plan.
+"""Sequences of walls that can join two points of an extruded floor plan, by exact beam tracing in the plan.
 
 A wall of full height reflects a path in the plan just as a line does, so which walls can join a transmitter to a
 receiver is a question in two dimensions. From the image of the transmitter, the visible walls split the view into
@@ -264,7 +264,7 @@ def _walls_in(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-def]
-    """Whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
+    """Return whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
     return (min(corner[0, axis], corner[1, axis]) > high and min(first, second) >= 0.0) or (
         max(corner[0, axis], corner[1, axis]) < low and max(first, second) <= 0.0
     )
@@ -321,7 +321,7 @@ def _entries(corner, bins, row):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_filled(scratch, count, far):  # type: ignore[no-untyped-def]
-    """Whether walls no farther than `far` fill the whole view."""
+    """Return whether walls no farther than `far` fill the whole view."""
     reach = 1e-12
     for k in range(count):
         i = scratch.order[k]
@@ -407,7 +407,7 @@ def _pass(beam, piece, child):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def was_met(parent, wall_of, passed, node, wall):  # type: ignore[no-untyped-def]
-    """Whether a beam has met a wall since it was reflected: no line does twice, slivers at corners would for ever."""
+    """Return whether a beam has met a wall since its reflection: prevents endless passes through slivers at corners."""
     while node >= 0:
         if wall_of[node] == wall:
             return True

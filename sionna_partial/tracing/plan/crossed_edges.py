@@ -5,6 +5,7 @@ with walls to go through on either or on both. Floor and ceiling may reflect it.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,11 +15,9 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.bounds import Strengths, at_edge, at_flats, transmitted_power, utd_terms, wedge_angle
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.crossing_beams import Building
-from sionna_partial.tracing.plan.crossings import can_bounce_as, least_power, weakest_needed
+from sionna_partial.tracing.plan.crossings import CrossingCandidates, can_bounce_as
 from sionna_partial.tracing.plan.diffraction import angle_rad, edges_of, outside
 from sionna_partial.tracing.plan.legs import (
     Leg,
@@ -29,7 +28,16 @@ from sionna_partial.tracing.plan.legs import (
     trail_of,
     write_kinds,
 )
-from sionna_partial.tracing.plan.specular import WALLS, merge_heights, unfolded_height
+from sionna_partial.tracing.plan.specular import WALLS, gain_of_leg, merge_heights, sign_of_rise, unfolded_height
+from sionna_partial.tracing.power import (
+    at_edge,
+    at_flats,
+    gain_at_azimuth,
+    power_near,
+    utd_terms,
+    wedge_angle,
+)
+from sionna_partial.tracing.select import Listed
 
 _EDGES_AT_ONCE = 16
 
@@ -60,49 +68,52 @@ class Arrivals(NamedTuple):
 class CrossedEdgeCandidates:
     """All paths over one vertical edge, through a wall at least, without reflections at walls."""
 
-    def __init__(self, geometry: SceneGeometry, wedges: Wedges, building: Building, tolerance_db: float) -> None:
-        self._geometry, self._wedges, self._building, self._tolerance_db = geometry, wedges, building, tolerance_db
-        self._edges = edges_of(wedges, building.room.wall_material)
+    name = "diffractions through walls"
 
-    def blocks(self, strengths: Strengths, found: Floats) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that links need whose other indirect paths have the power `found` (N,)."""
+    def __init__(self, geometry: SceneGeometry, wedges: Wedges, crossing: CrossingCandidates) -> None:
+        self._geometry, self._wedges, self._building = geometry, wedges, crossing.building
+        self._lowered = crossing.lowered
+        self._edges = edges_of(wedges, crossing.building.room.wall_material)
+
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the paths that links may need whose other indirect paths have the power `found` (N,)."""
         if not len(self._wedges.edge_m):
             return
-        plan, needed = self._geometry.plan, weakest_needed(found, self._tolerance_db)
+        plan, needed = self._geometry.plan, self._building.limits.min_power(found)
         arrivals = _arrivals(self._edges, self._building, trail_of(plan))
 
-        def listed(first: int) -> tuple[Indices, Indices, Indices, Floats]:
+        def of_edges(first: int) -> tuple[Indices, Indices, Indices, Floats]:
             some = np.arange(first, min(first + _EDGES_AT_ONCE, len(self._wedges.edge_m)))
-            return _listed(some, self._edges, arrivals, strengths, needed, self._building, trail_of(plan))  # type: ignore[no-any-return]
+            return _listed(some, self._edges, arrivals, needed, self._building, trail_of(plan))  # type: ignore[no-any-return]
 
-        parts = list(in_order(listed, range(0, len(self._wedges.edge_m), _EDGES_AT_ONCE)))
+        parts = list(in_order(of_edges, range(0, len(self._wedges.edge_m), _EDGES_AT_ONCE)))
         edge, rx, variant, power = (np.concatenate(column) for column in zip(*parts, strict=True))
-        kept = power >= least_power(rx, power, found, self._tolerance_db)[rx]
-        if not kept.any():
-            return
-        edge, rx, variant = edge[kept], rx[kept], variant[kept]
-        written = _written(edge, rx, variant, self._edges, self._building, trail_of(plan))
+        yield Listed(rx, power, partial(self._written, arrivals, edge, rx, variant), 1.0)
+
+    def _written(self, arrivals: Arrivals, edge: Indices, rx: Indices, variant: Indices, rows: Indices) -> Candidates:
+        edge, rx = edge[rows], rx[rows]
+        written = _written(edge, rx, variant[rows], self._edges, self._building, trail_of(self._geometry.plan))
         wedge = np.where(arrivals.lit[edge], edge, edge + len(self._wedges.edge_m)).astype(np.int32)
         columns = columns_of(self._geometry, *written)
         columns["face"] = np.where(columns["kind"] == DIFFRACTION, self._wedges.face[wedge, :1], columns["face"])
         candidates = Candidates(rx.astype(np.int32), **columns, wedge=wedge, wedges=self._wedges)
         possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
-        yield candidates.rows(np.flatnonzero(possible)), 1.0
+        return self._lowered(candidates.rows(np.flatnonzero(possible)))
 
 
 @njit(cache=True)
 def _leg_power(trail, count, building):  # type: ignore[no-untyped-def]
     """Fraction of the power that the walls of a leg leave at most, if it is horizontal, however polarised."""
-    power, slabs = 1.0, building.slabs
+    power, table = 1.0, building.materials.transmission
     for k in range(count):
         if not (trail.same_wall[k] or building.plan.low[trail.surface[k]]):
-            power *= transmitted_power(slabs.transmission[slabs.material[trail.surface[k]]], trail.cosine[k])
+            power *= power_near(table[building.material[trail.surface[k]]], trail.cosine[k])
     return power
 
 
 @njit(cache=True)
 def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped-def]
-    """Write what a line meets from the transmitter to an edge; the number of entries, and of walls."""
+    """Write the walls on a line from the transmitter to an edge; return the numbers of entries and of walls."""
     part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
     x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
     leg = Leg((tx_m[0], tx_m[1]), (x, y), np.int64(-1), np.int64(-1), 0.0, part * length / total)
@@ -111,7 +122,7 @@ def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped
 
 @njit(cache=True)
 def _from_edge(building, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
-    """Add what a line of some length meets from an edge to a receiver likewise."""
+    """Add the walls on a line of some length from an edge to a receiver; return as `_to_edge`."""
     part = _ASIDE_M / length
     x, y = origin[0] + part * (target[0] - origin[0]), origin[1] + part * (target[1] - origin[1])
     done = (total - length + _ASIDE_M) / total
@@ -146,16 +157,19 @@ def _arrivals(edges, building, trail):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type: ignore[no-untyped-def]
+def _listed(group, edges, arrivals, needed, building, trail):  # type: ignore[no-untyped-def]
     """Edges, receivers, variants and powers of the paths over some edges that are strong enough."""
-    room = building.room
+    room, materials = building.room, building.materials
     out, power, used = np.empty((1024, 3), np.int64), np.empty(1024), 0
-    terms, wavelength = np.empty((4, 3)), strengths.wavelength_m
-    largest, tables = strengths.largest, (strengths.faces, strengths.transition)
+    terms, wavelength = np.empty((4, 3)), materials.wavelength_m
+    largest, tables = materials.largest, (materials.reflection, materials.transition)
     for e in group:
         if not arrivals.good[e]:
             continue
         origin, before, through = edges.position_m[e], arrivals.length_m[e], arrivals.power[e]
+        x_edge, y_edge = origin[0] - room.tx_m[0], origin[1] - room.tx_m[1]
+        strongest = gain_at_azimuth(room.gains, x_edge, y_edge)
+        most = through * strongest
         constants = edges.utd[e, 0], edges.utd[e, 1], edges.utd[e, 2], edges.utd[e, 3], edges.utd[e, 4]
         arrival = arrivals.angle[e, 0], arrivals.angle[e, 1], arrivals.angle[e, 2], arrivals.angle[e, 3]
         lit = arrivals.faces[e, 0], arrivals.faces[e, 1]
@@ -165,7 +179,7 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
             x, y = target[0] - origin[0], target[1] - origin[1]
             onward = np.hypot(x, y)
             total = before + onward
-            if through * (wavelength / (4.0 * np.pi * total)) ** 2 < needed[rx] or onward < 20.0 * _ASIDE_M:
+            if most * (wavelength / (4.0 * np.pi * total)) ** 2 < needed[rx] or onward < 20.0 * _ASIDE_M:
                 continue
             if not outside(edges.normals[e], x, y)[1]:
                 continue
@@ -174,7 +188,7 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
             spread = through * wavelength**3 / (64.0 * np.pi**4 * before * onward)
             boundary = np.sqrt(4.0 * np.pi / wavelength * before * onward / total)
             level = at_edge(tables, material, terms, boundary, lit, 1.0, 0.0, (1.0, 0.0, 1.0))
-            if level[0] ** 2 * spread / total < needed[rx]:
+            if level[0] ** 2 * spread / total * strongest < needed[rx]:
                 continue
             count, crossed = _from_edge(building, origin, target, onward, total, 0, trail)
             walls = crossed + arrivals.crossed[e]
@@ -191,6 +205,8 @@ def _listed(group, edges, arrivals, strengths, needed, building, trail):  # type
                 edge = boundary * np.sqrt(sine)
                 field = at_edge(tables, material, terms, edge, lit, sine, slope, (1.0, 0.0, 1.0))
                 strength = at_flats(largest, room.flat_material, slope, bounces, field) ** 2 * spread * behind / length
+                rise = height * sign_of_rise(room, target, bounces, first) / total
+                strength *= gain_of_leg(room, x_edge, y_edge, rise)
                 if strength >= needed[rx]:
                     out, power = grow(out, used + 1), grow(power, used + 1)
                     out[used, 0], out[used, 1], out[used, 2], power[used] = e, rx, variant, strength

@@ -1,8 +1,8 @@
 """Beams of floor plans that walls reflect and let through, and the receivers that each of them can serve.
 
 A beam is a sequence of reflections: its window is the part of the last wall that reflects it. All walls behind the
-window are sorted from edge to edge of the beam, and by distance between two edges, so that what lies in front of any
-point is known, and with it a bound of what comes there. Coordinates inside a beam are those of `plan.beams`.
+window are sorted from edge to edge of the beam, and by distance between two edges, so that the walls in front of any
+point are known, and with them a bound of the power there. Coordinates inside a beam are as in `plan.beams`.
 """
 
 import math
@@ -26,12 +26,11 @@ from sionna_partial.tracing.plan.beams import (
     _sort,
     _without_ended,
 )
-from sionna_partial.tracing.plan.legs import FACES, Interior
+from sionna_partial.tracing.plan.legs import FACES
 from sionna_partial.tracing.plan.specular import Room
-from sionna_partial.tracing.slab import COSINES, Slabs
-
-USUAL_REFLECTIONS = 3
-"""Reflections at walls beyond which beams must be stronger, unless all paths are asked for."""
+from sionna_partial.tracing.power import COSINES, Materials, gain_between
+from sionna_partial.tracing.select import Limits, discount_after, matters, needs_by_distance
+from sionna_partial.tracing.walls import Interior
 
 _CELL_M = 1.0
 """Edge of the cells of receivers that beams are compared with [m]."""
@@ -40,36 +39,23 @@ _THINNEST = 1e-12
 """Part of a beam's width below which nothing lies between two edges."""
 
 
-class Limits(NamedTuple):
-    """Most reflections of a path, most of them at walls, and most walls that it goes through.
-
-    `rarer` is what counts of the power of beams for each reflection beyond `USUAL_REFLECTIONS`.
-    """
-
-    depth: int
-    reflections: int
-    walls: int
-    rarer: float
-
-
 class Building(NamedTuple):
-    """What paths through walls depend on, the receivers' needs aside."""
+    """A floor plan that paths go through; `material` (P,) are the materials of the pieces of its walls."""
 
     plan: Plan
     interior: Interior
     room: Room
-    slabs: Slabs
+    materials: Materials
+    material: NDArray[np.int64]
     limits: Limits
-    wavelength_m: float
 
 
 class Needed(NamedTuple):
-    """What a beam must bring to matter, relative to (wavelength / 4 pi)^2.
+    """The power that a beam must have to matter, relative to (wavelength / 4 pi)^2.
 
-    `power` (N,) is the smallest that matters to each receiver. Of receivers sorted by their distance in the plan from
-    the transmitter, `relative` is the smallest that matters to any at least that far away, times the square of its
-    distance, and `near` the smallest to any at most that far away. `cells` (ny, nx) is the smallest in square cells,
-    whose corner x0 and y0 and edge [m] are `grid` (3,).
+    `power` (N,) is the smallest that matters to each receiver; `distance_m`, `relative` and `near` are as in
+    `NeedsByDistance`, in the plan. `cells` (ny, nx) is the smallest in square cells, whose corner x0 and y0 and edge
+    [m] are `grid` (3,).
     """
 
     power: Floats
@@ -80,7 +66,7 @@ class Needed(NamedTuple):
     grid: Floats
 
 
-class Beams(NamedTuple):
+class CrossingBeams(NamedTuple):
     """M beams of one number of reflections.
 
     `parent` (M,) is the beam that each comes from, counted through all of them, and `piece` (M,) the piece of a wall
@@ -98,7 +84,7 @@ class Beams(NamedTuple):
 
 
 class Task(NamedTuple):
-    """What beams of `order` reflections are followed for."""
+    """Inputs for beams of `order` reflections."""
 
     order: int
     receivers: PointBins
@@ -107,7 +93,7 @@ class Task(NamedTuple):
 
 
 class _Beam(NamedTuple):
-    """One of `Beams`: its window, what reflections and walls leave of it, and how many walls it has crossed."""
+    """One of `CrossingBeams`: its window, what reflections and walls leave of it, and how many walls it has crossed."""
 
     window: Floats
     reflected: float
@@ -116,9 +102,9 @@ class _Beam(NamedTuple):
 
 
 class _Layers(NamedTuple):
-    """Scratch of one beam: the walls in it, and what lies between two edges, from the window outwards.
+    """Scratch of one beam: the walls in it, and the walls between two edges, from the window outwards.
 
-    Of clipped wall c, `slope` (C,) is that of 1 / r, `along` (C, 2) its direction. Of edge i, `ray` (E, 3) is the
+    For clipped wall c, `slope` (C,) is the one of 1 / r, `along` (C, 2) its direction. For edge i, `ray` (E, 3) is the
     direction and length of the beam there. Between edges i and i + 1 lie `depth` (E,) walls: `wall` (E, D), behind
     which `left` (E, D) of the power is left after `crossed` (E, D) walls. `open` (P,) is the last window of a line.
     """
@@ -134,25 +120,23 @@ class _Layers(NamedTuple):
     open: NDArray[np.int64]
 
 
-def first_beams(tx_m: Floats) -> Beams:
-    """Return the beams from a transmitter (2,) [m]."""
-    window = _root_beams(tx_m[None])
+def first_beams(room: Room) -> CrossingBeams:
+    """Return the beams from the transmitter, with its largest gain as a bound of what reflections leave."""
+    window = _root_beams(room.tx_m[None, :2])
+    left = np.tile([room.gains.largest, 1.0], (len(window), 1))
     none, nothing = np.full(len(window), -1, np.int32), np.zeros(len(window), np.int64)
-    return Beams(none, none, window, np.ones((len(window), 2)), nothing.astype(np.int32), nothing)
+    return CrossingBeams(none, none, window, left, nothing.astype(np.int32), nothing)
 
 
 def needed_of(power: Floats, room: Room, wavelength_m: float) -> Needed:
     """Sort what matters to receivers (N,)."""
-    distance_m = np.linalg.norm(room.rx_m[:, :2] - room.tx_m[:2], axis=1)
-    order = np.argsort(distance_m, kind="stable")
+    far = needs_by_distance(room.tx_m[:2], room.rx_m[:, :2], power, wavelength_m)
     power = power * (4.0 * math.pi / wavelength_m) ** 2
-    distance_m, ordered = distance_m[order], power[order]
-    relative = np.minimum.accumulate((ordered * np.maximum(distance_m, 1e-3) ** 2)[::-1])[::-1].copy()
     low = room.rx_m[:, :2].min(axis=0)
     column, row = ((room.rx_m[:, :2] - low) / _CELL_M).astype(np.int64).T
     cells = np.full((row.max() + 1, column.max() + 1), np.inf)
     np.minimum.at(cells, (row, column), power)
-    return Needed(power, distance_m, relative, np.minimum.accumulate(ordered), cells, np.array([*low, _CELL_M]))
+    return Needed(power, *far, cells, np.array([*low, _CELL_M]))
 
 
 @njit(cache=True, nogil=True)
@@ -180,10 +164,15 @@ def follow_beams(beams, first, stop, task):  # type: ignore[no-untyped-def]
             own = layers.clipped.wall[wall]
             if not _reflect(beam.window, _piece_of(layers, wall, span), plan.pieces_m[own], window[count]):
                 continue
-            if not _is_needed(_Beam(window[count], span[2], span[3], behind), task.order + 1, task):
+            reflected = span[2]
+            if task.order == 0:
+                gains, new, (x, y) = task.building.room.gains, window[count], (beam.window[0], beam.window[1])
+                ends = (new[4] - x, new[5] - y), (new[2] - x, new[3] - y)
+                reflected *= gain_between(gains, *ends) / gains.largest
+            if not _is_needed(_Beam(window[count], reflected, span[3], behind), task.order + 1, task):
                 continue
             parent[count], piece[count], crossed[count] = k, own, behind
-            left[count, 0], left[count, 1] = span[2], span[3]
+            left[count, 0], left[count, 1] = reflected, span[3]
             sequence[count] = _mixed(beams.sequence[k], plan.line[own])
             count += 1
     children = parent[:count], piece[:count], window[:count], left[:count], crossed[:count], sequence[:count]
@@ -306,15 +295,15 @@ def _sort_by_distance(layers, count, t):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped-def]
     """Put the walls between two edges into layers."""
-    scratch, building, slabs = layers.clipped, task.building, task.building.slabs
+    scratch, building, materials = layers.clipped, task.building, task.building.materials
     limits, depth_m, left, crossed = building.limits, building.interior.depth_m, beam.left, beam.crossed
-    rarer, next_rarer = rarer_by(limits, task.order), rarer_by(limits, task.order + 1)
+    discount, next_discount = discount_after(limits, task.order), discount_after(limits, task.order + 1)
     t0, t1, ray, next_ray = scratch.edge[i], scratch.edge[i + 1], layers.ray[i], layers.ray[i + 1]
     start_0 = start_1 = steep_0 = steep_1 = first = 0.0
     for j in range(min(active, FACES)):
         c = scratch.active[j]
         piece = scratch.wall[c]
-        material = slabs.material[piece]
+        material = building.material[piece]
         ux, uy = layers.along[c]
         r_0 = ray[2] / max(_nearness(layers, c, t0), 1e-9)
         r_1 = next_ray[2] / max(_nearness(layers, c, t1), 1e-9)
@@ -324,17 +313,17 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
         near = max(near, 1e-6)
         layers.wall[i, j], layers.left[i, j], layers.crossed[i, j] = c, 0.0, crossed
         layers.depth[i] = j + 1
-        total = beam.reflected * left * (most_through(slabs) if crossed == 0 else 1.0)
-        if not matters(total * rarer, near, task.needed):
+        total = beam.reflected * left * (most_through(materials) if crossed == 0 else 1.0)
+        if not matters(total * discount, near, task.needed):
             break
         if task.order < limits.reflections and not _is_solid(building, beam.window, piece):
             flat = near / np.hypot(near, 2.0 * building.room.height_m)
-            part = slabs.most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
-            if matters(part * total * next_rarer, near, task.needed):
+            part = materials.most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
+            if matters(part * total * next_discount, near, task.needed):
                 new = t0, t1, part * beam.reflected, left, crossed
                 windows = _extend(layers, building, c, new, windows)
         low = building.plan.low[piece]
-        through = 1.0 if low else slabs.most_transmitted[material, min(int(most * COSINES) + 1, COSINES)]
+        through = 1.0 if low else materials.most_transmitted[material, min(int(most * COSINES) + 1, COSINES)]
         same = j > 0 and first > 0.0
         if same:
             apart = min((r_0 - start_0) * min(cos_0, steep_0), (r_1 - start_1) * min(cos_1, steep_1))
@@ -353,23 +342,17 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def rarer_by(limits, order):  # type: ignore[no-untyped-def]
-    """Return what counts of the power of beams of so many reflections."""
-    return limits.rarer ** max(0, order - USUAL_REFLECTIONS)
-
-
-@njit(cache=True)
-def most_through(slabs):  # type: ignore[no-untyped-def]
+def most_through(materials):  # type: ignore[no-untyped-def]
     """Largest fraction of the power that any wall lets through."""
     most = 0.0
-    for material in range(len(slabs.most_transmitted)):
-        most = max(most, slabs.most_transmitted[material, -1])
+    for material in range(len(materials.most_transmitted)):
+        most = max(most, materials.most_transmitted[material, -1])
     return most
 
 
 @njit(cache=True)
 def _is_solid(building, beam, piece):  # type: ignore[no-untyped-def]
-    """Whether a beam meets a wall from inside it."""
+    """Return whether a beam meets a wall from inside it."""
     ends = building.plan.pieces_m[piece]
     dx, dy = ends[1, 0] - ends[0, 0], ends[1, 1] - ends[0, 1]
     left = dx * (beam[1] - ends[0, 1]) - dy * (beam[0] - ends[0, 0]) > 0.0
@@ -382,7 +365,7 @@ def _extend(layers, building, c, new, windows):  # type: ignore[no-untyped-def]
     t0, t1, reflected, left, crossed = new
     span, wall, count = windows
     piece = layers.clipped.wall[c]
-    line, material = building.plan.line[piece], building.slabs.material
+    line, material = building.plan.line[piece], building.material
     last = layers.open[line]
     beside = last >= 0 and span[last, 1] >= t0 - _THINNEST and wall[last, 1] == crossed
     if beside and material[layers.clipped.wall[wall[last, 0]]] == material[piece]:
@@ -405,15 +388,15 @@ def _piece_of(layers, c, span):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_needed(beam, order, task):  # type: ignore[no-untyped-def]
-    """Whether a beam of so many reflections may matter, as it is or after more of them."""
+    """Return whether a beam of so many reflections may matter, as it is or after more of them."""
     limits, needed = task.building.limits, task.needed
-    total = beam.reflected * beam.left * (most_through(task.building.slabs) if beam.crossed == 0 else 1.0)
+    total = beam.reflected * beam.left * (most_through(task.building.materials) if beam.crossed == 0 else 1.0)
     near = max(_nearest(beam.window), 1e-6)
-    if not matters(total * rarer_by(limits, order), near, needed):
+    if not matters(total * discount_after(limits, order), near, needed):
         return False
-    if order < limits.reflections and matters(total * rarer_by(limits, order + 1), near, needed):
+    if order < limits.reflections and matters(total * discount_after(limits, order + 1), near, needed):
         return True
-    return _reaches(beam.window, near, total * rarer_by(limits, order), needed)
+    return _reaches(beam.window, near, total * discount_after(limits, order), needed)
 
 
 @njit(cache=True)
@@ -428,17 +411,8 @@ def _nearest(beam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def matters(left, near, needed):  # type: ignore[no-untyped-def]
-    """Whether a beam that has so much left, and has come this far at least, may matter to any receiver."""
-    at = np.searchsorted(needed.distance_m, near)
-    if at < len(needed.distance_m) and left >= needed.relative[at]:
-        return True
-    return at > 0 and left >= needed.near[at - 1] * near * near
-
-
-@njit(cache=True)
 def _reaches(beam, near, left, needed):  # type: ignore[no-untyped-def]
-    """Whether a beam matters to any receiver behind its window, with all that stands there taken away."""
+    """Return whether a beam matters to any receiver behind its window, with all that stands there taken away."""
     x0, y0, edge = needed.grid
     rows, columns = needed.cells.shape
     corner = _cone(beam, True, x0, y0, x0 + columns * edge, y0 + rows * edge)

@@ -1,28 +1,26 @@
 """Candidates of floor plans that go through walls, without diffraction: their powers, and which of them links need.
 
 A path in the plan has five variants: without reflections at floor and ceiling, with one at either, and with both in
-either order. Its power between vertical antennas is that of a Jones vector along it.
+either order. Its power between vertical antennas is the power of a Jones vector along it.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
-from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
 from sionna_partial.process import in_order, njit
 from sionna_partial.scene.floor_plan import bin_points
-from sionna_partial.scene.scene import SceneGeometry, constants_of
+from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.bounds import dropped_power
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.crossing_beams import (
-    Beams,
     Building,
-    Limits,
+    CrossingBeams,
     Task,
     first_beams,
     follow_beams,
@@ -30,7 +28,6 @@ from sionna_partial.tracing.plan.crossing_beams import (
 )
 from sionna_partial.tracing.plan.legs import (
     FACES,
-    Interior,
     Leg,
     columns_of,
     cross_leg,
@@ -39,6 +36,7 @@ from sionna_partial.tracing.plan.legs import (
     trail_of,
     write_kinds,
 )
+from sionna_partial.tracing.plan.obstacles import Lowered
 from sionna_partial.tracing.plan.specular import (
     CEILING,
     FLOOR,
@@ -49,22 +47,20 @@ from sionna_partial.tracing.plan.specular import (
     merge_heights,
     unfolded_height,
 )
-from sionna_partial.tracing.slab import at_slab, received_power, reflected_part, slabs_of, vertical_field
+from sionna_partial.tracing.power import (
+    Materials,
+    at_slab,
+    gain_at_azimuth,
+    gain_towards,
+    power_near,
+    received_power,
+    vertical_field,
+)
+from sionna_partial.tracing.select import Limits, Listed
+from sionna_partial.tracing.walls import Interior
 
 VARIANTS = 5
 """Reflections at floor and ceiling that a path through walls may have: none, floor, ceiling, both in either order."""
-
-MOST_REFLECTIONS = 4
-"""Most reflections at walls of a path through walls, unless all paths are asked for."""
-
-_WEAKEST, _WEAKEST_OF_ALL = 5e-4, 1e-6
-"""Paths that bring less than this fraction of a link's power are left out; the second where all are asked for."""
-
-RARER = 0.03
-"""Fraction of its power that counts of a beam with more than the usual reflections."""
-
-_AT_ONCE = 100_000
-"""Number of candidates that are written together, which bounds the memory."""
 
 _BEAMS_AT_ONCE, _PAIRS_AT_ONCE = 256, 5_000
 """Number of beams, and of pairs, that one thread works on at a time."""
@@ -151,7 +147,9 @@ def _cross(k, building, target, trail):  # type: ignore[no-untyped-def]
 @njit(cache=True)
 def _bounds(k, length, through, building, target, least, trail, possible):  # type: ignore[no-untyped-def]
     """Mark the variants of a path that may have the power `least`; whether there is any."""
-    room, slabs, some = building.room, building.slabs, False
+    room, table, some = building.room, building.materials.reflection, False
+    x, y = (trail.bounce[0, 0], trail.bounce[0, 1]) if k > 0 else (target[0], target[1])
+    through *= gain_at_azimuth(room.gains, x - room.tx_m[0], y - room.tx_m[1])
     for variant in range(VARIANTS):
         bounces, first, possible[variant] = can_bounce_as(variant, room)
         possible[variant] &= k + bounces <= building.limits.depth
@@ -159,11 +157,11 @@ def _bounds(k, length, through, building, target, least, trail, possible):  # ty
             continue
         height = unfolded_height(room, target, bounces, first)
         total = np.hypot(length, height)
-        power = through * (building.wavelength_m / (4.0 * np.pi * total)) ** 2
-        power *= reflected_part(slabs, 0, height / total) ** bounces
+        power = through * (building.materials.wavelength_m / (4.0 * np.pi * total)) ** 2
+        power *= power_near(table[room.flat_material], height / total) ** bounces
         for level in range(k):
-            material = slabs.material[trail.walls[level]]
-            power *= reflected_part(slabs, material, trail.bounce[level, 3] * length / total)
+            material = building.material[trail.walls[level]]
+            power *= power_near(table[material], trail.bounce[level, 3] * length / total)
         possible[variant] = 1.01 * power >= least
         some |= possible[variant]
     return some
@@ -199,7 +197,7 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
     ax, ay, done = room.tx_m[0], room.tx_m[1], 0.0
     size = max(np.hypot(end[0] - ax, end[1] - ay), 1e-12) * total / length
     k = (end[0] - ax) / size, (end[1] - ay) / size, rise.up * rise.height / total
-    e = vertical_field(k)
+    e, gain = vertical_field(k), gain_towards(room.gains, k[0], k[1], k[2])
     item = turn = 0
     while item < count or turn < rise.bounces:
         fraction = (rise.to_first + turn * room.height_m) / rise.height if turn < rise.bounces else 2.0
@@ -210,8 +208,8 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
             if above:
                 above = _is_above(piece, done, variant, building, target)
             if not (trail.same_wall[item] or above):
-                normal, material = _normal(building.plan, piece), building.slabs.material[piece]
-                k, e = at_slab(k, e, normal, building.slabs, material, trail.kind[item])
+                normal, material = _normal(building.plan, piece), building.material[piece]
+                k, e = at_slab(k, e, normal, building.materials, material, trail.kind[item])
             item += 1
             continue
         bx, by, stop = target[0], target[1], 1.0
@@ -220,14 +218,14 @@ def _path_power(trail, count, length, variant, building, target):  # type: ignor
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         if not _has_floor(building.interior, ax + part * (bx - ax), ay + part * (by - ay)):
             return 0.0
-        k, e = at_slab(k, e, (0.0, 0.0, 1.0), building.slabs, 0, REFLECTION)
+        k, e = at_slab(k, e, (0.0, 0.0, 1.0), building.materials, room.flat_material, REFLECTION)
         turn += 1
-    return (building.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e)
+    return (building.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain
 
 
 @njit(cache=True)
 def _is_above(piece, fraction, variant, building, target):  # type: ignore[no-untyped-def]
-    """Whether a path is above a piece of a wall after a fraction of its length."""
+    """Return whether a path is above a piece of a wall after a fraction of its length."""
     room, (bounces, first, _) = building.room, can_bounce_as(variant, building.room)
     to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
     unfolded = unfolded_height(room, target, bounces, first) if bounces else 1.0
@@ -259,7 +257,7 @@ def _normal(plan, piece):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _has_floor(interior, x, y):  # type: ignore[no-untyped-def]
-    """Whether there is floor at a point, and ceiling."""
+    """Return whether there is floor at a point, and ceiling."""
     column, row = int(x / interior.cell_m), int(y / interior.cell_m)
     return 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1] and interior.floor[row, column]
 
@@ -279,7 +277,7 @@ def write_paths(tree, pair, variants, building, trail):  # type: ignore[no-untyp
     return surface, kind, vertices, same_wall
 
 
-class Listed(NamedTuple):
+class _Paths(NamedTuple):
     """Paths: `pair` (K, 2) of beam, -1 for straight lines, and receiver, `variant` (K,), and `power` (K,)."""
 
     pair: Indices
@@ -294,44 +292,45 @@ class Listed(NamedTuple):
 class CrossingCandidates:
     """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
 
-    They have at most four reflections at walls, and two at floor and ceiling. Paths that bring less than 5e-4 of the
-    power of their link are left out.
+    They have at most two reflections at floor and ceiling, and are limited by `Limits`.
     """
 
-    def __init__(self, geometry: SceneGeometry, room: Room, interior: Interior, settings: TraceSettings) -> None:
-        self._geometry, self._tolerance_db = geometry, settings.tolerance_db
-        most, rarer = (settings.max_depth, 1.0) if self._tolerance_db == 0.0 else (MOST_REFLECTIONS, RARER)
+    name = "paths through walls"
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        room: Room,
+        interior: Interior,
+        settings: TraceSettings,
+        materials: Materials,
+    ) -> None:
+        self._geometry = geometry
         walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
-        limits = Limits(settings.max_depth, min(settings.max_depth, most), walls, rarer)
-        constants = ((*constants_of(each, settings.frequency_hz), each.thickness_m) for each in geometry.materials)
-        of_piece = geometry.wall_material[geometry.plan.owner].astype(np.int64)
-        slabs = slabs_of(constants, of_piece, settings.frequency_hz)
-        wavelength_m = SPEED_OF_LIGHT_M_S / settings.frequency_hz
-        self.building = Building(geometry.plan, interior, room, slabs, limits, wavelength_m)
+        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1)
+        material = room.wall_material[geometry.plan.owner]
+        self.lowered = Lowered.of(geometry, room, interior, settings.max_walls)
+        self.building = Building(geometry.plan, interior, room, materials, material, limits)
 
-    def blocks(self, found: Floats) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that links need whose indirect paths without walls have the power `found` (N,)."""
-        tree, (pair, variant, power) = self._listed(found)
-        kept = power >= least_power(pair[:, 1], power, found, self._tolerance_db)[pair[:, 1]]
-        pair, variant = pair[kept], variant[kept]
-        for start in range(0, len(pair), _AT_ONCE):
-            rows = slice(start, start + _AT_ONCE)
-            yield self._written(tree, pair[rows], variant[rows]), min(1.0, rows.stop / len(pair))
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the paths that links may need whose indirect paths without walls have the power `found` (N,)."""
+        tree, (pair, variant, power) = self._found(found)
+        yield Listed(pair[:, 1], power, partial(self._written, tree, pair, variant), 1.0)
 
-    def _listed(self, found: Floats) -> tuple[Tree, Listed]:
+    def _found(self, found: Floats) -> tuple[Tree, _Paths]:
         """List all beams, and the paths that links need, by the number of their reflections.
 
-        The paths of few reflections decide how strong those of more have to be.
+        The paths of few reflections decide how strong paths of more have to be.
         """
         room, limits, count = self.building.room, self.building.limits, len(found)
-        receivers, beams = bin_points(room.rx_m[:, :2]), first_beams(room.tx_m[:2])
+        receivers, beams = bin_points(room.rx_m[:, :2]), first_beams(room)
         tree, first = Tree(beams.parent, beams.piece, beams.window[:, :2]), 0
         straight = np.stack([np.full(count, -1), np.arange(count)], axis=1)
         listed = [self._paths(tree, straight, np.ones(count), np.zeros(count))]
         total = found + listed[0].sums(count)
         for order in range(limits.reflections + 1):
-            weakest = weakest_needed(total, self._tolerance_db)
-            needed = needed_of(weakest, room, self.building.wavelength_m)
+            weakest = limits.min_power(total)
+            needed = needed_of(weakest, room, self.building.materials.wavelength_m)
             reflected, pair, through = self._followed(beams, Task(order, receivers, self.building, needed))
             new = first_of_each(beams.sequence[pair[:, 0]], pair[:, 1])
             listed.append(self._paths(tree, pair[new] + np.array([first, 0]), through[new], weakest))
@@ -339,9 +338,9 @@ class CrossingCandidates:
             first, beams = len(tree.parent), reflected._replace(parent=reflected.parent + first)
             parent, piece = np.append(tree.parent, beams.parent), np.append(tree.piece, beams.piece)
             tree = Tree(parent, piece, np.concatenate([tree.source_m, beams.window[:, :2]]))
-        return tree, Listed(*(np.concatenate(column) for column in zip(*listed, strict=True)))
+        return tree, _Paths(*(np.concatenate(column) for column in zip(*listed, strict=True)))
 
-    def _followed(self, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.int64], Floats]:
+    def _followed(self, beams: CrossingBeams, task: Task) -> tuple[CrossingBeams, NDArray[np.int64], Floats]:
         """Follow beams: those that walls reflect, pairs (K, 2), and what walls leave of these at most (K,)."""
 
         def followed(first: int) -> tuple[Any, ...]:
@@ -351,10 +350,10 @@ class CrossingCandidates:
         nothing = (tuple(column[:0] for column in beams), np.zeros((0, 2), np.int32), np.zeros(0))
         parts = [nothing, *in_order(followed, range(0, len(beams.parent), _BEAMS_AT_ONCE))]
         children, pair, through = zip(*parts, strict=True)
-        reflected = Beams(*(np.concatenate(column) for column in zip(*children, strict=True)))
+        reflected = CrossingBeams(*(np.concatenate(column) for column in zip(*children, strict=True)))
         return reflected, np.concatenate(pair).astype(np.int64), np.concatenate(through)
 
-    def _paths(self, tree: Tree, pair: NDArray[np.int64], through: Floats, needed: Floats) -> Listed:
+    def _paths(self, tree: Tree, pair: NDArray[np.int64], through: Floats, needed: Floats) -> _Paths:
         """Find the paths of pairs (beam, receiver) of which walls leave no more than `through` (K,)."""
 
         def of_pairs(start: int) -> Floats:
@@ -365,12 +364,11 @@ class CrossingCandidates:
         parts = in_order(of_pairs, range(0, len(pair), _PAIRS_AT_ONCE))
         power = np.concatenate([np.zeros((0, VARIANTS)), *parts])
         which, variant = np.nonzero(power)
-        return Listed(pair[which], variant, power[which, variant])
+        return _Paths(pair[which], variant, power[which, variant])
 
-    def _written(self, tree: Tree, pair: Indices, variant: Indices) -> Candidates:
-        """Write some paths."""
-        written = write_paths(tree, pair, variant, self.building, trail_of(self._geometry.plan))
-        return Candidates(pair[:, 1].astype(np.int32), **columns_of(self._geometry, *written))
+    def _written(self, tree: Tree, pair: Indices, variant: Indices, rows: Indices) -> Candidates:
+        written = write_paths(tree, pair[rows], variant[rows], self.building, trail_of(self._geometry.plan))
+        return self.lowered(Candidates(pair[rows, 1].astype(np.int32), **columns_of(self._geometry, *written)))
 
 
 def first_of_each(first: NDArray[np.int64], second: NDArray[np.int64]) -> Indices:
@@ -380,23 +378,3 @@ def first_of_each(first: NDArray[np.int64], second: NDArray[np.int64]) -> Indice
     new = np.ones(len(order), dtype=bool)
     new[1:] = (a[1:] != a[:-1]) | (b[1:] != b[:-1])
     return order[new]
-
-
-def weakest_needed(power: Floats, tolerance_db: float) -> Floats:
-    """Return below which power (N,) paths of links whose paths have some power do not matter."""
-    weakest = _WEAKEST_OF_ALL if tolerance_db == 0.0 else _WEAKEST
-    return weakest * np.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0))
-
-
-def least_power(rx: Indices, power: Floats, found: Floats, tolerance_db: float) -> Floats:
-    """Return the power (N,) below which links can do without paths, if the others have the power `found` (N,)."""
-    rx, power = rx[power > 0.0], power[power > 0.0]
-    order = np.lexsort((power, rx))
-    rx, power = rx[order], power[order]
-    allowed = dropped_power(found + np.bincount(rx, power, len(found)), tolerance_db)
-    sums = np.cumsum(power)
-    before = np.concatenate([[0.0], sums])[np.searchsorted(rx, np.arange(len(found)))]
-    kept = sums - before[rx] > allowed[rx]
-    least = np.full(len(found), np.inf)
-    np.minimum.at(least, rx[kept], power[kept])
-    return least

@@ -6,6 +6,7 @@ the plan as they do without the edge.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,22 +14,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import in_order, njit
-from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
+from sionna_partial.scene.floor_plan import Plan, bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.bounds import (
-    LEVELS,
-    NEGLIGIBLE,
-    Strengths,
-    at_edge,
-    at_flats,
-    at_wall,
-    level_of,
-    most_at_edge,
-    most_at_wall,
-    utd_terms,
-    wedge_angle,
-    wedge_constants,
-)
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.plan.beams import Beams, trace_beams_in
@@ -40,13 +27,25 @@ from sionna_partial.tracing.plan.specular import (
     WALLS,
     Room,
     can_bounce,
-    clear,
     faces_of,
     incidence,
     merge_heights,
     unfold,
     unfolded_height,
 )
+from sionna_partial.tracing.power import (
+    Materials,
+    at_edge,
+    at_flats,
+    at_wall,
+    gain_towards,
+    most_at_edge,
+    most_at_wall,
+    utd_terms,
+    wedge_angle,
+    wedge_constants,
+)
+from sionna_partial.tracing.select import Listed
 
 MAX_REFLECTIONS = 2
 """Largest number of reflections around the diffraction, those off floor and ceiling included."""
@@ -56,6 +55,9 @@ _EXTERIOR_M = 1e-5
 
 _NEAR_M = 1e-3
 """Shortest leg in the plan next to an edge [m]: walls that meet there do not reflect it."""
+
+NEGLIGIBLE = 3e-6
+"""Rough bound of diffracted paths, relative to the reflected ones of a link, below which none is listed."""
 
 _FLAT_RAD = 1e-3
 """Walls that meet at less than this angle from a straight line form no edge [rad]."""
@@ -72,7 +74,8 @@ class _Arrivals(NamedTuple):
     the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them, `material` (J, R) of
     those walls, `cosine` (J, R) of the angles of incidence there, `angle` (J, 4) the direction of arrival as
     `wedge_angle` gives it, `faces` (J, 2) the cosines of the angles of incidence at 0-face and n-face, -1 in the
-    shadow, and `lit` (J,) whether the 0-face is lit.
+    shadow, and `lit` (J,) whether the 0-face is lit. `toward` (J, 2) are horizontal unit vectors of departure, and
+    `gain` (J,) the largest gain of the antenna there.
     """
 
     start: NDArray[np.int64]
@@ -85,12 +88,14 @@ class _Arrivals(NamedTuple):
     angle: Floats
     faces: Floats
     lit: Bools
+    toward: Floats
+    gain: Floats
 
 
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
 
-    `utd` (E, 5) are the `wedge_constants`, and `material` (E, 2) is that of both faces where the 0-face is lit, and
+    `utd` (E, 5) are the `wedge_constants`, and `material` (E, 2) is the one of both faces where the 0-face is lit, and
     where it is not: to Sionna RT an edge is of one shape.
     """
 
@@ -102,10 +107,10 @@ class _Edges(NamedTuple):
     material: NDArray[np.int64]
 
 
-class _Leg(NamedTuple):
+class _Departure(NamedTuple):
     """Scratch of a leg after an edge: walls and points as `unfold` writes them, cosines of the angles of incidence.
 
-    `material` is that of each wall, and at its end that of floor and ceiling.
+    `material` has the material of each wall, and at its end of floor and ceiling.
     """
 
     walls: NDArray[np.int64]
@@ -114,15 +119,26 @@ class _Leg(NamedTuple):
     material: NDArray[np.int64]
 
 
+class _Task(NamedTuple):
+    """Beams from a group of edges, all edges, arrivals there, the room, and the most reflections of a path."""
+
+    beams: Beams
+    group: Indices
+    edges: _Edges
+    arrivals: _Arrivals
+    room: Room
+    reflections: int
+
+
 class _Pair(NamedTuple):
-    """A receiver and a way to it from an edge, which the arrivals `start` to `stop` there may have before it.
+    """The number of a pair of a beam from an edge and a receiver, and the arrivals there, `start` to `stop`.
 
     `left` is how many more reflections a path may have, `onward_m` the length of the leg, `departure` its direction as
-    `wedge_angle` gives it. `material` and `cosine` are those of a `_Leg`, `utd` (5,) and `at_faces` (2,) those of the
-    edge, `heights_m` as `_heights` gives them.
+    `wedge_angle` gives it. `material` and `cosine` are as in a `_Departure`, `utd` (5,) and `at_faces` (2,)
+    as in `_Edges`, `heights_m` as `_heights` gives them.
     """
 
-    rx: np.int32
+    number: np.int32
     start: np.int64
     stop: np.int64
     left: np.int64
@@ -163,51 +179,52 @@ def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
 class DiffractionCandidates:
     """All paths over one vertical edge, with at most two reflections, and `walls_a_side` of them at walls on each side.
 
-    The beams from the edges are traced once, on all cores, when they are first asked for.
+    The beams from the edges are traced on all cores.
     """
 
+    name = "diffractions"
+
     def __init__(
-        self, geometry: SceneGeometry, wedges: Wedges, room: Room, max_depth: int, walls_a_side: int = MAX_REFLECTIONS
+        self,
+        geometry: SceneGeometry,
+        wedges: Wedges,
+        room: Room,
+        max_depth: int,
+        materials: Materials,
+        walls_a_side: int = MAX_REFLECTIONS,
     ) -> None:
-        self._geometry, self._wedges, self._room = geometry, wedges, room
+        self._geometry, self._wedges, self._room, self._materials = geometry, wedges, room, materials
         self._reflections = min(MAX_REFLECTIONS, max_depth - 1)
         self._walls_a_side = min(walls_a_side, self._reflections)
-        self._beams: dict[int, tuple[Beams, NDArray[np.uint8]]] = {}
-        self._edges = edges_of(wedges, room.wall_material)
-        if self._reflections >= 0 and len(wedges.edge_m):
-            self._arrivals = _arrivals(geometry.plan, self._edges, room, self._walls_a_side)
 
-    def blocks(self, strengths: Strengths) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all."""
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the candidates over some edges at a time; those far below the power `found` (N,) are negligible."""
         if self._reflections < 0 or not len(self._wedges.edge_m):
             return
-        receivers, geometry = bin_points(self._room.rx_m[:, :2]), self._geometry
-        reached = np.flatnonzero(np.diff(self._arrivals.start))
+        plan, room = self._geometry.plan, self._room
+        edges, receivers = edges_of(self._wedges, room.wall_material), bin_points(room.rx_m[:, :2])
+        arrivals = _arrivals(plan, edges, room, self._walls_a_side)
+        reached = np.flatnonzero(np.diff(arrivals.start))
         groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
-        def listed(number: int) -> tuple[Candidates, Floats]:
-            if number not in self._beams:
-                beams = self._trace(groups[number], receivers)
-                self._beams[number] = beams, np.zeros(len(beams.pair_rx), np.uint8)
-            own = strengths._replace(power=np.zeros_like(strengths.power))
-            rx, wedge, surface, vertices_m = _combine(
-                *self._beams[number], groups[number], self._edges, self._arrivals, self._room, self._reflections, own
-            )
-            edge, met = surface == EDGE, surface != NOTHING
-            kind = np.where(edge, DIFFRACTION, np.where(met, REFLECTION, 0)).astype(np.uint8)
-            face = np.where(edge, self._wedges.face[wedge, :1], faces_of(surface, geometry))
-            return Candidates(rx, kind, face, vertices_m, wedge, self._wedges), own.power
+        def of_group(number: int) -> Listed:
+            group = groups[number]
+            fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
+            onward = np.minimum(self._walls_a_side, self._reflections - fewest)
+            beams = trace_beams_in(plan, receivers, self._wedges.edge_m[group], onward)
+            task = _Task(beams, group, edges, arrivals, room, self._reflections)
+            pair, joined, bound, unlisted = _list_joined(task, self._materials, NEGLIGIBLE * found)
+            write = partial(self._written, task, pair, joined)
+            return Listed(beams.pair_rx[pair], bound, write, (number + 1) / len(groups), unlisted)
 
-        for number, (candidates, power) in enumerate(in_order(listed, range(len(groups)))):
-            strengths.power[:] += power
-            yield candidates, (number + 1) / len(groups)
+        yield from in_order(of_group, range(len(groups)))
 
-    def _trace(self, group: Indices, receivers: PointBins) -> Beams:
-        """Trace the beams from a group of edges."""
-        arrivals = self._arrivals
-        fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
-        onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-        return trace_beams_in(self._geometry.plan, receivers, self._wedges.edge_m[group], onward)
+    def _written(self, task: "_Task", pair: Indices, joined: Indices, rows: Indices) -> Candidates:
+        rx, wedge, surface, vertices_m = _write_joined(task, pair[rows], joined[rows])
+        edge, met = surface == EDGE, surface != NOTHING
+        kind = np.where(edge, DIFFRACTION, np.where(met, REFLECTION, 0)).astype(np.uint8)
+        face = np.where(edge, self._wedges.face[wedge, :1], faces_of(surface, self._geometry))
+        return Candidates(rx, kind, face, vertices_m, wedge, self._wedges)
 
 
 def edges_of(wedges: Wedges, wall_material: NDArray[np.int64]) -> _Edges:
@@ -228,12 +245,17 @@ def _arrivals(plan: Plan, edges: _Edges, room: Room, reflections: int) -> _Arriv
     node, edge = beams.pair_node[order], beams.pair_rx[order]
     good, *columns = _unfold_all(beams, node, edge, edges, room, max(1, reflections))
     start = np.searchsorted(edge[good], np.arange(len(edges.position_m) + 1))
-    return _Arrivals(start, *(column[good] for column in columns))
+    count, _, _, points_m = columns[:4]
+    first_m = np.where(count[:, None] > 0, points_m[:, 0, :2], edges.position_m[edge])[good] - room.tx_m[:2]
+    toward = first_m / np.maximum(np.hypot(*first_m.T), 1e-12)[:, None]
+    degrees = (np.degrees(np.arctan2(toward[:, 1], toward[:, 0])) + 360.5).astype(np.intp)
+    gain = room.gains.by_azimuth[degrees % len(room.gains.by_azimuth)]
+    return _Arrivals(*[start, *(column[good] for column in columns), toward, gain])
 
 
 @njit(cache=True)
 def _unfold_all(beams, node, edge, edges, room, reflections):  # type: ignore[no-untyped-def]
-    """Whether each path to an edge comes from outside its wedge, and not from the edge itself; then `_Arrivals`."""
+    """Return whether each path reaches an edge from outside its wedge, and the columns of `_Arrivals`."""
     good, count = np.empty(len(node), np.bool_), np.empty(len(node), np.int64)
     length, walls = np.empty(len(node)), np.empty((len(node), reflections), np.int64)
     points, cosine = np.empty((len(node), reflections, 3)), np.empty((len(node), reflections))
@@ -273,7 +295,7 @@ def _root(parent, node):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def outside(normals, x, y):  # type: ignore[no-untyped-def]
-    """Whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
+    """Return whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
     first = normals[0] * x + normals[1] * y > _EXTERIOR_M
     return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
 
@@ -286,49 +308,60 @@ def angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _combine(beams, best, group, edges, arrivals, room, reflections, strengths):  # type: ignore[no-untyped-def]
-    """Join arrivals at edges and departures from them: receivers, wedges, surfaces and vertices of candidates.
+def _list_joined(task, materials, negligible):  # type: ignore[no-untyped-def]
+    """Join arrivals at edges and departures from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
 
+    The number of an arrival, and twice the reflections at floor and ceiling with the first of these, are one number.
     Loops take arrays out of tuples before they begin: numba counts references at every access, on all cores.
     """
-    size, first, last = reflections + 1, strengths.first, strengths.last
-    rx, wedge = np.empty(1024, np.int32), np.empty(1024, np.int32)
-    surface, vertices, used = np.empty((1024, size), np.int32), np.empty((1024, size, 3)), np.int64(0)
-    leg = _Leg(np.empty(size, np.int64), np.empty((size, 3)), np.empty(size), np.full(size + 1, room.flat_material))
-    met, points, terms = np.empty(size, np.int64), np.empty((size, 3)), np.empty((4, 3))
+    beams, group, edges, arrivals, room, reflections = task
+    size, unlisted = reflections + 1, np.zeros(len(room.rx_m))
+    out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
+    leg, terms = _leg_of(room, size), np.empty((4, 3))
     start, pair_rx, pair_node, heights = arrivals.start, beams.pair_rx, beams.pair_node, _heights(room, size)
-    most = _most_of_arrivals(strengths.largest, arrivals, edges.material, heights.max())
-    level = np.empty((np.diff(start).max(), size, 2), np.int64)
+    most = _most_of_arrivals(materials.largest, arrivals, edges.material, heights.max())
     for i in range(len(pair_node)):
         here = pair_rx[i]
-        if best[i] >= last[here]:
-            continue
-        best[i], edge, target = LEVELS, group[_root(beams.parent, pair_node[i]) // 4], room.rx_m[here]
+        edge, target = group[_root(beams.parent, pair_node[i]) // 4], room.rx_m[here]
         after, onward, departure = _depart(beams, pair_node[i], edges, edge, room, target, leg)
         if after < 0:
             continue
         arrived, beyond = (start[edge], start[edge + 1]), (leg.material, leg.cosine[:after])
         of_edge = edges.utd[edge], edges.material[edge], heights[here]
-        pair = _Pair(here, *arrived, reflections - after, onward, departure, *beyond, *of_edge)
-        best[i] = _bound(strengths, arrivals, most, pair, level, terms)
-        if not first[here] < last[here] or best[i] >= last[here]:
-            continue
-        for j in range(start[edge], start[edge + 1]):
-            for bounces in range(size):
-                for down in (1, 0):
-                    if not first[here] <= level[j - start[edge], bounces, down] < last[here]:
-                        continue
-                    rx, wedge = grow(rx, used + 1), grow(wedge, used + 1)
-                    surface, vertices = grow(surface, used + 1), grow(vertices, used + 1)
-                    rx[used], wedge[used] = here, edge if arrivals.lit[j] else edge + len(edges.position_m)
-                    clear(surface[used], vertices[used])
-                    count = _join(
-                        arrivals, j, edges.position_m[edge], leg.walls[:after], leg.points, onward, met, points
-                    )
-                    whole = met[:count], points[:count]
-                    merge_heights(*whole, room, target, bounces, CEILING - down, surface[used], vertices[used])
-                    used += 1
-    return rx[:used].copy(), wedge[:used].copy(), surface[:used].copy(), vertices[:used].copy()
+        pair = _Pair(np.int32(i), *arrived, reflections - after, onward, departure, *beyond, *of_edge)
+        rises = 1.0 if target[2] >= room.tx_m[2] else -1.0
+        out, rough = _bound(materials, arrivals, most, pair, negligible[here], terms, (room.gains, rises), out)
+        unlisted[here] += rough
+    pairs, joined, bound, used = out
+    return pairs[:used].copy(), joined[:used].copy(), bound[:used].copy(), unlisted
+
+
+@njit(cache=True, nogil=True)
+def _write_joined(task, pairs, joined):  # type: ignore[no-untyped-def]
+    """Write receivers, wedges (C,), surfaces (C, D) and vertices (C, D, 3) of candidates."""
+    beams, group, edges, arrivals, room, reflections = task
+    size, count = reflections + 1, len(pairs)
+    rx, wedge = np.empty(count, np.int32), np.empty(count, np.int32)
+    surface, vertices = np.zeros((count, size), np.int32), np.zeros((count, size, 3))
+    leg, met, points = _leg_of(room, size), np.empty(size, np.int64), np.empty((size, 3))
+    for c in range(count):
+        node, j, variant = beams.pair_node[pairs[c]], joined[c] // (2 * size), joined[c] % (2 * size)
+        rx[c] = beams.pair_rx[pairs[c]]
+        edge, target = group[_root(beams.parent, node) // 4], room.rx_m[rx[c]]
+        after, onward, _ = _depart(beams, node, edges, edge, room, target, leg)
+        wedge[c] = edge if arrivals.lit[j] else edge + len(edges.position_m)
+        number = _join(arrivals, j, edges.position_m[edge], leg.walls[:after], leg.points, onward, met, points)
+        whole, first = (met[:number], points[:number]), FLOOR + variant % 2
+        merge_heights(*whole, room, target, variant // 2, first, surface[c], vertices[c])
+    return rx, wedge, surface, vertices
+
+
+@njit(cache=True)
+def _leg_of(room, size):  # type: ignore[no-untyped-def]
+    """Make room for a leg after an edge."""
+    return _Departure(
+        np.empty(size, np.int64), np.empty((size, 3)), np.empty(size), np.full(size + 1, room.flat_material)
+    )
 
 
 @njit(cache=True)
@@ -351,25 +384,29 @@ def _depart(beams, node, edges, edge, room, target, leg):  # type: ignore[no-unt
 
 @njit(cache=True)
 def _heights(room, size):  # type: ignore[no-untyped-def]
-    """Heights [m] that paths to each receiver cover (N, bounces, 2), off ceiling or floor first; -1 where none can."""
+    """Heights [m] that paths to each receiver cover (N, bounces, 2), off floor or ceiling first; -1 where none can."""
     heights = np.empty((len(room.rx_m), size, 2))
     for rx in range(len(room.rx_m)):
         for bounces in range(size):
-            for first in (CEILING, FLOOR):
+            for first in (FLOOR, CEILING):
                 possible = can_bounce(bounces, first, room)
                 height = unfolded_height(room, room.rx_m[rx], bounces, first) if possible else -1.0
-                heights[rx, bounces, CEILING - first] = height
+                heights[rx, bounces, first - FLOOR] = height
     return heights
 
 
 @njit(cache=True)
-def _bound(strengths, arrivals, most, pair, level, terms):  # type: ignore[no-untyped-def]
-    """Write the levels of all paths of a pair, one for each arrival, number of bounces and first flat; the lowest.
+def _bound(materials, arrivals, most, pair, negligible, terms, antenna, out):  # type: ignore[no-untyped-def]
+    """Add all paths of a pair: one for each arrival, number of bounces and first flat; return the unlisted power.
 
-    Paths that are negligible by a rough bound count with it, in the last level; `most` is what that takes.
+    Paths with a rough bound below `negligible`, which takes `most`, are not listed. `antenna` are its gains, and 1 or
+    -1 where paths without reflections at floor and ceiling rise or fall.
     """
-    largest, tables = strengths.largest, (strengths.faces, strengths.transition)
-    power, reflected, wavelength = strengths.power, strengths.reflected, strengths.wavelength_m
+    largest, tables, wavelength = (
+        materials.largest,
+        (materials.reflection, materials.transition),
+        materials.wavelength_m,
+    )
     earlier, is_lit, lengths, reflections, angle, lit, before = (
         arrivals.material,
         arrivals.lit,
@@ -379,12 +416,13 @@ def _bound(strengths, arrivals, most, pair, level, terms):  # type: ignore[no-un
         arrivals.faces,
         arrivals.cosine,
     )
-    here, start, stop, remain, onward, departure, material, cosine, utd, at_faces, heights = pair
+    toward, gain, (gains, rises) = arrivals.toward, arrivals.gain, antenna
+    directed = len(gains.table) > 1
+    number, start, stop, remain, onward, departure, material, cosine, utd, at_faces, heights = pair
     constants = utd[0], utd[1], utd[2], utd[3], utd[4]
     most_after = _most_at_walls(largest, material, cosine, len(cosine), onward, heights.max())
-    lowest, adds = LEVELS, len(power) > 0
-    rough = NEGLIGIBLE * reflected[here] if strengths.last[here] < LEVELS else 0.0
-    level[: stop - start] = LEVELS
+    pairs, joined, bound, used = out
+    unlisted, size = 0.0, len(heights)
     for j in range(start, stop):
         left, length = remain - reflections[j], lengths[j]
         if left < 0:
@@ -393,14 +431,13 @@ def _bound(strengths, arrivals, most, pair, level, terms):  # type: ignore[no-un
         spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
         boundary = 4.0 * np.pi / wavelength * length * onward / (length + onward)
         amplitude = most_after * most[j, 0] * most_at_edge(terms, np.sqrt(boundary), most[j, 1], most[j, 2])
-        weak = (2 * left + 1) * amplitude**2 * spread / (length + onward)
-        if weak < rough:
-            if adds:
-                power[here, LEVELS - 1] += weak
+        rough = (2 * left + 1) * amplitude**2 * spread / (length + onward) * gain[j]
+        if rough < negligible:
+            unlisted += rough
             continue
         for bounces in range(left + 1):
-            for down in (1, 0):
-                height = heights[bounces, down]
+            for up in range(2):
+                height = heights[bounces, up]
                 if height < 0.0:
                     continue
                 total = np.sqrt((length + onward) ** 2 + height**2)
@@ -412,18 +449,20 @@ def _bound(strengths, arrivals, most, pair, level, terms):  # type: ignore[no-un
                 field = at_edge(tables, own, terms, edge, (lit[j, 0], lit[j, 1]), sine, slope, field)
                 for k in range(len(cosine)):
                     field = at_wall(largest, material[k], cosine[k], sine, slope, field)
+                pairs, joined, bound = grow(pairs, used + 1), grow(joined, used + 1), grow(bound, used + 1)
+                pairs[used], joined[used] = number, (j * size + bounces) * 2 + up
                 strength = at_flats(largest, material[-1], slope, bounces, field) ** 2 * spread / total
-                at = level_of(strength)
-                level[j - start, bounces, down] = at
-                lowest = min(lowest, at)
-                if adds:
-                    power[here, at] += strength
-    return lowest
+                if directed:
+                    rise = (rises if bounces == 0 else 2.0 * up - 1.0) * height / (length + onward)
+                    strength *= gain_towards(gains, toward[j, 0], toward[j, 1], rise)
+                bound[used] = strength
+                used += 1
+    return (pairs, joined, bound, used), unlisted
 
 
 @njit(cache=True)
 def _most_of_arrivals(largest, arrivals, material, highest):  # type: ignore[no-untyped-def]
-    """Bounds (J, 3) of what walls leave of fields that arrive at edges, and of what the two faces there reflect."""
+    """Return bounds (J, 3) of fields that arrive at edges, and of reflections at the two faces there."""
     most = np.empty((len(arrivals.lit), 3))
     for edge in range(len(arrivals.start) - 1):
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):

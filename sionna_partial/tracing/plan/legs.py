@@ -1,8 +1,4 @@
-"""What the straight legs of a path meet in a floor plan, and what counts as one wall.
-
-Consecutive faces on a leg without a free cell between them are one wall if they are at most `depth_m` apart, measured
-across them. Only one face of a wall costs anything, and none reflects what has come through another.
-"""
+"""The walls that the straight legs of a path meet in a floor plan."""
 
 from typing import Any, NamedTuple
 
@@ -15,6 +11,7 @@ from sionna_partial.scene.floor_plan import Plan
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
 from sionna_partial.tracing.plan.specular import EDGE, WALLS, faces_of
+from sionna_partial.tracing.walls import group_faces, is_free_between
 
 FACES = 40
 """Most faces of walls that a leg may cross."""
@@ -24,39 +21,6 @@ _ENTRIES = 64
 
 SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less."""
-
-
-class Interior(NamedTuple):
-    """What lies between walls: cells (ny, nx) of the plan that are free, those with a floor, and their edge [m].
-
-    `solid` (P, 2) is whether pieces of walls have nothing but more of the wall on their left and on their right.
-    `depth_m` is how deep one wall may be.
-    """
-
-    free: Bools
-    floor: Bools
-    solid: Bools
-    cell_m: float
-    depth_m: float
-
-
-def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
-    """Whether pieces (P,) of walls have nothing but wall cells a cell away on their left and on their right (P, 2)."""
-    start, along = plan.pieces_m[:, 0], plan.pieces_m[:, 1] - plan.pieces_m[:, 0]
-    length = np.hypot(*along.T)
-    count = np.maximum(1, np.ceil(length / cell_m)).astype(np.int64)
-    piece = np.repeat(np.arange(len(start)), count)
-    part = (np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[piece]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None] * cell_m
-    solid = np.ones((len(start), 2), dtype=bool)
-    for side, sign in enumerate((1.0, -1.0)):
-        points = start[piece] + part[:, None] * along[piece] + sign * normal[piece]
-        column, row = np.floor(points / cell_m).astype(np.int64).T
-        inside = (row >= 0) & (row < walls.shape[0]) & (column >= 0) & (column < walls.shape[1])
-        wall = inside.copy()
-        wall[inside] = walls[row[inside], column[inside]]
-        np.logical_and.at(solid[:, side], piece, wall)
-    return solid
 
 
 class Leg(NamedTuple):
@@ -78,7 +42,7 @@ class Trail(NamedTuple):
 
     `walls` are pieces that reflect it, `bounce` the points (x, y, fraction of the length) and the cosine of incidence
     there. `surface` are pieces of walls, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a
-    further face of a wall that has been crossed, which costs nothing, and `cosine` that of the incidence there;
+    further face of a wall that has been crossed, which costs nothing, and `cosine` the cosine of incidence there;
     `points` are (x, y, fraction of the length).
     """
 
@@ -112,9 +76,9 @@ def trail_of(plan: Plan) -> Trail:
 
 @njit(cache=True)
 def cross_leg(plan, interior, leg, count, trail):  # type: ignore[no-untyped-def]
-    """Add the faces that a leg crosses to `count` entries: their number now, and that of walls among the faces.
+    """Add the faces that a leg crosses to `count` entries; return the number of entries, and of walls crossed.
 
-    The first is -1 if there are too many, or if a wall reflects what has come through another face of it.
+    The first is -1 if there are too many, or if a wall reflects a leg that came through another face of it.
     """
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
     length = np.hypot(dx, dy)
@@ -200,7 +164,7 @@ def _cosine(plan, piece, dx, dy, length):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-untyped-def]
-    """Whether the first or the last of the faces on a leg and the wall that reflects it there are one wall."""
+    """Return whether the first or the last of the faces on a leg and the wall that reflects it there are one wall."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
     length = np.hypot(dx, dy)
     for wall, face, t in ((leg.own, 0, 0.0), (leg.other, n - 1, 1.0)):
@@ -216,61 +180,8 @@ def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def group_faces(interior, start, end, found, cosine, same_wall):  # type: ignore[no-untyped-def]
-    """Write which faces on a leg are further faces of a wall (n,); return the number of walls.
-
-    `found` (n,) are the fractions of the leg at which it meets them, in order, `cosine` (n,) those of the angles of
-    incidence. Walls are counted from the end whose coordinates are smaller, so that a link is the same in both
-    directions.
-    """
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    length = np.hypot(dx, dy)
-    backwards = dx < 0.0 or (dx == 0.0 and dy < 0.0)
-    n, walls, begin, first, previous, steep = len(found), 0, 0, 0.0, 0.0, 1.0
-    for j in range(n):
-        i = n - 1 - j if backwards else j
-        t, depth_m = found[i], abs(found[i] - first) * length * min(cosine[i], steep)
-        joined = j > 0 and interior.depth_m > 0.0 and depth_m <= interior.depth_m
-        if not joined or is_free_between(interior, start, end, min(t, previous), max(t, previous)):
-            choose_face(cosine, same_wall, begin, j, backwards)
-            walls, begin, first, steep = walls + 1, j, t, 1.0
-        previous, steep = t, min(steep, cosine[i])
-    choose_face(cosine, same_wall, begin, n, backwards)
-    return walls
-
-
-@njit(cache=True)
-def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-untyped-def]
-    """Let one of the faces of a wall have its loss: that of the median angle, as outlines may be ragged.
-
-    The wall has the faces from `begin` to `end`, which are counted from the last one if `backwards`.
-    """
-    last = len(cosine) - 1
-    for j in range(begin, end):
-        own, rank = last - j if backwards else j, 0
-        for k in range(begin, end):
-            other = last - k if backwards else k
-            rank += cosine[other] < cosine[own] or (cosine[other] == cosine[own] and k < j)
-        same_wall[own] = rank != (end - begin) // 2
-
-
-@njit(cache=True)
-def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-def]
-    """Whether a leg meets a free cell between two fractions of it; cells that the faces there cut do not count."""
-    dx, dy = end[0] - start[0], end[1] - start[1]
-    length = np.hypot(dx, dy)
-    s, high = first * length + cells.cell_m, last * length - cells.cell_m
-    while s <= high:
-        column, row = int((start[0] + s / length * dx) / cells.cell_m), int((start[1] + s / length * dy) / cells.cell_m)
-        if 0 <= row < cells.free.shape[0] and 0 <= column < cells.free.shape[1] and cells.free[row, column]:
-            return True
-        s += 0.5 * cells.cell_m
-    return False
-
-
-@njit(cache=True)
 def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
-    """Whether no leg of a path of some length in the plan is so short that Sionna RT drops the path."""
+    """Return whether no leg of a path of some length in the plan is so short that Sionna RT drops the path."""
     previous = 0.0
     for k in range(count):
         if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:

@@ -1,4 +1,4 @@
-"""Paths through walls where obstacles end below the ceiling: what they cross of obstacles, and what they are above."""
+"""Paths through walls where obstacles end below the ceiling: paths cross obstacles, or run above them."""
 
 from dataclasses import dataclass, replace
 
@@ -9,8 +9,8 @@ from sionna_partial.process import njit
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.legs import Interior, group_faces
 from sionna_partial.tracing.plan.specular import Room
+from sionna_partial.tracing.walls import Interior, group_faces
 
 _MOST_LIDS = 8
 """Most tops of obstacles that a path may cross."""
@@ -59,7 +59,7 @@ class Lowered:
 
 @njit(cache=True)
 def _lower(kind, face, vertices, same, walls, lids, ends, interior):  # type: ignore[no-untyped-def]
-    """Write what each candidate crosses at its heights, in place; return the numbers of walls (C,), -1 if too many."""
+    """Write the walls that candidates cross at their heights, in place; return the numbers (C,), -1 if too many."""
     (tx_m, targets), (walls_m, top_m) = ends, walls
     crossings, most = np.zeros(len(kind), np.int64), kind.shape[1]
     old_kind, old_face, old = np.empty(most, np.uint8), np.empty(most, np.int32), np.empty((most, 3))

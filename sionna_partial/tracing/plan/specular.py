@@ -5,19 +5,21 @@ where it meets floor and ceiling depends on that length alone.
 """
 
 from collections.abc import Iterator
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
 from sionna_partial.scene.scene import SceneGeometry
-from sionna_partial.tracing.bounds import LEVELS, Strengths, at_flats, at_wall, level_of
 from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.beams import trace_beams
+from sionna_partial.tracing.plan.beams import Beams, trace_beams
+from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, at_flats, at_wall, gain_towards
+from sionna_partial.tracing.select import Listed
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
 """Surfaces by number: no surface, the floor, the ceiling, a vertical edge, and from `WALLS` on the wall segments."""
@@ -27,10 +29,11 @@ _PAIRS_AT_ONCE = 200_000
 
 
 class Room(NamedTuple):
-    """What paths meet between a transmitter (3,) and receivers (N, 3), in the local frame [m].
+    """Surfaces around a transmitter (3,) and receivers (N, 3), in the local frame [m].
 
     Walls (S, 2, 2) stand between the floor at 0 and the ceiling at `height_m`; `floor` and `ceiling` are whether they
-    reflect. `wall_material` (S,) and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls.
+    reflect. `wall_material` (S,) and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls,
+    `gains` the gains of the transmit antenna.
     """
 
     walls_m: Floats
@@ -42,39 +45,48 @@ class Room(NamedTuple):
     wall_material: NDArray[np.int64]
     flat_material: int
     top_m: Floats
+    gains: Gains
 
     @classmethod
-    def of(cls, geometry: SceneGeometry, tx_m: Floats, rx_m: Floats, material_of_face: NDArray[np.int64]) -> "Room":
+    def of(
+        cls,
+        geometry: SceneGeometry,
+        tx_m: Floats,
+        rx_m: Floats,
+        material_of_face: NDArray[np.int64],
+        gains: Gains = ISOTROPIC,
+    ) -> "Room":
         """Take it from a scene, whose faces have these materials."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
         materials = material_of_face[: 2 * len(geometry.segments) : 2], of_flats
-        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m, *materials, geometry.top_m)
+        return cls(geometry.walls_m, float(geometry.height_m), *flats, tx_m, rx_m, *materials, geometry.top_m, gains)
 
 
 class SpecularCandidates:
-    """All specular paths of at most `max_depth` reflections between the transmitter and the receivers of a room.
+    """All specular paths of at most `max_depth` reflections between the transmitter and the receivers of a room."""
 
-    The beams are traced once.
-    """
+    name = "reflections"
 
-    def __init__(self, geometry: SceneGeometry, room: Room, max_depth: int) -> None:
-        self._geometry, self._room, self._max_depth = geometry, room, max_depth
-        self._beams = trace_beams(geometry.plan, room.tx_m[:2], room.rx_m[:, :2], max_depth)
-        self._best = np.zeros(len(self._beams.pair_rx), np.uint8)  # level of the strongest candidate of each pair
+    def __init__(self, geometry: SceneGeometry, room: Room, max_depth: int, materials: Materials) -> None:
+        self._geometry, self._room, self._max_depth, self._materials = geometry, room, max_depth, materials
 
-    def blocks(
-        self, strengths: Strengths, *, pairs_at_once: int = _PAIRS_AT_ONCE
-    ) -> Iterator[tuple[Candidates, float]]:
-        """Yield the candidates that are asked for, and the fraction of the work done; add up the bounds of all."""
-        count = len(self._best)
+    def listed(self, found: Floats, *, pairs_at_once: int = _PAIRS_AT_ONCE) -> Iterator[Listed]:
+        """List the candidates; none is negligible."""
+        room, plan = self._room, self._geometry.plan
+        beams = trace_beams(plan, room.tx_m[:2], room.rx_m[:, :2], self._max_depth)
+        count = len(beams.pair_rx)
         for start in range(0, count, pairs_at_once):
             stop = min(start + pairs_at_once, count)
-            rx, surface, vertices_m = _expand_heights(
-                self._beams, start, stop, self._room, self._max_depth, strengths, self._best
-            )
-            kind = np.where(surface == NOTHING, 0, REFLECTION).astype(np.uint8)
-            yield Candidates(rx, kind, faces_of(surface, self._geometry), vertices_m), stop / count
+            pair, variant, bound = _list_heights(beams, start, stop, room, self._max_depth, self._materials)
+            write = partial(self._written, beams, pair, variant)
+            yield Listed(beams.pair_rx[pair], bound, write, stop / count)
+
+    def _written(self, beams: Beams, pair: Indices, variant: NDArray[np.int8], rows: Indices) -> Candidates:
+        pair = pair[rows]
+        surface, vertices_m = _write_heights(beams, pair, variant[rows], self._room, self._max_depth)
+        kind = np.where(surface == NOTHING, 0, REFLECTION).astype(np.uint8)
+        return Candidates(beams.pair_rx[pair], kind, faces_of(surface, self._geometry), vertices_m)
 
 
 def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.int32]:
@@ -85,66 +97,69 @@ def faces_of(surface: NDArray[np.int32], geometry: SceneGeometry) -> NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _expand_heights(beams, start, stop, room, max_depth, strengths, best):  # type: ignore[no-untyped-def]
-    """Every order of wall, floor and ceiling reflections of some pairs; pairs without any asked for are skipped."""
-    parent, segment, source, pair_node, pair_rx = (
-        beams.parent,
-        beams.segment,
-        beams.source,
-        beams.pair_node,
-        beams.pair_rx,
-    )
-    walls_m, tx_m, rx_m, first_level, last_level = room.walls_m, room.tx_m, room.rx_m, strengths.first, strengths.last
-    all_power, reflected, largest, wavelength = (
-        strengths.power,
-        strengths.reflected,
-        strengths.largest,
-        strengths.wavelength_m,
-    )
-    wall_material, flat_material = room.wall_material, room.flat_material
-    size = max(1, max_depth)
+def _list_heights(beams, start, stop, room, max_depth, materials):  # type: ignore[no-untyped-def]
+    """List every order of wall, floor and ceiling reflections of some pairs: pair, variant and bound (C,)."""
+    parent, segment, source = beams.parent, beams.segment, beams.source
+    pair_node, pair_rx, walls_m, tx_m, rx_m = beams.pair_node, beams.pair_rx, room.walls_m, room.tx_m, room.rx_m
+    wall_material, largest, wavelength = room.wall_material, materials.largest, materials.wavelength_m
+    size, directed = max(1, max_depth), len(room.gains.table) > 1
     walls, points, cosine = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size)
-    met, material = np.empty(size, np.int64), np.full(size + 1, flat_material)
-    out_rx, surface, vertices = np.empty(1024, np.int32), np.empty((1024, size), np.int32), np.empty((1024, size, 3))
+    material = np.full(size + 1, room.flat_material)
+    pair, variant, bound = np.empty(1024, np.int32), np.empty(1024, np.int8), np.empty(1024)
     count = np.int64(0)
     for i in range(start, stop):
-        rx = pair_rx[i]
-        if best[i] >= last_level[rx]:
-            continue
-        target, best[i] = rx_m[rx], LEVELS
+        target = rx_m[pair_rx[i]]
         k, length, good = unfold(parent, segment, source, pair_node[i], walls_m, target, walls, points)
         if not good:
             continue
         incidence(walls_m, tx_m, target, walls[:k], points, cosine)
         for level in range(k):
-            met[level], material[level] = WALLS + walls[level], wall_material[walls[level]]
+            material[level] = wall_material[walls[level]]
         for bounces in range(max_depth - k + 1):
             for first in (FLOOR, CEILING):
                 if not can_bounce(bounces, first, room):
                     continue
                 height = unfolded_height(room, target, bounces, first)
                 power = _specular_power(wavelength, largest, material, cosine, k, length, height, bounces)
-                level = level_of(power) if k + bounces > 0 else 0
-                if len(all_power):
-                    all_power[rx, level] += power
-                    reflected[rx] += power if level > 0 else 0.0
-                best[i] = min(best[i], level)
-                if not first_level[rx] <= level < last_level[rx]:
-                    continue
-                out_rx, surface, vertices = grow(out_rx, count + 1), grow(surface, count + 1), grow(vertices, count + 1)
-                out_rx[count] = rx
-                clear(surface[count], vertices[count])
-                merge_heights(met[:k], points[:k], room, target, bounces, first, surface[count], vertices[count])
+                if directed:
+                    x, y = (points[0, 0], points[0, 1]) if k > 0 else (target[0], target[1])
+                    slope = height * sign_of_rise(room, target, bounces, first) / max(length, 1e-9)
+                    power *= gain_of_leg(room, x - tx_m[0], y - tx_m[1], slope)
+                pair, variant, bound = grow(pair, count + 1), grow(variant, count + 1), grow(bound, count + 1)
+                pair[count], variant[count] = i, 2 * bounces + first - FLOOR
+                bound[count] = power if k + bounces > 0 else np.inf
                 count += 1
-    return out_rx[:count].copy(), surface[:count].copy(), vertices[:count].copy()
+    return pair[:count].copy(), variant[:count].copy(), bound[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def _write_heights(beams, pairs, variants, room, max_depth):  # type: ignore[no-untyped-def]
+    """Write surfaces (C, D) and vertices (C, D, 3) of some variants of pairs."""
+    size, count = max(1, max_depth), len(pairs)
+    walls, points, met = np.empty(size, np.int64), np.empty((size, 3)), np.empty(size, np.int64)
+    surface, vertices = np.zeros((count, size), np.int32), np.zeros((count, size, 3))
+    for c in range(count):
+        node, target = beams.pair_node[pairs[c]], room.rx_m[beams.pair_rx[pairs[c]]]
+        k, _, _ = unfold(beams.parent, beams.segment, beams.source, node, room.walls_m, target, walls, points)
+        for level in range(k):
+            met[level] = WALLS + walls[level]
+        bounces, first = variants[c] // 2, FLOOR + variants[c] % 2
+        merge_heights(met[:k], points[:k], room, target, bounces, first, surface[c], vertices[c])
+    return surface, vertices
 
 
 @njit(cache=True)
-def clear(surface, vertices):  # type: ignore[no-untyped-def]
-    """Empty one candidate."""
-    for depth in range(len(surface)):
-        surface[depth] = NOTHING
-        vertices[depth, 0] = vertices[depth, 1] = vertices[depth, 2] = 0.0
+def sign_of_rise(room, target, bounces, first):  # type: ignore[no-untyped-def]
+    """Return 1 where a path rises at first, -1 where it falls."""
+    if bounces == 0:
+        return 1.0 if target[2] >= room.tx_m[2] else -1.0
+    return -1.0 if first == FLOOR else 1.0
+
+
+@njit(cache=True)
+def gain_of_leg(room, x, y, slope):  # type: ignore[no-untyped-def]
+    """Return the gain of the transmit antenna towards a horizontal offset, for a path of some slope."""
+    return gain_towards(room.gains, x, y, slope * np.hypot(x, y))
 
 
 @njit(cache=True)
@@ -178,7 +193,7 @@ def incidence(all_walls, start, end, walls, points, cosine):  # type: ignore[no-
 def _specular_power(wavelength, largest, material, cosine, count, length, height, bounces):  # type: ignore[no-untyped-def]
     """Upper bound of the power of a path of some length in the plan, with reflections at walls, floor and ceiling.
 
-    `material` has those of the walls, and at its end that of floor and ceiling.
+    `material` has the materials of the walls, and at its end of floor and ceiling.
     """
     total = np.hypot(length, height)
     sine, slope, field = length / total, height / total, (1.0, 0.0, 1.0)
@@ -189,7 +204,7 @@ def _specular_power(wavelength, largest, material, cosine, count, length, height
 
 @njit(cache=True)
 def can_bounce(bounces, first, room):  # type: ignore[no-untyped-def]
-    """Whether a path can meet floor and ceiling alternately `bounces` times; without any, `first` counts as FLOOR."""
+    """Return whether a path can meet floor and ceiling in turn `bounces` times; without any, `first` is FLOOR."""
     if bounces == 0:
         return first == FLOOR
     if bounces == 1:
@@ -227,7 +242,7 @@ def unfold(parent, segment, source, node, all_walls, target, walls, points):  # 
 
 @njit(cache=True)
 def merge_heights(met, points, room, target, bounces, first, surface, vertices):  # type: ignore[no-untyped-def]
-    """Write one candidate: what it meets in the plan, and `bounces` reflections at floor and ceiling, in path order."""
+    """Write one candidate: its surfaces in the plan and `bounces` reflections at floor and ceiling, in path order."""
     tx, height = room.tx_m, room.height_m
     to_first = tx[2] if first == FLOOR else height - tx[2]
     unfolded = unfolded_height(room, target, bounces, first) if bounces else 1.0

@@ -1,7 +1,11 @@
-"""Which of the faces that a line through a mesh meets are one wall.
+"""Rules for the faces along a line that count as one wall, for floor plans, obstacles and meshes.
 
 Two faces that follow each other along a line are one wall if they are at most `depth_m` apart, measured across them,
-and either are where the line enters a closed body and leaves it again, or have no free cell of the map between them.
+and no free cell of the map lies between them. In meshes they are also one wall where the line enters a closed body and
+leaves it again. One face of a wall has its loss, and none reflects a path that came through another.
+
+Plans and meshes group faces in two functions: a mesh counts from the near end of the line, where its cells are
+sampled, too, and a common function would change which of two close faces is first.
 """
 
 from typing import NamedTuple
@@ -13,10 +17,43 @@ from scipy.sparse.csgraph import connected_components
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
+from sionna_partial.scene.floor_plan import Plan
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes
-from sionna_partial.tracing.plan.legs import choose_face, is_free_between
-from sionna_partial.tracing.slab import Slabs
+from sionna_partial.tracing.power import Materials
+
+
+class Interior(NamedTuple):
+    """The space between walls: cells (ny, nx) of the plan that are free, those with a floor, and their edge [m].
+
+    `solid` (P, 2) is whether the wall continues on the left and on the right of its pieces.
+    `depth_m` is how deep one wall may be.
+    """
+
+    free: Bools
+    floor: Bools
+    solid: Bools
+    cell_m: float
+    depth_m: float
+
+
+def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
+    """Return whether pieces (P,) of walls have only wall cells a cell away on their left and on their right (P, 2)."""
+    start, along = plan.pieces_m[:, 0], plan.pieces_m[:, 1] - plan.pieces_m[:, 0]
+    length = np.hypot(*along.T)
+    count = np.maximum(1, np.ceil(length / cell_m)).astype(np.int64)
+    piece = np.repeat(np.arange(len(start)), count)
+    part = (np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[piece]
+    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None] * cell_m
+    solid = np.ones((len(start), 2), dtype=bool)
+    for side, sign in enumerate((1.0, -1.0)):
+        points = start[piece] + part[:, None] * along[piece] + sign * normal[piece]
+        column, row = np.floor(points / cell_m).astype(np.int64).T
+        inside = (row >= 0) & (row < walls.shape[0]) & (column >= 0) & (column < walls.shape[1])
+        wall = inside.copy()
+        wall[inside] = walls[row[inside], column[inside]]
+        np.logical_and.at(solid[:, side], piece, wall)
+    return solid
 
 
 class Bodies(NamedTuple):
@@ -27,7 +64,7 @@ class Bodies(NamedTuple):
 
 
 class Cells(NamedTuple):
-    """Which cells (ny, nx) of a map are free, their edge [m], and how deep one wall may be [m]."""
+    """Free cells (ny, nx) of a map, their edge [m], and the largest depth of one wall [m]."""
 
     free: Bools
     cell_m: float
@@ -35,13 +72,14 @@ class Cells(NamedTuple):
 
 
 class SolidMesh(NamedTuple):
-    """A mesh that lines go through: its faces, their planes, bodies and materials, and the cells of its map."""
+    """A mesh that lines go through: its faces, planes, bodies and cells, and the material of each face (F,)."""
 
     tree: FaceTree
     planes: MeshPlanes
     bodies: Bodies
     cells: Cells
-    slabs: Slabs
+    materials: Materials
+    material: NDArray[np.int64]
 
 
 def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
@@ -66,11 +104,11 @@ def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
     return Bodies(np.where(opened[body], -1, body), outward)
 
 
-class Trail(NamedTuple):
-    """Scratch of one path: what it meets, in order from the transmitter.
+class MetFaces(NamedTuple):
+    """Scratch of one path: the faces that it meets, in order from the transmitter.
 
     `face` are faces, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a further face of a
-    wall that has been crossed, which costs nothing; `cosine` is that of the incidence there, `point_m` the points.
+    wall that has been crossed, which costs nothing; `cosine` is the cosine of incidence there, `point_m` the points.
     """
 
     face: NDArray[np.int64]
@@ -81,9 +119,9 @@ class Trail(NamedTuple):
 
 
 @njit(cache=True)
-def trail(size):  # type: ignore[no-untyped-def]
+def met_faces(size):  # type: ignore[no-untyped-def]
     """Make room for a path that meets so many faces."""
-    return Trail(
+    return MetFaces(
         np.empty(size, np.int64),
         np.empty(size, np.uint8),
         np.empty(size, np.bool_),
@@ -102,7 +140,7 @@ def cosine_at(planes, face, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
-    """Whether nothing free lies between two faces, met one after the other at two fractions of a line from a to b."""
+    """Return whether no free cell lies between two faces, met in turn at two fractions of a line from a to b."""
     body, outward = mesh.bodies.body, mesh.bodies.outward
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     if body[first] >= 0 and body[first] == body[second]:
@@ -115,7 +153,7 @@ def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
-    """Whether what lies between two faces on a line from a to b, at two fractions of it, is the inside of one wall.
+    """Return whether two faces, met at two fractions of a line from a to b, enclose the inside of one wall.
 
     Faces that are across each other are a wall and the floor that it stands on, or two walls at a corner.
     """
@@ -162,3 +200,56 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
         previous, steep = t, min(steep, cosine)
     choose_face(cosines, same_wall, opened, count, turned)
     return walls
+
+
+@njit(cache=True)
+def group_faces(interior, start, end, found, cosine, same_wall):  # type: ignore[no-untyped-def]
+    """Write which faces on a leg are further faces of a wall (n,); return the number of walls.
+
+    `found` (n,) are the fractions of the leg at which it meets them, in order, `cosine` (n,) the cosines of
+    incidence. Walls are counted from the end whose coordinates are smaller, so that a link is the same in both
+    directions.
+    """
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    length = np.hypot(dx, dy)
+    backwards = dx < 0.0 or (dx == 0.0 and dy < 0.0)
+    n, walls, begin, first, previous, steep = len(found), 0, 0, 0.0, 0.0, 1.0
+    for j in range(n):
+        i = n - 1 - j if backwards else j
+        t, depth_m = found[i], abs(found[i] - first) * length * min(cosine[i], steep)
+        joined = j > 0 and interior.depth_m > 0.0 and depth_m <= interior.depth_m
+        if not joined or is_free_between(interior, start, end, min(t, previous), max(t, previous)):
+            choose_face(cosine, same_wall, begin, j, backwards)
+            walls, begin, first, steep = walls + 1, j, t, 1.0
+        previous, steep = t, min(steep, cosine[i])
+    choose_face(cosine, same_wall, begin, n, backwards)
+    return walls
+
+
+@njit(cache=True)
+def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-untyped-def]
+    """Let the face of a wall with the median angle have its loss, as outlines may be ragged.
+
+    The wall has the faces from `begin` to `end`, which are counted from the last one if `backwards`.
+    """
+    last = len(cosine) - 1
+    for j in range(begin, end):
+        own, rank = last - j if backwards else j, 0
+        for k in range(begin, end):
+            other = last - k if backwards else k
+            rank += cosine[other] < cosine[own] or (cosine[other] == cosine[own] and k < j)
+        same_wall[own] = rank != (end - begin) // 2
+
+
+@njit(cache=True)
+def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-def]
+    """Return whether a free cell lies on a leg between two fractions of it, except cells that the faces there cut."""
+    dx, dy = end[0] - start[0], end[1] - start[1]
+    length = np.hypot(dx, dy)
+    s, high = first * length + cells.cell_m, last * length - cells.cell_m
+    while s <= high:
+        column, row = int((start[0] + s / length * dx) / cells.cell_m), int((start[1] + s / length * dy) / cells.cell_m)
+        if 0 <= row < cells.free.shape[0] and 0 <= column < cells.free.shape[1] and cells.free[row, column]:
+            return True
+        s += 0.5 * cells.cell_m
+    return False

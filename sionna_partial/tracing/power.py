@@ -1,0 +1,410 @@
+"""The power of paths by their geometry, before Sionna RT has verified them.
+
+Slabs reflect and transmit as Sionna RT has it (ITU-R P.2040-3, eq. 31, 37 and 38); an edge follows the uniform theory
+of diffraction (UTD). Paths between opaque walls have an upper bound of their power between vertically polarised
+antennas: the horizontal component that a slanting path has for a while is added up by magnitude. Paths through walls
+have the power of their Jones vector.
+"""
+
+import math
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import fresnel
+
+from sionna_partial.arrays import Floats
+from sionna_partial.checks import require
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S
+from sionna_partial.process import njit
+from sionna_partial.scene.scene import constants_of
+from sionna_partial.settings import Material
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+
+Polarisation = Literal["te", "tm"]
+"""Electric field perpendicular to the plane of incidence ("te"), as of vertical antennas at walls, or in it ("tm")."""
+
+MOST_LOSS_DB = 60.0
+"""Loss of a wall from which on it counts as opaque [dB]."""
+
+_ANGLES_DEG = np.arange(0.0, 61.0, 10.0)
+"""Angles of incidence over which a wall is averaged: the loss at normal incidence has deep interference fringes."""
+
+VACUUM_F_M = 8.8541878128e-12
+"""Permittivity of the vacuum [F/m]."""
+
+COSINES = 2048
+"""Steps of the tables over the cosine of the angle of incidence."""
+
+_ANGLES, _MARGIN = 1024, 1.01
+"""Steps of the table of largest coefficients, and factor by which it is enlarged."""
+
+_CANCELLED = 0.02
+"""Fraction of the terms of a diffraction that single precision may leave where they cancel each other."""
+
+_STEPS, _ASYMPTOTIC = 128, 3.0
+"""Entries of the table of the UTD transition function per unit, and where its asymptotic series takes over."""
+
+
+def reflection_loss_db(
+    permittivity: ArrayLike,
+    conductivity_s_m: ArrayLike,
+    thickness_m: ArrayLike,
+    frequency_hz: float,
+    angle_deg: ArrayLike,
+    polarisation: Polarisation = "te",
+) -> Floats:
+    """Return the loss [dB] of a wave that is reflected off a slab, with all reflections inside it.
+
+    All arrays are broadcast together; angles of incidence are from the normal, 0 to 90 degrees. The loss is at least 0
+    and infinite where nothing is reflected. Another polarisation or angle raises a SettingsError.
+    """
+    require(polarisation in ("te", "tm"), "polarisation", polarisation, "choose 'te' or 'tm'.")
+    angle = np.asarray(angle_deg, dtype=np.float64)
+    require(bool(np.all((angle >= 0.0) & (angle <= 90.0))), "angle_deg", angle_deg, "give degrees from 0 to 90.")
+    te, tm = reflection_coefficients(
+        permittivity, conductivity_s_m, thickness_m, frequency_hz, np.cos(np.radians(angle))
+    )
+    with np.errstate(divide="ignore"):
+        return -20.0 * np.log10(np.abs(te if polarisation == "te" else tm))
+
+
+def _refracted(
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
+) -> tuple[NDArray[np.complex128], Floats, NDArray[np.complex128]]:
+    """Return the complex permittivity, the cosines as an array, and the index of refraction times those inside."""
+    loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
+    eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
+    return eta, cosine, np.sqrt(eta - (1.0 - cosine**2))
+
+
+def reflection_coefficients(
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the reflection coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
+    eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
+    inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
+    faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
+    te, tm = (face * (1.0 - inside) / (1.0 - face**2 * inside) for face in faces)
+    return te, tm
+
+
+def transmission_coefficients(
+    permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
+) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
+    """Return the transmission coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
+    eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
+    once = np.exp(-2j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
+    faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
+    te, tm = ((1.0 - face**2) * once / (1.0 - face**2 * once**2) for face in faces)
+    return te, tm
+
+
+def wall_loss_db(material: Material, frequency_hz: float) -> float:
+    """Return the mean loss [dB] of going through a wall at angles of incidence up to 60 degrees."""
+    permittivity, conductivity_s_m = constants_of(material, frequency_hz)
+    cosine = np.cos(np.radians(_ANGLES_DEG))
+    te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
+    return float(np.mean(np.minimum(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8)), MOST_LOSS_DB)))
+
+
+class Materials(NamedTuple):
+    """Coefficients of the slabs of M materials, TE and TM, and of edges.
+
+    `reflection` and `transmission` (M, K + 1, 2) are the coefficients where the cosine of the angle of incidence is
+    k / K. `most_reflected` (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted`
+    (M, K + 1) the largest |T|^2 at this cosine or a smaller one. `largest` (M, L, 4) are the largest reflected |TE|,
+    |TM| and |TE + TM| where the cosine is l / L to (l + 1) / L, and the largest of the first two where it is l / L or
+    more.
+    `transition` is F(y^2) / y of the UTD transition function F.
+    """
+
+    wavelength_m: float
+    reflection: NDArray[np.complex128]
+    transmission: NDArray[np.complex128]
+    most_reflected: Floats
+    most_transmitted: Floats
+    largest: Floats
+    transition: NDArray[np.complex128]
+
+
+class Gains(NamedTuple):
+    """Upper bounds of the gain of the transmit antenna: by degrees of zenith and azimuth, by azimuth, and of all.
+
+    `table` is (181, 360), and (1, 1) for an isotropic antenna; `by_azimuth` (360,) is the largest of any zenith.
+    """
+
+    table: NDArray[np.float64]
+    by_azimuth: NDArray[np.float64]
+    largest: float
+
+
+ISOTROPIC = Gains(np.ones((1, 1)), np.ones(1), 1.0)
+
+
+@njit(cache=True)
+def gain_towards(gains, x, y, z):  # type: ignore[no-untyped-def]
+    """Return the gain in a direction."""
+    if len(gains.table) == 1:
+        return 1.0
+    zenith, azimuth = math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x))
+    return gains.table[int(zenith + 0.5), int(azimuth + 360.5) % 360]
+
+
+@njit(cache=True)
+def gain_at_azimuth(gains, x, y):  # type: ignore[no-untyped-def]
+    """Return the largest gain in a horizontal direction, at any zenith."""
+    if len(gains.by_azimuth) == 1:
+        return 1.0
+    return gains.by_azimuth[int(math.degrees(math.atan2(y, x)) + 360.5) % 360]
+
+
+@njit(cache=True)
+def gain_between(gains, first, second):  # type: ignore[no-untyped-def]
+    """Return the largest gain from one horizontal direction counterclockwise to another, less than half a turn."""
+    if len(gains.by_azimuth) == 1:
+        return 1.0
+    start = math.degrees(math.atan2(first[1], first[0]))
+    turn = (math.degrees(math.atan2(second[1], second[0])) - start) % 360.0
+    most = 0.0
+    for step in range(int(turn) + 2):
+        most = max(most, gains.by_azimuth[int(start + min(step, turn) + 720.5) % 360])
+    return most
+
+
+def materials_of(constants: Iterable[ArrayLike], frequency_hz: float) -> Materials:
+    """Tabulate the coefficients of materials, each permittivity, conductivity and thickness (3,)."""
+    given = np.array(list(constants), dtype=np.float64).reshape(-1, 3)
+
+    def tabulated(coefficients: Any, steps: int) -> NDArray[np.complex128]:
+        cosine = np.linspace(0.0, 1.0, steps + 1)
+        tables = [np.stack(coefficients(*own, frequency_hz, cosine), axis=1) for own in given]
+        return np.reshape(tables, (-1, steps + 1, 2)).astype(np.complex128)
+
+    reflection, transmission = (
+        tabulated(reflection_coefficients, COSINES),
+        tabulated(transmission_coefficients, COSINES),
+    )
+    reflection[:, 0], transmission[:, 0] = -1.0, 0.0
+    reflected, transmitted = (np.max(np.abs(table) ** 2, axis=2) for table in (reflection, transmission))
+    most_reflected = np.maximum.accumulate(reflected[:, ::-1], axis=1)[:, ::-1].copy()
+    most_transmitted = np.maximum.accumulate(transmitted, axis=1)
+    fine = tabulated(reflection_coefficients, 8 * _ANGLES)
+    sizes = np.abs(np.concatenate([fine, fine.sum(axis=2, keepdims=True)], axis=2))
+    ends = np.maximum(sizes[:, :-1], sizes[:, 1:]).reshape(len(given), _ANGLES, 8, 3).max(axis=2)
+    beyond = np.maximum.accumulate(ends[:, ::-1, :2].max(axis=2), axis=1)[:, ::-1, None]
+    largest = np.minimum(_MARGIN * np.concatenate([ends, beyond], axis=2), [1.0, 1.0, 2.0, 1.0])
+    wavelength_m = SPEED_OF_LIGHT_M_S / frequency_hz
+    slabs = reflection, transmission, most_reflected, most_transmitted, largest
+    return Materials(wavelength_m, *slabs, _transition_table())
+
+
+def _transition_table() -> NDArray[np.complex128]:
+    """F(y^2) / y (Kouyoumjian and Pathak 1974) for y = k / _STEPS."""
+    y = np.arange(_STEPS * _ASYMPTOTIC + 2) / _STEPS
+    sine, cosine = fresnel(math.sqrt(2.0 / math.pi) * y)
+    table: NDArray[np.complex128] = np.exp(1j * y**2) * (1.0 + 1j - 2j * (cosine - 1j * sine))
+    return math.sqrt(0.5 * math.pi) * table
+
+
+@njit(cache=True)
+def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
+    """Largest fraction of the power that a reflection by one of the materials leaves, however polarised."""
+    at = min(int(abs(cosine) * _ANGLES), _ANGLES - 1)
+    return max(largest[at, 0], largest[at, 1]) ** 2
+
+
+@njit(cache=True)
+def power_near(coefficients, cosine):  # type: ignore[no-untyped-def]
+    """Return the fraction of the power, of the better polarisation, that one slab reflects or lets through."""
+    te, tm = coefficients[min(int(cosine * COSINES + 0.5), COSINES)]
+    return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
+
+
+@njit(cache=True)
+def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
+    """Interpolate the coefficients TE and TM of a slab."""
+    at = cosine * COSINES
+    low = min(int(at), COSINES - 1)
+    part, first, second = at - low, table[material, low], table[material, low + 1]
+    return first[0] + part * (second[0] - first[0]), first[1] + part * (second[1] - first[1])
+
+
+@njit(cache=True)
+def most_at_wall(largest, material, cosine):  # type: ignore[no-untyped-def]
+    """Return the largest factor of a field at a reflection, for this cosine of incidence or a larger one."""
+    return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
+
+
+@njit(cache=True)
+def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-untyped-def]
+    """Return bounds of a field after a reflection at a wall: vertical, horizontal, and the part that is never turned.
+
+    `cosine` is the cosine of the angle of incidence seen from above; `sine` and `slope` are the horizontal and the
+    vertical part of the direction of the path.
+    """
+    cosine = min(abs(cosine), 1.0)
+    at = min(int(cosine * sine * _ANGLES), _ANGLES - 1)
+    te, tm, both = largest[material, at, 0], largest[material, at, 1], largest[material, at, 2]
+    part = _te_part(1.0 - cosine * cosine, sine, slope)
+    kept, mixed, other = te * part + tm * (1.0 - part), both * math.sqrt(part * (1.0 - part)), te + (tm - te) * part
+    vertical, horizontal, pure = field
+    return kept * vertical + mixed * horizontal, mixed * vertical + other * horizontal, kept * pure
+
+
+@njit(cache=True)
+def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # type: ignore[no-untyped-def]
+    """Return bounds of a field after a diffraction, without the spread of the wave, as `at_wall` does.
+
+    `tables` are `reflection` and `transition` of `Materials`, `boundary` is sqrt(2 k L), and `cosines` are the
+    cosines of the angles of incidence at both faces.
+    """
+    (faces, transition), (cosine_0, cosine_n) = tables, cosines
+    by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
+    by_n = utd_term(transition, terms, 1, boundary) - utd_term(transition, terms, 2, boundary)
+    size_0, size_n = _size(by_0), _size(by_n)
+    own_0, mixed_0, other_0 = _at_face(faces, material, cosine_0, sine, slope)
+    own_n, mixed_n, other_n = _at_face(faces, material, cosine_n, sine, slope)
+    kept = _size(own_0 * by_0 + own_n * by_n) + _CANCELLED * (_size(own_0) * size_0 + _size(own_n) * size_n)
+    vertical, horizontal, pure = field
+    mixed, other = mixed_0 * size_0 + mixed_n * size_n, other_0 * size_0 + other_n * size_n
+    return kept * vertical + mixed * horizontal, mixed * vertical + other * horizontal, kept * pure
+
+
+@njit(cache=True)
+def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-def]
+    """Rough upper bound of a field after a diffraction, from what both faces reflect at most."""
+    size = 0.0
+    for k, other, face in ((0, 3, face_0), (1, 2, face_n)):
+        first, second = terms[k, 0], terms[other, 0]
+        here, there = boundary * terms[k, 1], boundary * terms[other, 1]
+        if min(here, there) > _ASYMPTOTIC:
+            size += face * (abs(first - second) + abs(first) / (here * here) + abs(second) / (there * there))
+        else:
+            size += face * (abs(first) * min(1.0, 2.0 * here) + abs(second) * min(1.0, 2.0 * there))
+    return size
+
+
+@njit(cache=True)
+def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyped-def]
+    """Bound of a vertical field after reflections off floor and ceiling, wherever they are in the path."""
+    at = min(int(slope * _ANGLES), _ANGLES - 1)
+    te, tm = largest[material, at, 0], largest[material, at, 1]
+    vertical, _, pure = field
+    return tm**bounces * pure + max(te, tm) ** bounces * (vertical - pure)
+
+
+@njit(cache=True)
+def _te_part(along, sine, slope):  # type: ignore[no-untyped-def]
+    """Part of a vertical field's power that is perpendicular to the plane of incidence at a wall.
+
+    `along` is the square of the cosine of the angle between path and wall, seen from above.
+    """
+    return min(along / (slope * slope + sine * sine * along), 1.0) if slope * slope > 1e-12 else 1.0
+
+
+@njit(cache=True)
+def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-def]
+    """Coefficient of a vertical field at a face of a wedge, and sizes of the others.
+
+    A face in the shadow, where the cosine is negative, is a perfect mirror to Sionna RT.
+    """
+    if cosine < 0.0:
+        return 1.0 + 0.0j, 0.0, 1.0
+    te, tm = _coefficients(faces, material, cosine * sine)
+    if slope < 1e-6:
+        return te, 0.0, 0.0
+    part = _te_part(1.0 - cosine * cosine, sine, slope)
+    mixed = _size(te + tm) * math.sqrt(part * (1.0 - part))
+    return part * te - (1.0 - part) * tm, mixed, (1.0 - part) * _size(te) + part * _size(tm)
+
+
+@njit(cache=True)
+def _size(number):  # type: ignore[no-untyped-def]
+    """Magnitude of a complex number; `abs` is slower, as it cannot overflow."""
+    return math.sqrt(number.real * number.real + number.imag * number.imag)
+
+
+@njit(cache=True)
+def wedge_angle(angle, exterior):  # type: ignore[no-untyped-def]
+    """Sine and cosine of an angle / 2 n, and of half of it, for `utd_terms`; n is the exterior angle / pi."""
+    scaled = angle * 0.5 * math.pi / exterior
+    return math.sin(scaled), math.cos(scaled), math.sin(0.5 * angle), math.cos(0.5 * angle)
+
+
+def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Return (W, 5) of wedges for `utd_terms`: sine and cosine of pi / 2 n and of n pi, and 1 / 2 n."""
+    half = 0.5 * math.pi**2 / exterior_rad
+    parts = np.sin(half), np.cos(half), np.sin(exterior_rad), np.cos(exterior_rad), half / math.pi
+    return np.stack(parts, axis=1)
+
+
+@njit(cache=True)
+def utd_terms(wedge, arrival, departure, terms):  # type: ignore[no-untyped-def]
+    """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
+
+    Written are cot(psi) / 2 n, y = sqrt(a / 2), the sine of n times the angle from psi to the nearest pole of the
+    cotangent, and 1 / y^2 (4, 3). Directions count from the 0-face; they are given by
+    `wedge_angle`, and `wedge` by `wedge_constants`.
+    """
+    for k in range(4):
+        sign, turn = -1.0 if k < 2 else 1.0, 1.0 if k % 2 == 0 else -1.0
+        sine = departure[0] * arrival[1] + sign * departure[1] * arrival[0]
+        cosine = departure[1] * arrival[1] - sign * departure[0] * arrival[0]
+        half_sine = departure[2] * arrival[3] + sign * departure[3] * arrival[2]
+        half = departure[3] * arrival[3] - sign * departure[2] * arrival[2]
+        sine, cosine = wedge[0] * cosine + turn * wedge[1] * sine, wedge[1] * cosine - turn * wedge[0] * sine
+        if cosine < 0.0:  # beyond pi / 2 the nearest pole is another
+            half = half * wedge[3] + turn * (1.0 if k < 3 else -1.0) * half_sine * wedge[2]
+        y = max(abs(half), 1e-9)
+        cotangent = wedge[4] * cosine / sine if abs(sine) > 1e-9 else 0.5 * cosine / y
+        terms[k, 0], terms[k, 1], terms[k, 2] = cotangent, y, 1.0 / (y * y)
+
+
+@njit(cache=True)
+def utd_term(transition, terms, k, boundary):  # type: ignore[no-untyped-def]
+    """Return one of the terms of `utd_terms` for sqrt(2 k L)."""
+    y = boundary * terms[k, 1]
+    if y < _ASYMPTOTIC:
+        at = int(y * _STEPS)
+        return terms[k, 0] * y * (transition[at] + (y * _STEPS - at) * (transition[at + 1] - transition[at]))
+    x = terms[k, 2] / (boundary * boundary)
+    return complex(terms[k, 0] * (1.0 - 0.75 * x * x), terms[k, 0] * x * (0.5 - 1.875 * x * x))
+
+
+@njit(cache=True)
+def vertical_field(k):  # type: ignore[no-untyped-def]
+    """Field of a vertical antenna in a direction: the unit vector along theta of spherical coordinates."""
+    flat = max(np.hypot(k[0], k[1]), 1e-12)
+    return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
+
+
+@njit(cache=True)
+def received_power(k, e):  # type: ignore[no-untyped-def]
+    """Fraction of the power that a vertical antenna receives of a field that comes in a direction."""
+    vertical = vertical_field(k)
+    field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
+    return field.real**2 + field.imag**2
+
+
+@njit(cache=True)
+def at_slab(k, e, n, materials, material, kind):  # type: ignore[no-untyped-def]
+    """Direction and field of a path after a reflection at a slab with the unit normal `n`, or a refraction."""
+    along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]
+    sx, sy, sz = k[1] * n[2] - k[2] * n[1], k[2] * n[0] - k[0] * n[2], k[0] * n[1] - k[1] * n[0]
+    norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+    if norm < 1e-9:
+        sx, sy, sz = (-n[2], 0.0, n[0]) if abs(n[1]) < 0.5 else (0.0, n[2], -n[1])
+        norm = np.sqrt(sx * sx + sy * sy + sz * sz)
+    sx, sy, sz = sx / norm, sy / norm, sz / norm
+    te = e[0] * sx + e[1] * sy + e[2] * sz
+    px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
+    tm = e[0] * px + e[1] * py + e[2] * pz
+    table = materials.transmission if kind == REFRACTION else materials.reflection
+    of_te, of_tm = _coefficients(table, material, min(abs(along), 1.0))
+    te, tm = te * of_te, tm * of_tm
+    if kind == REFLECTION:
+        k = k[0] - 2.0 * along * n[0], k[1] - 2.0 * along * n[1], k[2] - 2.0 * along * n[2]
+        px, py, pz = sy * k[2] - sz * k[1], sz * k[0] - sx * k[2], sx * k[1] - sy * k[0]
+    return k, (te * sx + tm * px, te * sy + tm * py, te * sz + tm * pz)
