@@ -80,7 +80,8 @@ def test_refused(map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     Path("bad.csv").write_text("a,b\n1,2\n")
     Path("cut.csv").write_text("x,y,z\n1,2,1\n3,4\n")
     Path("wall.csv").write_text("rx_x,rx_y,rx_z\n3.05,0.5,1.5\n")
-    result = run(map_path, "--tx", 1, 1, "--out", tmp_path / "channels.nc", *options)
+    out = [] if "--out" in options else ["--out", tmp_path / "channels.nc"]
+    result = run(map_path, "--tx", 1, 1, *out, *options)
     assert result.exit_code == 2
     assert message in " ".join(result.output.replace("│", " ").split())
     assert not (tmp_path / "channels.nc").exists()

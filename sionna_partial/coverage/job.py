@@ -36,7 +36,7 @@ from sionna_partial.measurements.measurements import (
     nearest_transmitters,
 )
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.progress import part_of
+from sionna_partial.progress import part_of, reporting
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 
@@ -243,19 +243,23 @@ def predict_coverage(
     tx_antenna: TxAntenna,
     measurements: Any,
     memory_gb: float,
-    report: Progress,
+    progress: Progress | bool | None,
     **grid: Any,
 ) -> xr.Dataset:
-    """Predict the coverage of all transmitters; `grid` has `rx_height_m`, `spacing_m` and `receivers`."""
-    report(0.0, "building the scene")
+    """Predict the coverage of all transmitters; `grid` has `rx_height_m`, `spacing_m` and `receivers`.
+
+    All arguments are checked before anything is traced.
+    """
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, grid["rx_height_m"], grid["spacing_m"])
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
-    job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
     maps = []
-    for number, transmitter in enumerate(transmitters):
-        part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
-        maps.append(job.coverage(transmitter, part))
-    report(1.0, "done")
+    with reporting(progress) as report:
+        report(0.0, "building the scene")
+        job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
+        for number, transmitter in enumerate(transmitters):
+            part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
+            maps.append(job.coverage(transmitter, part))
+        report(1.0, "done")
     return maps[0] if names is None else join_transmitters(maps, names)
 
 

@@ -15,7 +15,6 @@ from sionna_partial.coverage.job import TxAntenna, predict_coverage
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.simulation import Simulation
 
@@ -125,5 +124,4 @@ def predict_map(
     require_choice("receivers", receivers, RECEIVERS)
     require_memory(memory_gb)
     grid = {"rx_height_m": rx_height_m, "spacing_m": spacing_m, "receivers": receivers}
-    with reporting(progress) as report:
-        return predict_coverage(model, tx, tx_antenna, measurements, memory_gb, report, **grid)
+    return predict_coverage(model, tx, tx_antenna, measurements, memory_gb, progress, **grid)

@@ -15,7 +15,7 @@ from sionna_partial.process import core_count, in_order, njit
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 GRAZE = 1e-9
-"""Fraction of a line up to which a wall is only grazed: lines between grid points meet many corners, to rounding."""
+"""Fraction of a line up to which cells are only grazed: lines between grid points meet many corners, to rounding."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a segment runs along the border of cells [cells]."""
@@ -75,7 +75,8 @@ def parts_at_walls(
 
 def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Floats) -> Floats:
     fractions = map_line_fractions(partial, in_cells(partial, start_m), in_cells(partial, end_m))[:, kind]
-    return fractions * np.linalg.norm(end_m - start_m, axis=1)
+    lengths_m: Floats = np.where(fractions > GRAZE, fractions, 0.0) * np.linalg.norm(end_m - start_m, axis=1)
+    return lengths_m
 
 
 def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
