@@ -189,8 +189,8 @@ class TestMap:
             assert word in line
 
     def test_axis_and_height_band_of_a_cloud(self, tmp_path: Path) -> None:
-        points_m = np.random.default_rng(0).uniform((0, 0, 0), (4, 3, 4), (1000, 3))
-        points_m[:500, 0] = 0.0
+        points_m = np.random.default_rng(0).uniform((0, 0, 0), (3.1, 3, 0.5), (4000, 3))
+        points_m[:2000, 0] = 0.0
         np.savetxt(tmp_path / "cloud.xyz", points_m)
         maps = [load_map(tmp_path / "cloud.xyz", up="y", height_band_m=band) for band in ((2.5, 2.9), None)]
         assert maps[0] != maps[1]
