@@ -128,13 +128,13 @@ def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy:
 
 
 def is_whole(value: object, low: int = 0) -> bool:
-    """Whether `value` is a whole number of `low` or more."""
+    """Return whether `value` is a whole number of `low` or more."""
     number = plain(value)
     return isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= low
 
 
 def are_stages(value: Any) -> bool:
-    """Whether `value` has increasing whole numbers (of steps), or increasing fractions in [0, 1), one at least."""
+    """Return whether `value` has increasing whole numbers (of steps) or increasing fractions in [0, 1)."""
     stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
     numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
@@ -162,7 +162,7 @@ class Checked:
     """Base of dataclasses whose fields are checked against their annotations.
 
     Checked are ranges (`Annotated[float, Within(0, 1)]`, whole numbers for int), bool, text, Literal and dataclasses.
-    Numbers of NumPy become those of Python, so that settings can be written as JSON.
+    NumPy numbers become Python numbers, so that settings can be written as JSON.
     """
 
     def __post_init__(self) -> None:

@@ -30,7 +30,7 @@ DRYWALL_CONDUCTIVITY_S_M = 0.1226
 """Conductivity of layered drywall at 28 GHz [S/m] (the paper's Wireless InSite material)."""
 
 DRYWALL_CONDUCTIVITY_EXPONENT = 0.9395
-"""Exponent of the frequency in the conductivity of drywall: that of plasterboard (ITU-R P.2040-3, table 3)."""
+"""Exponent of the frequency in the conductivity of drywall, as of plasterboard (ITU-R P.2040-3, table 3)."""
 
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""

@@ -121,7 +121,7 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
 def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`), `.png` or `.yaml`.
 
-    The latter is a ROS map as that of `save_coverage`, of the probability that all transmitters are in outage.
+    The latter is a ROS map, as by `save_coverage`, of the probability that all transmitters are in outage.
 
     Parameters
     ----------

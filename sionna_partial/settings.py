@@ -71,8 +71,8 @@ Count = Annotated[int, Within(1, 1_000_000)]
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
-    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one, whose constants are by default those of the
-    paper's layered drywall at 28 GHz. `Material.named` has materials of walls with their usual thickness.
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default constants are
+    the paper's layered drywall at 28 GHz. `Material.named` has materials of walls with their usual thickness.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class Material(Checked):
     def named(cls, name: str) -> "Material":
         """Return a material of walls with its usual thickness, by its name.
 
-        The names are those of `WALL_MATERIALS`, such as "drywall", which is the default, and those of ITU-R P.2040-3,
+        The names are the keys of `WALL_MATERIALS`, such as "drywall", the default, and the materials of ITU-R P.2040-3,
         with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
         such walls: `docs/through_walls.md`.
 
@@ -272,7 +272,7 @@ class TraceSettings(Checked):
 
     @property
     def through_walls(self) -> bool:
-        """Whether paths go through walls at this frequency."""
+        """Return whether paths go through walls at this frequency."""
         return self.frequency_hz < OPAQUE_FROM_HZ if self.refraction is None else self.refraction
 
     @property
@@ -322,7 +322,7 @@ class SensorSettings(Checked):
 
     @property
     def is_exact(self) -> bool:
-        """Whether it makes no errors."""
+        """Return whether it makes no errors."""
         return self.range_noise_m == self.drift_m_per_m == self.missed_wall_fraction == 0.0
 
 

@@ -43,7 +43,7 @@ from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, simulation_of
 
 DETERMINED = 0.35
-"""Largest standard deviation of a parameter that counts as determined, as a fraction of that of the prior."""
+"""Largest standard deviation of a parameter that counts as determined, as a fraction of its prior."""
 
 _log = logging.getLogger(__name__)
 
@@ -306,7 +306,7 @@ class _Fit:
 
 
 def _has_offset(target: MaterialTarget, start: Sequence[Material]) -> bool:
-    """Whether links in line of sight are off by more than reflections can change their gains."""
+    """Return whether links in line of sight are off by more than reflections can change their gains."""
     if target.is_direct.sum() < FEWEST_DIRECT:
         message = "%d links in line of sight do not show an offset of all measured gains: calibrate with path gains"
         _log.warning(message, target.is_direct.sum())

@@ -59,7 +59,7 @@ class LinkPaths:
 
     @property
     def is_direct(self) -> Bools:
-        """Whether each path (P,) is the line of sight."""
+        """Return whether each path (P,) is the line of sight."""
         return self.paths.is_direct
 
     def of_links(self, chosen: Bools) -> "LinkPaths":

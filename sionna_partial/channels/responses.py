@@ -62,7 +62,7 @@ class ArrayPaths:
         synthetic_array: bool = True,
         normalize_delays: bool = True,
     ) -> "ArrayPaths":
-        """Check arguments, which are those of `TracedLinks.cir`."""
+        """Check the arguments of `TracedLinks.cir`."""
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
             require_bool(name, value)
         paths = with_every_path(paths)

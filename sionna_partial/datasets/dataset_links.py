@@ -25,7 +25,7 @@ class LinkTraces:
 
     @classmethod
     def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
-        """Return those of a predictor's settings."""
+        """Return the settings of the traces that a predictor was trained on."""
         return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
 
     def __str__(self) -> str:
@@ -34,7 +34,7 @@ class LinkTraces:
         return f"{where} {'with' if self.diffraction else 'without'} diffraction"
 
     def is_like(self, other: "LinkTraces") -> bool:
-        """Whether frequency (within 1e-6), diffraction and paths through walls are the same."""
+        """Return whether frequency (within 1e-6), diffraction and paths through walls are the same."""
         same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
         return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
 

@@ -98,7 +98,7 @@ def closed_home(home: PartialMap, name: str) -> PartialMap:
 
 
 def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
-    """Return the sensor of the robot in a home: that of the settings, or one that is drawn for the home's name."""
+    """Return the sensor of the robot in a home: the sensor of the settings, or one drawn for the name of the home."""
     if isinstance(settings.sensor, SensorSettings):
         return settings.sensor
     rng = np.random.default_rng([1, *_home_seed(name, settings)])
@@ -173,7 +173,7 @@ def points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: 
 
 
 def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -> tuple[Bools, States, Floats]:
-    """Whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
+    """Return whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
     links = _traced(home, positions.tx_m, indoors, settings)

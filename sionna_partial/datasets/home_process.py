@@ -76,7 +76,7 @@ class HomeTask:
 
     @property
     def is_done(self) -> bool:
-        """Whether the home's shard is there, whole, and of these settings."""
+        """Return whether the home's shard is there, whole, and of these settings."""
         try:
             notes = shard_metadata(shard_path(self.folder, self.source.name))
         except PredictorError:
@@ -188,7 +188,7 @@ class _HomeProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Whether it runs; what a dead one has left is released."""
+        """Return whether it runs; what a dead one has left is released."""
         if self._process.poll() is None:
             return True
         self.close()

@@ -38,7 +38,7 @@ class HomeSource:
         return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
 
     def load(self) -> PartialMap:
-        """Make or read the home; errors are those of `make_home` and `load_map`."""
+        """Make or read the home, with the errors of `make_home` and `load_map`."""
         return make_home(self.origin, self.kind) if isinstance(self.origin, int) else load_map(self.origin)
 
 

@@ -16,7 +16,7 @@ What gradients include, and what they do not:
   Their derivative jumps where a receiver passes the centre of one of their cells.
 - Where the map is complete the distribution is the trace itself: its probabilities are constant, and its gain is that
   of the paths.
-- There are first derivatives alone: TensorFlow refuses those of derivatives.
+- There are first derivatives only: TensorFlow refuses second derivatives.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ WINDOW_STEP_M = CELLS_M[0] / 2
 """How far from the transmitter further windows are drawn [m]."""
 
 STEEPEST = 4.0
-"""Largest ratio of the growth of a length to that of its smooth surrogate, as where it hardly touches a cell."""
+"""Largest ratio of the growth of a length to the growth of its smooth surrogate, as where it hardly touches a cell."""
 
 _NEAREST_M = 1e-6
 """Distance that a transmitter keeps from receivers: at the receiver, a distance has no slope [m]."""

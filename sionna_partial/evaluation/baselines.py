@@ -105,7 +105,7 @@ class Baselines(Shown):
 def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
     """Return the features of the same N links on an empty map, where the distance is all that is known.
 
-    `frequency_hz` is that of links whose features have none.
+    `frequency_hz` applies to links whose features have none.
     """
     frequency_hz = phi.frequency_hz or frequency_hz
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)

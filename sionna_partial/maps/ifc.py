@@ -29,7 +29,7 @@ MAX_IFC_BYTES = 500_000_000
 """Largest model that is read [bytes]."""
 
 CUT_M = 1.2001
-"""Height above the storey at which walls are cut [m]: that of plans, above sills and tables, and on no round number."""
+"""Height above the storey at which walls are cut [m], as in plans: above sills and tables, and on no round number."""
 
 LEAST_STOREY_M = 2.0
 """Height from which on the next storey is the ceiling of one [m]: levels nearer by are of stairs or foundations."""

@@ -296,7 +296,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def is_complete(self) -> bool:
-        """Whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
+        """Return whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
 
         What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
         out of a larger one. A map without free cells is not complete.
@@ -305,7 +305,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def is_nearly_complete(self) -> bool:
-        """Whether no unknown room can be entered: unknown are pockets in furniture, shelves and thick walls alone.
+        """Return whether no unknown room can be entered; only pockets in furniture or thick walls are unknown.
 
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
         gets into it from free cells without touching a wall. Meshes are never nearly complete.
@@ -379,7 +379,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return tuple(levels)
 
     def is_wall_at(self, points_m: Floats) -> Bools:
-        """Whether world points (..., 3) [m] are in walls, which reach to the ceiling or to the height of obstacles."""
+        """Return whether world points (..., 3) [m] are in walls or in obstacles below their height."""
         found = [
             (points_m[..., 2] <= top_m) & (level.state_at(points_m) == CellState.WALL)
             for top_m, level in self.wall_levels
@@ -416,7 +416,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return ""
 
     def radios_can_stand(self, points_m: Floats) -> Bools:
-        """Whether `require_positions` takes each of the points (N, 3) [m]."""
+        """Return whether `require_positions` takes each of the points (N, 3) [m]."""
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
     def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
@@ -464,7 +464,7 @@ def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
 
 
 def with_height(points_m: Floats) -> Floats:
-    """Return positions (..., 3) [m]; those of x and y alone, (..., 2), get the default height."""
+    """Return positions (..., 3) [m]; positions (..., 2) without z get the default height."""
     return np.insert(points_m, 2, DEFAULT_HEIGHT_M, axis=-1) if points_m.shape[-1:] == (2,) else points_m
 
 
@@ -505,7 +505,7 @@ def unknown_pockets(state: States, resolution_m: float) -> Bools:
 
 
 def _has_unknown_room(state: States, resolution_m: float) -> bool:
-    """Whether there is an unknown region as in `PartialMap.is_nearly_complete`, or there are no walls."""
+    """Return whether there is an unknown region as in `PartialMap.is_nearly_complete`, or there are no walls."""
     state = np.pad(state, math.ceil(BODY_M / resolution_m) + 1, constant_values=CellState.UNKNOWN)
     unknown, opened = state == CellState.UNKNOWN, state != CellState.WALL
     if opened.all():

@@ -98,7 +98,7 @@ class _EachKeyOnce(yaml.SafeLoader):
 
 
 class _Plain(yaml.SafeDumper):
-    """Writes numbers and arrays of NumPy as those of Python."""
+    """Writes NumPy numbers and arrays as Python numbers and lists."""
 
 
 _Plain.add_multi_representer(

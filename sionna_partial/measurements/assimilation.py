@@ -176,7 +176,7 @@ class _Links:
 
     @property
     def tx_seen(self) -> bool:
-        """Whether the transmitter is in a cell that was seen."""
+        """Return whether the transmitter is in a cell that was seen."""
         return bool(self.walks.partial.state_at(self.tx_m[None])[0] == CellState.FREE)
 
     def free_space_db(self, rx_m: Floats) -> Floats:
@@ -190,7 +190,7 @@ class _Links:
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
     def _both_seen(self, rx_m: Floats) -> Bools:
-        """Whether both ends of the links to receivers (N, 3) are in cells that were seen."""
+        """Return whether both ends of the links to receivers (N, 3) are in cells that were seen."""
         return self.tx_seen & (self.walks.partial.state_at(rx_m) == CellState.FREE)
 
 

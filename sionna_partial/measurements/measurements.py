@@ -153,7 +153,7 @@ class Measurements(Shown):
 
     @property
     def tx_known(self) -> NDArray[np.bool_]:
-        """Whether the position of each transmitter (N,) is known."""
+        """Return whether the position of each transmitter (N,) is known."""
         return np.asarray(np.isfinite(self.tx).all(axis=1))
 
     def require_transmitters(self) -> None:
@@ -167,7 +167,7 @@ class Measurements(Shown):
 
     @property
     def is_outage(self) -> NDArray[np.bool_]:
-        """Whether each link (N,) is an outage."""
+        """Return whether each link (N,) is an outage."""
         return self.gain_db <= OUTAGE_DB
 
 
@@ -457,7 +457,7 @@ def _measured(
 
 
 def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> Bools:
-    """Whether receivers (N, 3) [m] are neither in walls nor at one of the transmitters (K, 3) [m]."""
+    """Return whether receivers (N, 3) [m] are neither in walls nor at one of the transmitters (K, 3) [m]."""
     usable = clear_of_walls(partial, rx_m)
     for each_m in tx_m:
         usable &= np.linalg.norm(rx_m - each_m, axis=1) >= nearest_m(frequency_hz)

@@ -1,4 +1,4 @@
-"""Where a transmitter may stand, and the receivers that count: PartialMap -> PlacementArea."""
+"""Possible positions of a transmitter and weighted receivers: PartialMap -> PlacementArea."""
 
 import math
 from dataclasses import dataclass, replace
@@ -35,7 +35,7 @@ distance d. Fitted on made homes (other than those of `benchmarks/placement.py`)
 
 @dataclass(frozen=True, eq=False)
 class PlacementArea:
-    """Where a transmitter may stand, and weighted receivers.
+    """Possible positions of a transmitter, and weighted receivers.
 
     A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors: the mean over
     transmitter positions all over the free cells, so that no position gains by making the building seem larger. On a
@@ -63,7 +63,7 @@ class PlacementArea:
         return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
 
     def stands(self, positions_m: Floats) -> Bools:
-        """Whether a transmitter may stand at each of the positions (..., 3) [m]."""
+        """Return whether a transmitter may stand at each of the positions (..., 3) [m]."""
         return self.room.state_at(positions_m) == CellState.FREE
 
     def positions(self, seed: int) -> Floats:
@@ -170,7 +170,7 @@ def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m
 
 
 def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
-    """Whether each line (A B,) from A points to B others meets a wall, its unobserved length, and its length [m]."""
+    """Return whether lines (A B,) from A points to B others meet a wall, unobserved lengths and lengths [m]."""
     start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
     walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
     return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)

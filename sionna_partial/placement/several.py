@@ -124,7 +124,7 @@ def place_transmitters(
     count : int
         Number of transmitters K, up to 16.
     rx : (N, 3) array-like, optional
-        Receivers that count [m], with equal weights. By default those of `place_transmitter`.
+        Receivers that count [m], with equal weights. By default as in `place_transmitter`.
     threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
         As for `place_transmitter`.
 
@@ -189,7 +189,7 @@ def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
 
 
 def _covered(search: Search, area: PlacementArea, candidates_m: Floats) -> Bools:
-    """Whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
+    """Return whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
     links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
     gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [search.settings.seed])[1]

@@ -72,7 +72,7 @@ for (const tx of source.data.p_above.keys()) {
 }
 source.change.emit()
 """
-"""The error function is that of Abramowitz and Stegun, 7.1.26, with an error below 1.5e-7."""
+"""The error function follows Abramowitz and Stegun, 7.1.26, with an error below 1.5e-7."""
 
 _PAGE = """<!doctype html>
 <html lang="en">

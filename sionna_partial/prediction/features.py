@@ -237,7 +237,7 @@ class IndirectPaths:
 
 
 def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> float:
-    """Return the mean loss of the known wall cells of a map [dB], whose default material is that of the settings.
+    """Return the mean loss of the known wall cells of a map [dB]; the settings have the default material.
 
     It is `MOST_LOSS_DB` where no path goes through walls.
     """
@@ -318,7 +318,7 @@ def _possible_states(
 
 
 def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
-    """Whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
+    """Return whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
     crosses = np.zeros((2, len(rx_m)), dtype=bool)
     for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
         starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
@@ -331,7 +331,7 @@ def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
 
 
 def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
-    """Whether both ends of links (N,) are in different regions, and whether both are in one that is wholly observed."""
+    """Return whether the ends of links (N,) are in different regions, and whether both are in a wholly observed one."""
     state = np.pad(partial.wall_levels[0][1].state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
     regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
     observed = np.ones(count + 1, dtype=bool)
@@ -359,7 +359,7 @@ def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkFeatures(Shown):
-    """Features of N links, or T N: those of the paper (eq. 8), and what the other predictors need in addition.
+    """Features of N links, or T N: the features of the paper (eq. 8), and further inputs of the other predictors.
 
     Parameters
     ----------
@@ -375,7 +375,7 @@ class LinkFeatures(Shown):
         What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
         paper's predictor does not use it.
     frequency_hz : float, optional
-        Carrier frequency of the trace [Hz], from `link_features`. None is that of the predictor.
+        Carrier frequency of the trace [Hz], from `link_features`. None is the frequency of the predictor.
 
     Raises
     ------
@@ -435,7 +435,7 @@ class LinkFeatures(Shown):
         return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz)
 
     def free_space_shift_db(self, frequency_hz: float) -> float:
-        """Return how much stronger free space is at another frequency than at that of the links [dB]."""
+        """Return the free-space gain at another frequency less the gain at the frequency of the links [dB]."""
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
@@ -469,12 +469,12 @@ def context_of(phi: LinkFeatures) -> LinkContext:
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
-    """Return how much of the noise of walls is more than that of exact maps, 0 to 1."""
+    """Return the excess of the noise of walls over exact maps, 0 to 1."""
     return np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
 
 
 def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
-    """Change gains by so many dB, but not those of outages. `ops` is NumPy, or keras.ops for tensors."""
+    """Shift gains by some dB, except the gains of outages. `ops` is NumPy, or keras.ops for tensors."""
     return ops.where(gain_db > GAIN_FLOOR_DB, gain_db + shift_db, gain_db)
 
 

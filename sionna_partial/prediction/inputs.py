@@ -120,7 +120,7 @@ def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleT
     """Return the inputs (N, len(LINK_INPUTS)) of the link network of a frequency.
 
     `values` are from `feature_values`, or tensors in their place; `ops` is NumPy, or keras.ops for tensors. Free space
-    is stronger by `shift_db` at that frequency than at that of the links.
+    is stronger by `shift_db` at that frequency than at the frequency of the links.
     """
     gains_db = {name: shifted_gain_db(values[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
     free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops)

@@ -35,7 +35,7 @@ Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
 Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
-"""Names of the networks; those of maps are in the order of `CELLS_M`."""
+"""Names of the networks; map networks are in the order of `CELLS_M`."""
 
 MAP_FEATURES = 16
 """Number of values of a cell that the link network reads."""
@@ -165,7 +165,7 @@ def kind_of(networks: Networks) -> NetworkKind:
 
 
 def reads_maps(networks: Networks) -> bool:
-    """Whether there are map networks."""
+    """Return whether there are map networks."""
     return MAP_NETWORKS[0] in networks
 
 
@@ -229,7 +229,7 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
     """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
 
     `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
-    mean given LOS is that of free space or up to `_LOS_MOST_DB` more.
+    mean given LOS is the free-space gain or up to `_LOS_MOST_DB` more.
     """
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]

@@ -4,7 +4,7 @@ All of them are side by side in one functional model. Its inputs are the feature
 each (N, 1); its outputs, by name, are P(link state) given each partial link state (N, 3), mean and log-variance of the
 gain for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are
 scaled and clamped to the range of the training links inside the networks, so that nothing is extrapolated but an anchor
-of physics: the gain of the partial trace, or that of free space.
+of physics: the gain of the partial trace, or the free-space gain.
 """
 
 import itertools
@@ -73,7 +73,7 @@ class GainNetwork:
 
     @property
     def anchored_to_trace(self) -> bool:
-        """Whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
+        """Return whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
         return self.partial_states == (LinkState.LOS,) and "gain_db" in self.inputs
 
     def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> Floats:
@@ -219,7 +219,7 @@ def distribution_by_paper(
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `GAIN_INPUTS` and partial link states (N,).
 
-    Free space is stronger by `shift_db` at the frequency of the networks than at that of the links.
+    Free space is stronger by `shift_db` at the frequency of the networks than at the frequency of the links.
     Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
     inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, tf)}
@@ -356,7 +356,7 @@ def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
 
 
 def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> None:
-    """Set the weights of a logistic classifier to those of the smallest cross-entropy, a convex problem.
+    """Set the weights of a logistic classifier to the minimum of the cross-entropy, a convex problem.
 
     A slight penalty keeps weights finite where a straight line parts the classes.
     """

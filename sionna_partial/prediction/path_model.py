@@ -138,9 +138,9 @@ class PathModel:
     fraction : (Q,) float16 array
         Of the power of the paths of an analogue.
     excess_ns : (Q,) float16 array
-        Delay after that of the direct line [ns].
+        Excess delay over the direct line [ns].
     departure_rad, arrival_rad : (Q, 2) float16 arrays
-        Zenith and azimuth, from those of the direct line [rad].
+        Zenith and azimuth relative to the direct line [rad].
     """
 
     weights: tuple[Floats, ...]

@@ -62,7 +62,7 @@ SHIPPED = ("map", "paper")
 
 
 class TraceErrors(NamedTuple):
-    """How the trace of a nearly complete map differs from that of the building.
+    """Difference between the trace of a nearly complete map and the trace of the building.
 
     The depth of a link is how much weaker than free space it is traced [dB].
 
@@ -70,7 +70,7 @@ class TraceErrors(NamedTuple):
     ----------
     p_missed, missed_db, missed_std_db : float
         P(NLOS) of a traced outage, which falls to 1/e of this in `MISSED_RANGE_M`; mean and standard deviation of its
-        gain over that of an outage [dB].
+        gain over an outage [dB].
     p_blocked, blocked_db, blocked_std_db : float
         P(NLOS) of traced LOS; mean and standard deviation of the change of the gain [dB].
     p_opened : float
@@ -365,7 +365,7 @@ class Predictor(Shown):
 
     @property
     def reads_maps(self) -> bool:
-        """Whether it needs the windows of `link_features`."""
+        """Return whether it needs the windows of `link_features`."""
         return reads_maps(parts(self.model))
 
     @classmethod

@@ -80,7 +80,7 @@ def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Flo
 
 
 def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
-    """Whether the map is complete and at least one end of each link (N,) is known, so that nothing unknown is met."""
+    """Return whether each link (N,) meets nothing unknown: the map is complete and at least one end is known."""
     if not partial.is_complete:
         return np.zeros(len(end_m), dtype=bool)
     known = (partial.state_at(points_m) != CellState.UNKNOWN for points_m in (start_m, end_m))

@@ -47,7 +47,7 @@ _POINTS, _LENGTH_M = 96, 3.0
 """Number of points of a line at which the walls per metre are read, and the unit of lengths [m]."""
 
 _FIRST, _LEAST = -1.5, -4.0
-"""What walls per metre begin with in training, and the least number of walls, as logits of a softplus."""
+"""Initial walls per metre in training, and smallest number of walls, as logits of a softplus."""
 
 _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
 """Width of the unknown border around what is known [m]; cells at the border of an image that the network blurs, and
@@ -65,7 +65,7 @@ LOSS_OF_WALL, LARGEST_LOSS_DB = 0.78, 72.0
 power; and what many walls come near to [dB]: paths around them are the strongest there."""
 
 FOUND_WALLS = 0.43
-"""How many walls unseen reflections make up for, of links that are traced without LOS."""
+"""Number of walls that unseen reflections compensate, for links that are traced without LOS."""
 
 LOS_GAIN_DB = 2.0
 """By how much unseen reflections add to a link with LOS, for the square root of an expected wall."""
@@ -121,7 +121,7 @@ class UnseenWalls(NamedTuple):
     @classmethod
     @functools.cache
     def shipped(cls) -> Self:
-        """Return those of the package."""
+        """Return the shipped networks."""
         networks = cls.untrained()
         with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
             for name, network in networks._asdict().items():

@@ -24,7 +24,7 @@ class WallIndex(NamedTuple):
     """Square cells over a plan, row by row, and the wall pieces that may cross each.
 
     `grid` (5,) is the corner x0 and y0 and the edge of the cells [m], and the numbers of columns and rows. The pieces
-    of a cell are `piece` (E,) from `start` (B + 1,) of the cell to that of the next.
+    of a cell are `piece` (E,) from `start` (B + 1,) of the cell to `start` of the next.
     """
 
     grid: Floats

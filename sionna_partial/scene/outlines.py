@@ -256,7 +256,7 @@ def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int
 
 
 def _turns(points: NDArray[np.generic]) -> Bools:
-    """Whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
+    """Return whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
     step = np.diff(points.astype(np.float64), axis=0)
     return cross(step[1:], step[:-1]) != 0.0
 

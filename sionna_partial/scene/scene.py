@@ -68,13 +68,13 @@ class SceneGeometry:
     segments : (S, 2) int64 array
         Walls, as indices into `vertices_m`.
     open_end : (V,) bool array
-        Where a wall ends because observation did: what lies beyond is not free.
+        End of a wall because observation ended there: the space beyond it is not free.
     wall_material : (S,) int64 array
         Index of the material of each wall in `materials`; walls are in the order of their materials.
     materials : tuple of Material
-        The first is that of floor and ceiling.
+        The first is the material of floor and ceiling.
     top_m : (S,) float64 array
-        Height of each wall: `height_m`, or that of an obstacle below it [m].
+        Height of each wall: `height_m`, or the height of an obstacle below it [m].
     lids : tuple of Lid
         Tops of obstacles that enclose an area.
     floor_m : (R, 4) float64 array

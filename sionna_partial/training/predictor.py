@@ -97,7 +97,7 @@ def train(
         Fraction of the homes that is kept for testing, in [0, 1).
     settings : PredictorSettings, optional
         Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency, diffraction and paths
-        through walls must be those of the data set, and are by default; the seed splits the homes, too.
+        through walls must equal the settings of the data set, and do by default; the seed splits the homes, too.
     progress : bool or callable, optional
         As in `predict_map`.
 

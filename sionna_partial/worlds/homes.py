@@ -112,7 +112,7 @@ STYLES: dict[str, _Style] = {
     "hall": _Style(0, (200, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.02, layout=hall_layout),
     "warehouse": _Style(0, (300, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.01, layout=warehouse_layout),
 }
-"""The kinds of homes that can be made; areas are those of the outline. `frequency` is how often kind=None draws one."""
+"""The kinds of homes that can be made; areas are areas of the outline. `frequency` is how often kind=None draws one."""
 
 
 def make_home(
@@ -333,7 +333,7 @@ def _cores(piece: Polygon) -> list[Polygon]:
 def _connected(rng: Rng, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
     """Rooms that can be reached, their openings, and locked rooms.
 
-    Openings are those of a random spanning tree, which goes through corridors where it can, and some more.
+    Openings follow a random spanning tree, which goes through corridors where it can, with some additional ones.
     """
     jamb_m = _JAMB_M + style.wall / 2
     pairs = [(i, j) for i in range(len(rooms)) for j in range(i)]

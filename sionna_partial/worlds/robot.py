@@ -1,6 +1,6 @@
 """The exploring robot: frontiers between seen and unseen cells, its goals and routes, and what stops it.
 
-It is that of Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
+It follows Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
 degrees of turn, and a long-term goal every 25 steps. Its learnt policies are replaced by frontiers between seen and
 unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over what it has seen.
 """
@@ -200,7 +200,7 @@ class Robot:
         return made >= length / 2
 
     def _has_room(self, x: float, y: float, cell: tuple[int, int]) -> bool:
-        """Whether the robot fits at x, y, and gets there from a cell: not between walls that meet at a corner."""
+        """Return whether the robot fits at x, y, and gets there from a cell; walls that meet at a corner block it."""
         row, column = int(y), int(x)
         beside = self._roomy[row, cell[1]] or self._roomy[cell[0], column]
         return bool(self._roomy[row, column] and beside)

@@ -164,7 +164,7 @@ def _doubled_area(flat_m: Floats) -> Floats:
 
 
 def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Indices]:
-    """Cut triangles that have a width seen from above; the height of new corners is that of the triangle's plane."""
+    """Cut triangles that have a width seen from above; new corners are in the plane of their triangle."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
     pieces, index = shapely.get_parts(shapely.constrained_delaunay_triangles(parts[wide]), return_index=True)

@@ -146,7 +146,7 @@ def material_records(materials: Iterable[Material | None]) -> list[dict[str, Any
 
 
 def equal_fields(one: Any, other: Any) -> bool:
-    """Whether two objects of one dataclass, which may hold arrays, are equal."""
+    """Return whether two objects of one dataclass, which may hold arrays, are equal."""
     names = [field.name for field in fields(one) if field.compare]
     return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in names)
 

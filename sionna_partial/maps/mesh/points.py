@@ -120,7 +120,7 @@ def map_from_points(
     unit_m : float or None
         Length of a unit of the cloud [m], 0.3048 for feet; 1 by default. All other arguments are in metres.
     wall_height_m : float or None
-        Height of walls and ceiling [m]; by default that of the ceiling that was found, or 3.
+        Height of walls and ceiling [m]; by default the height of the ceiling that was found, or 3.
 
     Returns
     -------
@@ -167,7 +167,7 @@ def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None
 
 
 def is_cloud(path: Path) -> bool:
-    """Whether a PLY file has no faces."""
+    """Return whether a PLY file has no faces."""
     with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
         header, end, _ = stream.read(100_000).partition(b"end_header")
     return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
