@@ -131,19 +131,19 @@ class LinkModel:
     def _networks(self) -> Predictor | OtherPredictor:
         """The networks, which are read when they are first needed."""
         networks = warm_predictor(self.asked)
-        if isinstance(networks, Predictor) and not self._by_mean_losses:
+        if isinstance(networks, Predictor) and not self.by_mean_losses:
             warn_of_other_traces(networks, *self.simulation.resolved)
         return networks
 
     @property
-    def _by_mean_losses(self) -> bool:
+    def by_mean_losses(self) -> bool:
         """Return whether mean losses predict: the shipped networks were trained on opaque walls."""
         return self.asked is None and self.simulation.trace_settings.through_walls
 
     @cached_property
     def predictor(self) -> AnyPredictor:
         """The predictor of links that are not complete."""
-        if self._by_mean_losses:
+        if self.by_mean_losses:
             return MeanLosses(self._networks, self.partial)
         return self._networks
 

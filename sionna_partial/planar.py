@@ -20,6 +20,13 @@ def largest_part(mask: Bools) -> Bools:
     return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
 
 
+def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
+    """Return the largest value in each of the areas 0 to `count`, which `area` numbers. Faster than ndimage.maximum."""
+    largest = np.zeros(count + 1)
+    np.maximum.at(largest, area.ravel(), values.ravel())
+    return largest
+
+
 def grid_edges(cost: Floats) -> tuple[Indices, Floats]:
     """Pairs of neighbouring cells (2, E) of a grid, in eight directions, and what a step from one to the other costs.
 

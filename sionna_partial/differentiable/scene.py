@@ -158,12 +158,11 @@ class DifferentiableScene:
                 "scene has obstacles below the ceiling, which smooth lengths in walls do not know: give "
                 "dataclasses.replace(partial, obstacle=None)."
             )
-        by_losses = model.asked is None and self.simulation.trace_settings.through_walls
         remedy = (
             "the default prediction through walls has no gradients on a map that is not complete: give "
             "TraceSettings(refraction=False), or a predictor that was trained on paths through walls."
         )
-        require(self.partial.is_complete or not by_losses, "refraction", True, remedy)
+        require(self.partial.is_complete or not model.by_mean_losses, "refraction", True, remedy)
         self.predictor = Predictor.load(model.asked)
         if not self.partial.is_complete:
             warn_of_other_traces(self.predictor, *self.simulation.resolved)

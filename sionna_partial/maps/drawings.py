@@ -33,7 +33,7 @@ from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, Ma
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.rooms import largest_by_area
+from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000

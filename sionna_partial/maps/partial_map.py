@@ -22,6 +22,7 @@ from sionna_partial.maps.import_report import ImportReport, ImportSource, report
 from sionna_partial.maps.import_report import MapWarning as MapWarning
 from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.maps.wall_cells import wall_cells
+from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -514,9 +515,9 @@ def _has_unknown_room(state: States, resolution_m: float) -> bool:
     parts, count = ndimage.label(clear, np.ones((3, 3), dtype=bool))
     from_free = np.zeros(count + 1, dtype=bool)
     from_free[parts[clear & (state == CellState.FREE)]] = True
-    regions, _ = ndimage.label(unknown)
+    regions, count = ndimage.label(unknown)
     entered = np.unique(regions[unknown & from_free[parts]])
-    radii_m = ndimage.maximum(ndimage.distance_transform_edt(unknown), regions, entered) * resolution_m
+    radii_m = largest_by_area(ndimage.distance_transform_edt(unknown), regions, count)[entered] * resolution_m
     return bool(((entered == regions[0, 0]) | (radii_m >= ROOM_M)).any())
 
 

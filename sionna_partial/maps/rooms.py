@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
 
 MAX_ROOM_CELLS = 1_000_000
@@ -42,13 +42,6 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
     order = inside[np.argsort(-clearance.ravel()[inside], kind="stable")]
     openings, areas = _join(clearance.ravel(), order, clearance.shape[1], OPENING_RATIO, SMALLEST_RADIUS_CELLS)
     return Rooms(areas + len(openings), np.sort((2.0 * openings - 1.0) * resolution_m * factor))
-
-
-def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
-    """Return the largest value in each of the areas 0 to `count`, which `area` numbers. Faster than ndimage.maximum."""
-    largest = np.zeros(count + 1)
-    np.maximum.at(largest, area.ravel(), values.ravel())
-    return largest
 
 
 @njit(cache=True)

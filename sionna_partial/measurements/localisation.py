@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import log_ndtr, logsumexp
 
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
@@ -17,8 +17,6 @@ from sionna_partial.measurements.assimilation import FREE_P_POWERS, LIKELY_NOISE
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.predictor import LinkPrediction
 
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
 """Links from a position (3,) to others (N, 3) [m] -> their prediction without the antenna at the others, its gain
 (N,) [dB], and P(indoor) of the others (N,)."""

@@ -20,9 +20,8 @@ from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
-from sionna_partial.maps.rooms import largest_by_area
 from sionna_partial.maps.wall_cells import row_runs
-from sionna_partial.planar import span_in_strip
+from sionna_partial.planar import largest_by_area, span_in_strip
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
