@@ -84,8 +84,8 @@ def export_scene(
     partial: opt.PartialMap,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
-    settings = SceneSettings(material=opt.parse_material(material))
-    settings.material.require_frequency(frequency)
+    settings = SceneSettings(material=opt.parse_material(material) if material else None)
+    settings.traced_material.require_frequency(frequency)
     scene = sp.export_scene(partial, out, settings, frequency_hz=frequency)
     opt.print_files(scene.parent, [scene.name])
 

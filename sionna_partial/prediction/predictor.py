@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -143,6 +143,39 @@ class LinkPrediction(Shown):
     gain_nlos_mean_db: Floats
     gain_nlos_std_db: Floats
 
+    _materials: ClassVar[tuple[tuple[LinkPrediction, ...], Floats] | None] = None
+    """Distributions given each candidate for the material of walls, and their probabilities (K,), where unknown."""
+
+    @property
+    def by_material(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
+        """Distributions given each candidate for the material of walls, without residuals, and their weights (K,)."""
+        return self._materials or ((self,), np.ones(1))
+
+    @classmethod
+    def over_materials(
+        cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float = 0.0
+    ) -> LinkPrediction:
+        """Return the mixture over candidates for the material of walls, which is remembered.
+
+        `residual_db` is the standard deviation of gains about the trace with the true material [dB].
+        """
+        mixed = cls.mixture(parts, weights)
+        if residual_db:
+            probabilities, means_db, stds_db = mixed.by_state
+            stds_db[1:] = np.hypot(stds_db[1:], residual_db)
+            mixed = cls.of_parts(probabilities, means_db, stds_db)
+        if len(parts) > 1:
+            object.__setattr__(mixed, "_materials", (tuple(parts), weights))
+        return mixed
+
+    def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
+        """Return a change of this distribution, with the same change of those given each material."""
+        changed = change(self)
+        if self._materials is not None:
+            parts, weights = self._materials
+            object.__setattr__(changed, "_materials", (tuple(map(change, parts)), weights))
+        return changed
+
     @property
     def link_state(self) -> States:
         """Likeliest LinkState (N,)."""
@@ -242,19 +275,30 @@ class LinkPrediction(Shown):
 
         Outages stay, and no gain falls below the floor.
         """
-        probabilities, means_db, stds_db = self.by_state
         has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
-        means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
-        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        def amplified(links: LinkPrediction) -> LinkPrediction:
+            probabilities, means_db, stds_db = links.by_state
+            means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
+            return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        return self.mapped(amplified)
 
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
-        return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
+        return self.mapped(
+            lambda links: LinkPrediction(*(getattr(links, column.name)[index] for column in fields(links)))
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
         """Return the links of all `parts`, one part after the other."""
-        return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+        joined = cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+        materials = [part._materials for part in parts if part._materials is not None]
+        if len(materials) == len(parts) > 0:
+            under = tuple(map(cls.concatenate, zip(*(part for part, _ in materials), strict=True)))
+            object.__setattr__(joined, "_materials", (under, materials[0][1]))
+        return joined
 
     @classmethod
     def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
@@ -273,7 +317,9 @@ class LinkPrediction(Shown):
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
         """Return the same links in another shape, as (T, N)."""
-        return LinkPrediction(*(getattr(self, column.name).reshape(shape) for column in fields(self)))
+        return self.mapped(
+            lambda links: LinkPrediction(*(getattr(links, column.name).reshape(shape) for column in fields(links)))
+        )
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
@@ -660,7 +706,12 @@ class MeanLosses:
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links (N,)."""
-        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi))
+        return self.predict_each([phi])[0]
+
+    def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
+        """Predict the same links with several losses of walls."""
+        walls = self._walls.counts(features[0])
+        return [LinkPrediction.of_mean_losses(phi, walls) for phi in features]
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses

@@ -23,7 +23,7 @@ from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
 from sionna_partial.progress import part_of, reporting
-from sionna_partial.scene.scene import scene_settings_of
+from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
@@ -37,6 +37,9 @@ InvalidLinks = Literal["raise", "nan"]
 """Treatment of links that cannot be traced."""
 
 _log = logging.getLogger(__name__)
+
+UNKNOWN_MATERIAL_TOLERANCE_DB = 0.01
+"""`power_tolerance_db` by default where paths go through walls of an unknown material [dB]."""
 
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
@@ -76,6 +79,8 @@ class Simulation:
     scene_settings : SceneSettings
         As given, likewise.
     resolved : ResolvedSettings
+    material_unknown : bool
+        True where paths go through walls of which neither settings nor map give the material.
 
     Raises
     ------
@@ -104,6 +109,9 @@ class Simulation:
         self.trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
         self.scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
         self.resolved = resolved_settings(self.partial, self.trace_settings, self.scene_settings)
+        self.material_unknown = self.trace_settings.through_walls and material_is_unknown(
+            self.partial, self.scene_settings
+        )
         self._origin_m = np.array([*self.partial.origin_m, 0.0])
 
     def links(
@@ -453,9 +461,15 @@ def trace_links(
 def resolved_settings(
     partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings
 ) -> ResolvedSettings:
-    """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency."""
+    """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency.
+
+    With an unknown material, weak paths through drywall are kept: they may be the strongest through other walls.
+    """
+    unknown = trace_settings.through_walls and material_is_unknown(partial, scene_settings)
+    if unknown and trace_settings.power_tolerance_db is None:
+        trace_settings = replace(trace_settings, power_tolerance_db=UNKNOWN_MATERIAL_TOLERANCE_DB)
     scene_settings = scene_settings_of(partial, scene_settings)
-    for material in partial.environment.known_materials(scene_settings.material):
+    for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
     return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
 
