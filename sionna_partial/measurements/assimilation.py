@@ -23,7 +23,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.measurements.wall_evidence import LIKELY_STD_DB, STDS_DB, Residuals, log_std_prior, mean_square
+from sionna_partial.measurements.wall_evidence import FADINGS_DB, LIKELY_STD_DB, OTHERS_WEIGHT, OWN_WEIGHT, STDS_DB, Residuals, log_std_prior, mean_square
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -341,12 +341,6 @@ class _Compared(NamedTuple):
         correlation = _positive(links.correlation(sample.rx_m, kinds[0]))
         return cls(sample, links, materials, learnt, correlation)
 
-    @property
-    def noises_db(self) -> Floats:
-        """Standard deviations of single measurements to try [dB]."""
-        sizes = self.sample.size
-        return np.array([_root_mean(noise_db**2 * sizes) for noise_db in self.sample.noises_db().values()])
-
     def log_p(
         self, p_powers: float, weights: Floats, others: Sequence[Floats]
     ) -> tuple[Floats, Floats]:
@@ -363,23 +357,21 @@ class _Compared(NamedTuple):
                 *(each[:, received] for each in (residual_db, below_db, std_db)),
                 np.stack([kinds[kind].covariance for kinds in self.kinds]),
             )
-            parts.append(log_kind + residuals.log_evidence(self.noises_db))
+            parts.append(log_kind + residuals.log_evidence(np.hypot(FADINGS_DB, self._given_db)))
         evidence = np.stack(parts)
-        log_noise = [-0.5 * (math.log(each) / NOISE_SPREAD) ** 2 for each in self.noises_db / LIKELY_NOISE_DB]
-        log_prior = np.log(weights)[:, None, None] + log_std_prior() + (log_noise if len(log_noise) > 1 else 0.0)
+        log_prior = np.log(weights)[:, None, None] + log_std_prior()
         for other in others:
-            log_prior = log_prior + OTHERS_WEIGHT * _fitting(other, log_prior.shape)
+            log_prior = log_prior + OTHERS_WEIGHT * _fitting(other, len(weights))
         return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
 
     def fit(self, k: int, p: Floats) -> _Fit:
         """Fit the process under a candidate, given the probabilities (2, S, N) of kinds, process and noise."""
-        best = self._hypothesis(k, p)
-        fading_db = best.noise_db if self.sample.measured.std_db is None else 0.0
+        best, fading_db = self._hypothesis(k, p)
         return _Fit.of(best, self.sample.received, fading_db)
 
     def in_common(self, k: int, p: Floats) -> tuple[Floats, Floats]:
         """Return the offset and factor of the measurements under a candidate, as `_Hypothesis.in_common`."""
-        return self._hypothesis(k, p).in_common(self.sample.received)
+        return self._hypothesis(k, p)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
         """Return averages (P,) of the loss below free space, of the measured above the predicted, and of its spread."""
@@ -387,32 +379,35 @@ class _Compared(NamedTuple):
         levels = prior.gain_mean_db - free_db, sample.level_db - prior.gain_mean_db, prior.gain_std_db
         return sample.averaged(levels[0]), sample.averaged(levels[1]), sample.averaged(levels[2])
 
-    def _hypothesis(self, k: int, p: Floats) -> _Hypothesis:
-        """Return the most probable kind under a candidate, with the root mean squares of process and noise."""
+    @property
+    def _given_db(self) -> float:
+        """Root mean square of the standard deviations of the measurements, 0 where none are given [dB]."""
+        std_db = self.sample.measured.std_db
+        return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
+
+    def _hypothesis(self, k: int, p: Floats) -> tuple[_Hypothesis, float]:
+        """Return the most probable kind under a candidate, with the root mean squares of process and fading."""
         of_kind = p.sum(axis=(1, 2))
         number = int(of_kind.argmax())
         weights = p[number] if of_kind[number] > 0.0 else np.ones(p.shape[1:])
         process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
-        noise_db = mean_square(self.noises_db, weights.sum(axis=0))
+        fading_db = mean_square(FADINGS_DB, weights.sum(axis=0))
+        noise_db = float(np.hypot(fading_db, self._given_db))
         below_db, above_db, std_db = self._levels(self.materials[k])
         kind = self.kinds[k][number]._replace(trace_std_db=process_db)
         scale_db = np.hypot(std_db, process_db)
         residual = (above_db - kind.mean[0] - (kind.mean[1] - 1.0) * below_db) / scale_db
         design = np.stack([np.ones(len(residual)), below_db]) / scale_db
-        noise = noise_db / np.sqrt(self.sample.size) / scale_db
-        return _Hypothesis(0.0, kind, noise_db, design, self.correlation, residual, noise)
+        given_db2 = 0.0 if self.sample.measured.std_db is None else self.sample.averaged(self.sample.measured.std_db**2)
+        noise = np.sqrt((fading_db**2 + given_db2) / self.sample.size) / scale_db
+        return _Hypothesis(0.0, kind, noise_db, design, self.correlation, residual, noise), fading_db
 
 
-def _root_mean(values: Floats) -> float:
-    return math.sqrt(float(values.mean())) if len(values) else LIKELY_NOISE_DB
-
-
-def _fitting(log_evidence: Floats, shape: tuple[int, ...]) -> Floats:
-    """Average what the evidence (K, S, N) of another transmitter has in addition to a shape (K, S, N)."""
-    for axis, (own, other) in enumerate(zip(shape, log_evidence.shape, strict=True)):
-        if own != other:
-            log_evidence = logsumexp(log_evidence, axis=axis, keepdims=True) - math.log(other)
-    return log_evidence
+def _fitting(log_evidence: Floats, candidates: int) -> Floats:
+    """Return the evidence (K, S, N) of another transmitter, averaged over candidates that are not compared."""
+    if len(log_evidence) in (1, candidates):
+        return log_evidence
+    return logsumexp(log_evidence, axis=0, keepdims=True) - math.log(len(log_evidence))
 
 
 @read_only
@@ -444,7 +439,7 @@ class Assimilation(Shown):
     """
 
     noise_db: float
-    """Standard deviation of the measurements [dB]; the root mean square of those that were given."""
+    """Standard deviation of the measurements [dB]: of those that were given, and of fading."""
 
     offset_db: float
     """What the measurements have in common above the predicted gains [dB]."""

@@ -16,6 +16,12 @@ STDS_DB, LIKELY_STD_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 5.0, 0.4
 """Standard deviations of the process that are tried [dB], the most probable one before any measurement, and the
 standard deviation of its logarithm."""
 
+FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
+"""Standard deviations of what differs from receiver to receiver that are tried [dB]."""
+
+LIKELY_FADING_DB, FADING_SPREAD = 3.0, 0.5
+"""The most probable one before any measurement, and the standard deviation of its logarithm [dB]."""
+
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
 """Exponents of the evidence of a transmitter, and of other transmitters of the building: errors of a trace are
 correlated over more than the process has."""
@@ -60,9 +66,11 @@ class Residuals(NamedTuple):
 
 
 def log_std_prior() -> Floats:
-    """Return the log-probability (S, 1) of `STDS_DB`, but for a constant."""
+    """Return the log-probability (S, N) of `STDS_DB` and `FADINGS_DB`, but for a constant."""
     apart = np.log(np.array(STDS_DB) / LIKELY_STD_DB) / STD_SPREAD
-    return -0.5 * apart[:, None] ** 2
+    fading_apart = np.log(FADINGS_DB / LIKELY_FADING_DB) / FADING_SPREAD
+    log_prior: Floats = -0.5 * apart[:, None] ** 2 - 0.5 * fading_apart**2
+    return log_prior
 
 
 def mean_square(values: Floats, weights: Floats) -> float:
