@@ -165,6 +165,8 @@ class Walks:
         lengths_m = costs * self._step * self.partial.resolution_m
         graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
         cells, index = np.unique(self._cell_at(self.points_m), return_inverse=True)
+        if not len(cells):
+            return np.zeros((0, self._cost.size), dtype=np.float32)
         return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
 
     def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:

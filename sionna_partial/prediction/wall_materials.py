@@ -44,12 +44,15 @@ class WallMaterials:
         Probability of each candidate.
     names : tuple of K str
         The common material whose loss is nearest.
+    traced_db : float
+        Loss of a crossed wall of drywall [dB].
     """
 
     crossing_db: Floats
     reflection_db: Floats
     prior: Floats
     names: tuple[str, ...]
+    traced_db: float
 
     @classmethod
     @lru_cache(maxsize=16)
@@ -59,15 +62,21 @@ class WallMaterials:
         losses_db = np.geomspace(mean_db.min(), np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
         apart = np.log(losses_db[:, None] / mean_db)
         density = np.exp(-0.5 * (apart / SCATTER) ** 2) @ [*COMMON.values()]
-        crossing_db, reflection_db = np.meshgrid(losses_db - wall_loss_db(DRYWALL, frequency_hz), REFLECTIONS_DB)
+        traced_db = wall_loss_db(DRYWALL, frequency_hz)
+        crossing_db, reflection_db = np.meshgrid(losses_db - traced_db, REFLECTIONS_DB)
         prior = np.tile(density / density.sum(), len(REFLECTIONS_DB)) / len(REFLECTIONS_DB)
         nearest = [[*COMMON][at] for at in np.abs(apart).argmin(axis=1)]
-        return cls(crossing_db.ravel(), reflection_db.ravel(), prior, tuple(nearest * len(REFLECTIONS_DB)))
+        names = tuple(nearest * len(REFLECTIONS_DB))
+        return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
 
     def under(self, phi: LinkFeatures) -> list[LinkFeatures]:
         """Return the features of links under each candidate."""
         pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
         return [phi.with_extra_losses(*pair) for pair in pairs]
+
+    def attributes(self, weights: Floats) -> dict[str, str | float]:
+        """Return the attributes of a coverage map: the materials as a text, and the mean loss of a wall [dB]."""
+        return {"wall_material": self.text(weights), "wall_loss_db": float(weights @ self.crossing_db) + self.traced_db}
 
     def text(self, weights: Floats) -> str:
         """Return the probabilities (K,) of the candidates by material, the most probable first."""
