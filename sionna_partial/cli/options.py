@@ -196,7 +196,10 @@ def settings_of(
 ) -> dict[str, Any]:
     """Return settings of scene and trace by the names of arguments; with diffraction where it is the default."""
     trace = TraceSettings(frequency, max_depth, None if diffraction else False, refraction=through_walls)
-    return {"scene_settings": SceneSettings(material=parse_material(material) if material else None), "trace_settings": trace}
+    return {
+        "scene_settings": SceneSettings(material=parse_material(material) if material else None),
+        "trace_settings": trace,
+    }
 
 
 def _read_map(

@@ -72,6 +72,8 @@ def predict(
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
                 sp.save_coverage(coverage, folder / name)
+    if "wall_material" in coverage.attrs:
+        typer.echo(f"walls: {coverage.attrs['wall_material']}, mean loss {coverage.attrs['wall_loss_db']:.1f} dB")
     opt.print_files(out, names)
 
 

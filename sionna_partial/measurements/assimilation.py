@@ -23,7 +23,16 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.measurements.wall_evidence import FADINGS_DB, LIKELY_STD_DB, OTHERS_WEIGHT, OWN_WEIGHT, STDS_DB, Residuals, log_std_prior, mean_square
+from sionna_partial.measurements.wall_evidence import (
+    FADINGS_DB,
+    LIKELY_STD_DB,
+    OTHERS_WEIGHT,
+    OWN_WEIGHT,
+    STDS_DB,
+    Residuals,
+    log_std_prior,
+    mean_square,
+)
 from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -343,9 +352,7 @@ class _Compared(NamedTuple):
         correlation = _positive(links.correlation(sample.rx_m, kinds[0]))
         return cls(sample, links, materials, learnt, correlation)
 
-    def log_p(
-        self, p_powers: float, weights: Floats, others: Sequence[Floats]
-    ) -> tuple[Floats, Floats]:
+    def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
         """Return the log-posterior (2, K, S, N) of kinds, candidates, process and noise, and the evidence (K, S, N)."""
         received = self.sample.received
         below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))

@@ -55,7 +55,7 @@ class Residuals(NamedTuple):
                 scale_db = np.hypot(self.std_db[k], process_db)
                 rows = np.stack([self.residual_db[k], np.ones(len(root)), self.below_db[k]]) * (root / scale_db)
                 rows = rows @ vectors
-                spectrum = values + (noises_db**2 * np.mean(scale_db**-2.0))[:, None]
+                spectrum = values + (noises_db**2 * (scale_db**-2.0).sum() / max(len(root), 1))[:, None]
                 gram = np.einsum("np,ap,bp->nab", 1.0 / spectrum, rows, rows, optimize=True)
                 common = np.linalg.inv(covariance) + gram[:, 1:, 1:]
                 shift = gram[:, 1:, 0]

@@ -22,11 +22,17 @@ from sionna_partial.tracing.power import wall_loss_db
 COMMON = {"drywall": 0.4, "brick": 0.35, "concrete": 0.25}
 """Materials of walls and the prior probability of each."""
 
+MODELS_HZ = (1e9, 40e9)
+"""Frequencies that the models of all of them cover [Hz]."""
+
 SCATTER = math.log(1.7)
 """Standard deviation of the logarithm of the loss of walls of one material."""
 
 CROSSINGS, LARGEST_DB, REFLECTIONS_DB = 8, (21.0, 40.0), (0.0, 3.0)
-"""Number of losses of a wall that are compared, the limits of the largest one, and extra losses of a reflection [dB]."""
+"""Number of losses of a wall that are compared, limits of the largest one, and extra losses of a reflection [dB]."""
+
+BELOW = 1.3
+"""Ratio of the smallest mean loss of the common materials to the smallest loss that is compared."""
 
 RESIDUAL_DB = 6.0
 """Standard deviation of measured powers about a trace with the best material and offset: what maps lack [dB]."""
@@ -43,7 +49,7 @@ class WallMaterials:
     prior : (K,) float64 array
         Probability of each candidate.
     names : tuple of K str
-        The common material whose loss is nearest.
+        The `COMMON` material whose loss is nearest on a logarithmic scale.
     traced_db : float
         Loss of a crossed wall of drywall [dB].
     """
@@ -58,15 +64,16 @@ class WallMaterials:
     @lru_cache(maxsize=16)
     def at(cls, frequency_hz: float) -> "WallMaterials":
         """Return the candidates at a frequency [Hz]."""
-        mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], frequency_hz) for name in COMMON])
-        losses_db = np.geomspace(mean_db.min(), np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
+        covered_hz = min(max(frequency_hz, MODELS_HZ[0]), MODELS_HZ[1])
+        mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], covered_hz) for name in COMMON])
+        losses_db = np.geomspace(mean_db.min() / BELOW, np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
         apart = np.log(losses_db[:, None] / mean_db)
-        density = np.exp(-0.5 * (apart / SCATTER) ** 2) @ [*COMMON.values()]
+        density = np.exp(-0.5 * (apart / SCATTER) ** 2)
+        joint = np.tile(density / density.sum(axis=0) * [*COMMON.values()], (len(REFLECTIONS_DB), 1))
+        prior = joint.sum(axis=1) / len(REFLECTIONS_DB)
         traced_db = wall_loss_db(DRYWALL, frequency_hz)
         crossing_db, reflection_db = np.meshgrid(losses_db - traced_db, REFLECTIONS_DB)
-        prior = np.tile(density / density.sum(), len(REFLECTIONS_DB)) / len(REFLECTIONS_DB)
-        nearest = [[*COMMON][at] for at in np.abs(apart).argmin(axis=1)]
-        names = tuple(nearest * len(REFLECTIONS_DB))
+        names = tuple([*COMMON][at] for at in np.tile(np.abs(apart).argmin(axis=1), len(REFLECTIONS_DB)))
         return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
 
     def under(self, phi: LinkFeatures) -> list[LinkFeatures]:
@@ -80,6 +87,6 @@ class WallMaterials:
 
     def text(self, weights: Floats) -> str:
         """Return the probabilities (K,) of the candidates by material, the most probable first."""
-        sums = {name: float(weights @ [name == each for each in self.names]) for name in COMMON}
+        sums = {name: float(weights @ [name == near for near in self.names]) for name in COMMON}
         shown = sorted(((round(p, 2), name) for name, p in sums.items()), reverse=True)
         return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)
