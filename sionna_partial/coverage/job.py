@@ -126,7 +126,7 @@ class CoverageJob:
         if measured is not None and len(measured):
             attributes |= _measurement_attributes(measured, source)
         coverage = coverage_map(model.partial, grid, values, attributes)
-        weights = model.wall_materials.prior
+        weights = model.wall_materials.prior if model.simulation.material_unknown else np.ones(1)
         if source.assimilations:
             weights = source.weights @ [fitted.material_weights for fitted in source.assimilations]
         return coverage if posterior is None else with_posterior(coverage, posterior), weights

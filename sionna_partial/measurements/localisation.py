@@ -102,7 +102,8 @@ def locate_transmitter(
 
     Links are reciprocal: they are predicted from the measured positions to all others (`allowed` returns where one can
     be). A gain has the distribution that is predicted, and noise; at or below the sensitivity it is at most that.
-    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one.
+    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one. Where the
+    material of walls is unknown, its candidates are compared together with the positions.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
@@ -112,15 +113,17 @@ def locate_transmitter(
     if not len(possible):
         raise PositionError("a transmitter can be nowhere: no position is away from walls and measurements.")
     partial.require_positions("tx", points_m[possible])
-    log_p = np.zeros((len(OFFSETS_DB), len(possible)))
-    p_indoor = np.zeros(len(possible))
+    log_p, weights, p_indoor = np.zeros(()), np.ones(1), np.zeros(len(possible))
     for index, each_m in enumerate(some.rx):
         report(index / len(some), "comparing positions of the transmitter")
         prediction, antenna_db, indoor = predict(each_m, points_m[possible])
         p_indoor += indoor / len(some)
-        log_p += _log_likelihood(prediction, some.take(np.array([index])), antenna_db)
+        materials, weights = prediction.by_material
+        one = some.take(np.array([index]))
+        log_p = log_p + np.stack([_log_likelihood(each, one, antenna_db) for each in materials])
     walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
     log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
+    log_p = logsumexp(log_p + np.log(weights)[:, None, None], axis=0)
     log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
     joint = np.exp(log_p - logsumexp(log_p))
     posterior.probability.ravel()[possible] = joint.sum(axis=0)
