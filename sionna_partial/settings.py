@@ -1,6 +1,6 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated, Literal, get_args
 
 from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number
@@ -418,7 +418,6 @@ class DatasetSettings(Checked):
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
         remedy = "give SensorSettings(...), or 'mixed'."
         require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
-        object.__setattr__(self, "scene", replace(self.scene, material=self.scene.traced_material))
         self.scene.traced_material.require_frequency(self.trace.frequency_hz)
 
 

@@ -255,6 +255,6 @@ class TestPredictorSettings:
 
 def test_materials_by_name() -> None:
     assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete", thickness_m=0.2))  # type: ignore[arg-type]
-    assert Material.named("drywall") == SceneSettings().material
+    assert Material.named("drywall") == SceneSettings().traced_material
     with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, brick"):
         SceneSettings(material="cheese")  # type: ignore[arg-type]
