@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 from link_tables import make_dataset, make_table
 
-from sionna_partial.datasets.dataset_links import LinkTraces, open_links, require_like, settings_for
+from sionna_partial.datasets.shards import LinkTraces, open_links, require_like, settings_for
 from sionna_partial.errors import PredictorError
 from sionna_partial.settings import PredictorSettings
 

@@ -9,7 +9,7 @@ from predictor_links import QUIET, quick_predictor
 from sionna_partial.errors import SettingsError
 from sionna_partial.evaluation.evaluate import evaluate
 from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability
-from sionna_partial.plots.evaluation_plot import plot_reliability, plot_stages
+from sionna_partial.plots.result_plots import plot_reliability, plot_stages
 
 pytestmark = QUIET
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from sionna_partial.datasets.home_sources import HomeSource, home_sources
+from sionna_partial.datasets.home_links import HomeSource, home_sources
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.worlds.homes import make_home
 

@@ -23,16 +23,14 @@ PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("arrays", "constants", "errors", "checks", "display", "progress", "settings", "resources"),
+        *("arrays", "constants", "errors", "checks", "display", "settings", "resources"),
         *("process", "files", "planar", "llvm"),
     ),
     "maps": (
         *(
             "mesh.cut",
-            "mesh.mesh",
             "environment",
             "wall_cells",
-            "rooms",
             "import_report",
             "partial_map",
             "mesh.cells",
@@ -40,9 +38,9 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawing_units", "drawings", "ifc", "bags", "map_files"),
+        *("drawing_lines", "drawings", "ifc", "bags", "map_files"),
     ),
-    "worlds": ("furniture", "buildings", "homes", "camera", "robot"),
+    "worlds": ("buildings", "homes", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
@@ -64,16 +62,13 @@ ROOMS = {
     "networks": ("coverage.network",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
-    "placement": ("area", "placement", "several"),
+    "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
-    "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
-    "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
-    "evaluation": ("metrics", "baselines", "evaluate"),
+    "live": ("coverage", "topics"),
+    "datasets": ("link_table", "home_links", "shards", "home_process", "dataset"),
+    "evaluation": ("metrics", "evaluate"),
     "training": ("predictor", "paths", "walls"),
-    "plots": (
-        *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
-        *("material_plot", "placement_plot", "evaluation_plot"),
-    ),
+    "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
     "app": ("jobs", "uploads", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),

@@ -5,7 +5,7 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.calibration.material_fit import Posterior
-from sionna_partial.plots.material_plot import ANGLES_DEG, plot_calibration
+from sionna_partial.plots.result_plots import ANGLES_DEG, plot_calibration
 
 CONCRETE, BRICK = sp.Material(5.24, 0.6), sp.Material(3.9, 0.04)
 

@@ -10,7 +10,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
+from sionna_partial.placement.placement import CLEARANCE_M, PlacementArea, placement_area
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import TraceSettings
 

@@ -5,7 +5,7 @@ from placement_cases import placed
 
 from sionna_partial.errors import SettingsError
 from sionna_partial.placement.placement import TransmitterPlacement
-from sionna_partial.plots.placement_plot import plot_placement
+from sionna_partial.plots.result_plots import plot_placement
 from sionna_partial.plots.style import RED, figure_png
 
 

@@ -6,9 +6,9 @@ from typing import Any
 
 import pytest
 
-from sionna_partial import progress
+from sionna_partial import display
+from sionna_partial.display import counting, reporting
 from sionna_partial.errors import SettingsError
-from sionna_partial.progress import counting, reporting
 
 
 class Terminal(io.StringIO):
@@ -21,7 +21,7 @@ class Terminal(io.StringIO):
 @pytest.fixture
 def at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("WAIT_S", "COMMAND_WAIT_S", "LINE_S"):
-        monkeypatch.setattr(progress, name, 0.0)
+        monkeypatch.setattr(display, name, 0.0)
 
 
 def test_a_callable_is_called() -> None:

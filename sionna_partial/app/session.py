@@ -26,6 +26,7 @@ from sionna_partial.checks import Checked, Progress, Within, require, require_ch
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
 from sionna_partial.coverage.network import network_map
+from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
@@ -43,7 +44,6 @@ from sionna_partial.measurements.measurements import (
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.progress import part_of
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
 from sionna_partial.tracing.antennas import Antenna

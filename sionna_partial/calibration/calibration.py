@@ -33,11 +33,10 @@ from sionna_partial.calibration.measured_building import (
 )
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, part_of, reporting
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
-from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, simulation_of
@@ -58,7 +57,7 @@ _NUMBERS = (
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
+class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
     Of a scene of one material the parameters are numbers. Of a map with M materials they are arrays (M,): that of

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sionna_partial.channels.responses import ArrayPaths, require_memory
 from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
 from sionna_partial.constants import MEMORY_GB
+from sionna_partial.display import reporting
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import (
     atomic_files,
@@ -25,7 +26,6 @@ from sionna_partial.files import (
     require_plain_hdf5,
     write_netcdf,
 )
-from sionna_partial.progress import reporting
 from sionna_partial.tracing.links import TracedLinks
 
 Layout = Literal["sionna", "deepmimo"]

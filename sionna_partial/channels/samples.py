@@ -18,14 +18,13 @@ from sionna_partial.arrays import Floats, Indices, States, read_only
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.checks import Progress, require_memory, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.progress import reporting
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths, path_order

@@ -17,6 +17,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm import parse_address, parse_host_port
 
 from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
+from sionna_partial.datasets.home_links import Home, HomeSource, home_sources
 from sionna_partial.datasets.home_process import (
     HomeResult,
     HomeTask,
@@ -26,13 +27,11 @@ from sionna_partial.datasets.home_process import (
     settings_record,
     stop_homes,
 )
-from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, counting
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
 from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
-from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0

@@ -23,8 +23,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal
 
-from sionna_partial.datasets.home_links import home_links, home_sensor
-from sionna_partial.datasets.home_sources import HomeSource
+from sionna_partial.datasets.home_links import HomeSource, home_links, home_sensor
 from sionna_partial.datasets.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.files import temporary_folder

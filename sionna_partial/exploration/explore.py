@@ -14,12 +14,11 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Floats, States, read_only
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, reporting
 from sionna_partial.errors import MapError
 from sionna_partial.exploration.next_views import coverage_choice
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.progress import reporting
 from sionna_partial.settings import Policy, SensorSettings
 from sionna_partial.worlds.robot import Choice, Robot
 

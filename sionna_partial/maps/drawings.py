@@ -22,13 +22,15 @@ from sionna_partial.maps.drawing_lines import (
     LINE_TYPES,
     NO_WALL,
     PARTIAL_HEIGHT,
+    POSSIBLE_M,
     XREF,
     DrawnLines,
     Segments,
     opened,
     skip_reason,
+    unit_of,
+    wall_thickness,
 )
-from sionna_partial.maps.drawing_units import POSSIBLE_M, unit_of, wall_thickness
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M

@@ -17,10 +17,9 @@ from sionna_partial.checks import float_array, is_whole, number_of, real_array, 
 from sionna_partial.constants import DEFAULT_HEIGHT_M, DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.environment import FloorPlan, Mesh
+from sionna_partial.maps.environment import FloorPlan, Mesh, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
@@ -56,7 +55,7 @@ _RANK = np.argsort(_FREEST)
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
+class PartialMap(Pictured, plot="plots.style:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
 
     World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.

@@ -26,7 +26,6 @@ from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import extent_m
-from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import (
     BLUE,
     RED,
@@ -36,12 +35,13 @@ from sionna_partial.plots.style import (
     YELLOW,
     Figure,
     corners_m,
+    draw_map,
     figure_png,
     legend_below,
     sheet_columns,
     window_m,
 )
-from sionna_partial.worlds.camera import view_corners_m
+from sionna_partial.worlds.robot import view_corners_m
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 """Time of a frame of an animation, and of its last one [ms]."""

@@ -21,8 +21,7 @@ from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.environment import Mesh
-from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps.environment import Mesh, SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.maps.wall_cells import row_runs

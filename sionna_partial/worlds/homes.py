@@ -26,8 +26,19 @@ from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import largest_part
 from sionna_partial.settings import HomeKind
-from sionna_partial.worlds.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
-from sionna_partial.worlds.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
+from sionna_partial.worlds.buildings import (
+    GRID_M,
+    NEAR_M,
+    LayoutMaker,
+    Rng,
+    floor_layout,
+    furnish,
+    hall_layout,
+    log_uniform,
+    parts_of,
+    union_of,
+    warehouse_layout,
+)
 
 RESOLUTION_M = 0.05
 """Edge of a cell of the other kinds where none is given [m]."""

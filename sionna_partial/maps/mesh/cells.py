@@ -15,10 +15,9 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import Mesh
+from sionna_partial.maps.environment import Mesh, SceneMesh, height_pair
 from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
-from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.planar import largest_by_area, span_in_strip

@@ -25,9 +25,9 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, lies_in, read_bytes
+from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import looks_y_up
-from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
 

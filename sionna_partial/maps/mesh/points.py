@@ -23,6 +23,7 @@ from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, open_regular
+from sionna_partial.maps.environment import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,
@@ -35,7 +36,6 @@ from sionna_partial.maps.mesh.cells import (
     require_metres,
     warn_of_feet,
 )
-from sionna_partial.maps.mesh.mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.process import njit
 
