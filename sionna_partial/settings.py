@@ -435,12 +435,12 @@ class PredictorSettings(Checked):
     batch_size : int
         Links in such a step.
     learning_rate : float
-        Of Adam at the first such step; it falls to 0 along a cosine.
+        Learning rate of Adam at the first such step; it falls to 0 along a cosine.
     minimum_links : int
         A network of the paper with fewer links is not trained: it returns mean and standard deviation of those it has
         and of prior knowledge.
     seed : int
-        Of first weights and batches.
+        Seed of first weights and batches.
     through_walls : bool
         Whether the links were traced through walls.
 

@@ -1,4 +1,4 @@
-"""The page of the app: what a session has, drawn by Bokeh, and what is clicked, given to the session."""
+"""The page of the app: the state of a session drawn by Bokeh, and clicks that are handed to the session."""
 
 import functools
 import html
@@ -41,7 +41,7 @@ _TOOLTIPS = (
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
 _UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click, or the next drag would move what was clicked as well."""
+"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
@@ -122,7 +122,7 @@ TEMPLATE = """\
 
 
 class Page:
-    """What one window shows.
+    """Page of one window.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Page:
             document.add_root(model)
         document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
-    # What is made once
+    # Widgets
 
     def _make_picture(self) -> None:
         from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
@@ -345,12 +345,12 @@ class Page:
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
-        """Give what is chosen to a function; what is refused is shown."""
+        """Call a function with the chosen value; a refusal is shown."""
 
         def changed(_name: str, _old: Any, new: Any) -> None:
             if self._is_showing:
                 return
-            if new is None:  # a field was emptied: what it had comes back
+            if new is None:  # a field was emptied: its old value is shown again
                 self.show()
             else:
                 self._guarded(take, new)
@@ -372,7 +372,7 @@ class Page:
         except SionnaPartialError as error:
             self.session.refuse(error)
 
-    # What is clicked
+    # Callbacks
 
     def _on_points(self, _name: str, _old: Any, new: Any) -> None:
         if not self._is_showing:
@@ -405,10 +405,10 @@ class Page:
     def _change(self, **values: Any) -> None:
         self.session.change(self.session.chosen, **values)
 
-    # What changes
+    # Updates
 
     def show(self) -> None:
-        """Draw what the session has."""
+        """Draw the state of the session."""
         self._is_showing = True
         try:
             self._show_status()
@@ -421,7 +421,7 @@ class Page:
             self._is_showing = False
 
     def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
-        """Draw what has changed alone."""
+        """Draw changes only."""
         if self._drawn.get(name) != key:
             draw()
             self._drawn[name] = key
@@ -480,7 +480,7 @@ class Page:
         self._once("aims", (repr(aims),), functools.partial(setattr, self._aims, "data", aims))
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
-        if self.which.options != options:  # of several, first what a receiver gets
+        if self.which.options != options:  # of several transmitters, first the sum at a receiver
             self.which.options, self.which.value = options, options[0][0]
         self.layer.options = self._options(len(names))
         if self.layer.value not in [value for value, _ in self.layer.options]:

@@ -136,7 +136,7 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
         angle_deg : array-like
             Angle of incidence from the normal, 0 to 90 [degrees].
         polarisation : {"te", "tm"}
-            "te" is that of vertical antennas at walls.
+            "te" applies to vertical antennas at walls.
         which : int
             The material.
 
@@ -186,7 +186,7 @@ def calibrate_materials(
     Paths are traced once, and Sionna RT evaluates the sum of their powers for any material. The whole plane of
     permittivity and conductivity is searched, so that the result does not depend on the start; then Newton's method
     follows the derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their
-    posterior mean: where the measurements determine little, the likeliest material would follow the noise. The
+    posterior mean: where the measurements determine little, the most probable material would follow the noise. The
     thickness is fixed.
 
     Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged. Links of a partial map are used
@@ -296,7 +296,7 @@ def calibrate_materials(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Steps to the likeliest materials, the materials that are taken, and their posteriors; deviations are (2, M)."""
+    """Steps to the most probable materials, the materials taken, and their posteriors; deviations are (2, M)."""
 
     steps: list[Point]
     point: Point
@@ -336,7 +336,7 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
 def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats) -> Floats:
     """Return the standard deviations (2, M) of permittivities and conductivities.
 
-    A posterior is that of one material while the others stay as they are. Where there are others, the curvature of all
+    A posterior is of one material while the others stay as they are. Where there are others, the curvature of all
     together gives a lower bound.
     """
     own = np.stack(

@@ -67,7 +67,7 @@ def save_channels(
 
     ============ =================================================================================================
     `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
-                 where there is no path: what a generator of Sionna's `CIRDataset` yields. Responses have `h` (rx,
+                 where there is no path: as a generator of Sionna's `CIRDataset` yields them. Responses have `h` (rx,
                  rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
                  no path, of one transmitter.

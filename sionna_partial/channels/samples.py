@@ -1,4 +1,4 @@
-"""Draws of the channels of links on a partial map: what the paths may be in the building."""
+"""Draws of the channels of links on a partial map: paths that are possible in the building."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 UNSEEN = 255
-"""Interaction of paths through what was not seen, in place of Sionna RT's `InteractionType`."""
+"""Interaction of paths through unseen space, in the place of Sionna RT's `InteractionType`."""
 
 MOST_DRAWS = 10_000
 
@@ -143,7 +143,7 @@ class ChannelSamples(Shown):
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
     def _by_draw(self, found: xr.Dataset) -> xr.Dataset:
-        """Fold links, or transmitters, into draws and those of each draw."""
+        """Split the axis of links, or of transmitters, into draws and the links of a draw."""
         along = "link" if "link" in found.dims else "tx"
         if found.sizes[along]:
             folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
@@ -188,7 +188,7 @@ def sample_channels(
     n : int
         Number of draws, up to 10,000.
     seed : int
-        Of the draws, at least 0: equal seeds give equal draws.
+        Seed of the draws, at least 0: equal seeds give equal draws.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     trace_settings : TraceSettings, optional
@@ -312,7 +312,7 @@ class _Draws:
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Paths of some draws: those of certain links, the surviving and direct ones, and those of analogues."""
+        """Return the paths of some draws: of certain links, surviving and direct ones, and paths of analogues."""
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]

@@ -189,7 +189,7 @@ def _results(
 def _prepare(
     folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
 ) -> list[HomeTask]:
-    """Write or check the folder's `dataset.json`, remove what killed runs left, and return what is to be done."""
+    """Write or check the folder's `dataset.json`, remove the remains of killed runs, and return the tasks."""
     path, versions = folder / INDEX_FILE, installed_versions()
     homes = [source.record for source in sources]
     index = {"versions": versions, "settings": settings_record(settings), "homes": homes}
@@ -229,7 +229,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
 
 
 def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield what differs, what it was, and what it is. Homes may have been added."""
+    """Yield the name, the old and the new value of each difference. Homes may have been added."""
     for part in ("settings", "versions"):
         before, after = (dict(_leaves(index[part], part)) for index in (earlier, now))
         for name in sorted(before.keys() | after.keys()):

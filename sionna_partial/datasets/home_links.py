@@ -55,7 +55,7 @@ class HomeSource:
 
 
 def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
-    """Name the homes to build from, in their order; those of a folder in the order of their names.
+    """Name the homes to build from, in their order; homes of a folder in the order of their names.
 
     A map has the name of its file, or of its folder if the file is called map or scene.
     """
@@ -138,7 +138,7 @@ class _Positions:
 
 
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
-    """Trace the links of a complete home on what a robot has seen of it at every stage, and on the whole of it.
+    """Trace the links of a complete home on the map of a robot at every stage, and on the complete home.
 
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
     cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,

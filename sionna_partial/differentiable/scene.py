@@ -1,14 +1,14 @@
 """The predicted distribution as one differentiable function of transmitter, materials, frequency and network weights.
 
 Paths and their derivatives come from `tracing`, a `tf.custom_gradient` hands both to TensorFlow, and everything from
-there on, features and networks, is TensorFlow. At the position where links were traced the distribution is that of
-`Predictor.predict`; on a nearly complete map it is that of the networks alone.
+there on, features and networks, is TensorFlow. At the position where links were traced the distribution equals
+`Predictor.predict`; on a nearly complete map the networks alone give it.
 
-What gradients include, and what they do not:
+Limits of the gradients:
 
-- Paths are those of the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
+- Paths are taken from the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
   power in a step, which no derivative includes. Link states of the partial trace, the link states that the map leaves
-  possible, and whether the ends are in observed cells, are those of the trace too.
+  possible, and whether the ends are in observed cells, are taken from the trace, too.
 - The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
   the length is that of the trace times s(tx) / s(tx at the trace), and s is `SmoothLengths`: so are the lengths of all
   paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
@@ -65,7 +65,7 @@ from sionna_partial.tracing.path_set import PARAMETERS, PathSet
 from sionna_partial.tracing.simulation import Simulation
 
 WINDOW_STEP_M = CELLS_M[0] / 2
-"""How far from the transmitter further windows are drawn [m]."""
+"""Distance from the transmitter at which further windows are drawn [m]."""
 
 STEEPEST = 4.0
 """Largest ratio of the growth of a length to the growth of its smooth surrogate, as where it hardly touches a cell."""
@@ -110,7 +110,7 @@ class DifferentiableScene:
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        What is known of the building. The predictor of a link model is loaded anew, so that its weights may change.
+        Map of the building. The predictor of a link model is loaded anew, so that its weights may change.
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default. On a complete map it is not used.
     trace_settings : TraceSettings, optional
@@ -216,7 +216,7 @@ class DifferentiableLinks:
     Attributes
     ----------
     base : PathParameters
-        Where they were traced; its fields are the arguments of a call.
+        Values at which they were traced; its fields are the arguments of a call.
     """
 
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
@@ -241,7 +241,7 @@ class DifferentiableLinks:
         tx_m : (3,) tensor, optional
             Transmitter position [m].
         relative_permittivity, conductivity_s_m, thickness_m : (M,) tensors, optional
-            Of each of the scene's materials; [S/m] and [m].
+            Value of each of the scene's materials; [S/m] and [m].
         frequency_hz : () tensor, optional
             Carrier frequency of the trace [Hz]; ITU materials follow it.
 

@@ -134,7 +134,7 @@ def _add_patch(
 ) -> None:
     """Add what `_integrate` adds between two fractions of a segment that is in one patch there, by Simpson's rule.
 
-    What is integrated is quadratic in t, and the rule exact.
+    The integrand is quadratic in t, and the rule exact.
     """
     corner, right, up = corners[0, 0], corners[0, 1], corners[1, 0]
     twist = corners[1, 1] - right - up + corner

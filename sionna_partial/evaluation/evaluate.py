@@ -188,9 +188,9 @@ class Row:
     Parameters
     ----------
     homes : {"test", "train"}
-        Whether the predictor was trained on the homes of these links.
+        Homes of these links: the predictor was trained on "train" ones.
     receivers : {"indoor", "anywhere"}
-        Whether receivers were drawn indoors, or from the whole map area.
+        Receivers drawn indoors, or from the whole map area.
     stage : float
         Steps that the robot has explored; below 1, the fraction that it was to observe.
     ends_seen : {"all", "both", "one", "none"}
@@ -238,7 +238,7 @@ class Evaluation(Shown):
     rows : tuple of Row
     differences : tuple of Difference
     calibrations : mapping of float to Calibration
-        Of the predictor on test homes, receivers indoors, by stage of exploration.
+        Calibration of the predictor on test homes, receivers indoors, by stage of exploration.
     notes : tuple of str
         Remarks for the reader.
     """

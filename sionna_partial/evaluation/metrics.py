@@ -26,10 +26,10 @@ _NO_SPREAD_DB = 1e-6
 """A standard deviation below this is rounding [dB]."""
 
 LEAST_PROBABILITY = 1e-4
-"""Of the true link state in a likelihood: a map with errors excludes true states now and then."""
+"""Least probability of the true link state in a likelihood: a map with errors excludes true states now and then."""
 
 LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
-"""Of the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, and now and then wrong."""
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, but may be wrong."""
 
 DEFINITIONS = {
     "links": "number of links that were measured.",

@@ -1,4 +1,4 @@
-"""Robot simulator: a complete home -> what a robot has seen of it after so many steps."""
+"""Robot simulator: a complete home -> the maps of a robot after so many steps."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from sionna_partial.settings import Policy, SensorSettings
 from sionna_partial.worlds.robot import Choice, Robot
 
 MAX_STEPS = 100_000
-"""Largest number of actions: many times what a large building takes."""
+"""Largest number of actions: many times the number for a large building."""
 
 VAIN_STEPS = 1000
 """Number of actions without progress after which a robot stops trying to observe a fraction of the free area: errors of
@@ -113,7 +113,7 @@ def explore(
     policy: Policy = "random",
     tx: ArrayLike | None = None,
 ) -> list[PartialMap]:
-    """Send a robot through a home and return what it has seen at several moments.
+    """Send a robot through a home and return its map at several moments.
 
     The robot starts at a random free position and heading. Each step it moves towards a frontier between seen and
     unseen cells, or turns, and then looks: rays run through the cells to the first wall. Range, position and wall

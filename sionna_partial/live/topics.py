@@ -29,7 +29,7 @@ MOST_FRAMES = 1000
 """Number of frames outside the robot's chain that are kept, the newest ones of `/tf` and of `/tf_static`."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
-"""Types of what is published."""
+"""Types of published messages."""
 
 UPDATE_TYPE = "map_msgs/msg/OccupancyGridUpdate"
 UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
@@ -53,7 +53,7 @@ class Topics(Checked):
     key_values : str
         Topic of `diagnostic_msgs/KeyValue` with the name of a transmitter and its power; "" for none.
     unknown : bool
-        Whether the predictions for cells that the map does not know are published, with "/unknown" behind the topic.
+        Predictions for cells that the map does not know are published, too, with "/unknown" behind the topic.
 
     Raises
     ------

@@ -112,7 +112,7 @@ def opened(content: bytes) -> Any:
 class DrawnLines:
     """Lines of a drawing by layer. Blocks are read once, however often they are inserted.
 
-    `counts` is the number of entities on each layer (in lower case) by type, with those of blocks: entities on layer 0
+    `counts` is the number of entities on each layer (in lower case) by type, also of blocks: entities on layer 0
     of a block take the layer of their INSERT. `names` are the layers as they are written.
     """
 

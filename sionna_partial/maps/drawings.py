@@ -1,4 +1,4 @@
-"""DXF floor plans -> PartialMap: lines of the wall layers on cells, and what they enclose."""
+"""DXF floor plans -> PartialMap: lines of the wall layers on cells, and the areas that they enclose."""
 
 import math
 import os
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, States
+from sionna_partial.arrays import Bools, States, largest_by_area
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
@@ -35,7 +35,6 @@ from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, Ma
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
@@ -361,7 +360,7 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
 
 
 def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
-    """Cell states (ny, nx): walls, those of `solid` among them, what they enclose, and unknown cells."""
+    """Return the cell states (ny, nx): walls with the cells of `solid`, the area within, and unknown cells."""
     cell_m = empty.resolution_m
     corners = np.zeros((len(segments), 5, 2))
     corners[:, :2] = (segments - empty.origin_m) / cell_m

@@ -1,4 +1,4 @@
-"""Contents of a map: walls extruded from its cells (`FloorPlan`), or the triangles of a `SceneMesh` (`Mesh`).
+"""Contents of a map: walls extruded from its cells (`FloorPlan`), or triangles (`SceneMesh`).
 
 `PartialMap.environment` alone decides which of the two a map has. Another kind, such as voxels, takes a
 class like these, a way to write it in `scene.write_map`, and a way to find its paths in `tracing/finder.py`.
@@ -38,6 +38,8 @@ FLAT_M = 0.1
 DEGENERATE_M = 1e-6
 """Triangles lower than this over their longest edge have no direction, and are dropped [m]."""
 
+EnvironmentKind = Literal["plan", "mesh"]
+
 
 @read_only
 @dataclass(frozen=True, eq=False)
@@ -72,6 +74,11 @@ class SceneMesh(Shown):
     material: NDArray[np.uint8]
     materials: tuple[Material | None, ...] = (None,)
     height_range_m: tuple[float, float] | None = None
+
+    kind: ClassVar[EnvironmentKind] = "mesh"
+    is_extruded: ClassVar[bool] = False
+    suffixes: ClassVar[tuple[str, ...]] = (".npz",)
+    receivers_at_once: ClassVar[int] = 50_000
 
     def __post_init__(self) -> None:
         vertices = _vertices(self.vertices_m)
@@ -132,6 +139,49 @@ class SceneMesh(Shown):
         triangles = np.concatenate([self.triangles[whole], cut[wide]])[order]
         triangles, split = close_seams(vertices, triangles, count)
         return replace(self, vertices_m=vertices, triangles=triangles, material=self.material[source[order][split]])
+
+    def known_materials(self, default: Material) -> set[Material]:
+        """Return the materials of its triangles, as `FloorPlan.known_materials`."""
+        return set(self.scene_materials(default).values())
+
+    def scene_materials(self, default: Material) -> dict[str, Material]:
+        """Return the materials of its triangles by their names in its scene."""
+        used = np.unique(self.material).tolist()
+        return {f"material{index}": self.materials[index] or default for index in used}
+
+    def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
+        """Return the fields of a map with other materials, by their names in its scene."""
+        named = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.materials))
+        return {"mesh": replace(self, materials=named)}
+
+    def with_height(self, height_m: float) -> dict[str, Any]:
+        """Return the fields of a map on whose mesh radios may be up to a height above its lowest point [m]."""
+        low_m, _ = self._heights_m
+        return {"mesh": replace(self, height_range_m=(low_m, low_m + height_m))}
+
+    def scene_offset_m(self, bounds_m: tuple[float, float, float, float]) -> list[float]:
+        """Return the world position [m] of the origin of a scene in whole metres."""
+        (x0, y0, x1, y1), heights_m = bounds_m, self._heights_m
+        return [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), heights_m)]
+
+    def sheet(self, _image: str) -> dict[str, object]:
+        """Return its keys in the YAML of an exported scene, which has the triangles."""
+        return {"mesh": {"height_range": [*self._heights_m], "materials": material_records(self.materials)}}
+
+    def arrays(self) -> dict[str, Any]:
+        """Return its arrays in a map's `.npz`."""
+        return {
+            "mesh_vertices_m": self.vertices_m,
+            "mesh_triangles": self.triangles,
+            "mesh_material": self.material,
+            "mesh_materials": json.dumps(material_records(self.materials)),
+            "mesh_height_range_m": self._heights_m,
+        }
+
+    @property
+    def _heights_m(self) -> tuple[float, float]:
+        assert self.height_range_m is not None  # a mesh has it once it is built
+        return self.height_range_m
 
 
 def merged_mesh(
@@ -224,14 +274,12 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
 FAR_M = 1000.0
 """Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
 
-EnvironmentKind = Literal["plan", "mesh"]
-
 
 @dataclass(frozen=True)
 class FloorPlan:
     """Walls from floor to ceiling in all wall cells of a map, with the fields that a map has for them.
 
-    `is_extruded` is whether the cells show what a line at any height crosses. `suffixes` are those of the map files
+    `is_extruded`: the cells show the walls at any height. `suffixes` are the suffixes of the map files
     that can hold it, the usual one first. `receivers_at_once` is the number of receivers whose paths are found at once,
     which bounds the memory.
     """
@@ -251,7 +299,7 @@ class FloorPlan:
         return 0.0, self.wall_height_m
 
     def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials that it may need, `default` where it names none; those of floor and ceiling count."""
+        """Return the materials that it may need, also of floor and ceiling; `default` stands for unnamed ones."""
         return {default, *self.wall_materials}
 
     def scene_materials(self, default: Material) -> dict[str, Material]:
@@ -284,67 +332,6 @@ class FloorPlan:
             return {}
         records = json.dumps(material_records(self.wall_materials))
         return {"wall_material": self.wall_material, "wall_materials": records}
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Observed part of a mesh, with the methods of `FloorPlan`.
-
-    It has fewer paths than a floor plan, and costs rays for all receivers that are not found together.
-    """
-
-    mesh: SceneMesh
-
-    kind: ClassVar[EnvironmentKind] = "mesh"
-    is_extruded: ClassVar[bool] = False
-    suffixes: ClassVar[tuple[str, ...]] = (".npz",)
-    receivers_at_once: ClassVar[int] = 50_000
-
-    @property
-    def height_range_m(self) -> tuple[float, float]:
-        """Lowest and highest world z that a radio may have [m]."""
-        assert self.mesh.height_range_m is not None  # a mesh has it once it is built
-        return self.mesh.height_range_m
-
-    def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials of its triangles likewise."""
-        return set(self.scene_materials(default).values())
-
-    def scene_materials(self, default: Material) -> dict[str, Material]:
-        """Return them by their names in its scene."""
-        used = np.unique(self.mesh.material).tolist()
-        return {f"material{index}": self.mesh.materials[index] or default for index in used}
-
-    def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
-        """Return the fields of a map with other materials likewise."""
-        named = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.mesh.materials))
-        return {"mesh": replace(self.mesh, materials=named)}
-
-    def with_height(self, height_m: float) -> dict[str, Any]:
-        """Return the fields of a map on whose mesh radios may be up to a height above its lowest point [m]."""
-        low_m, _ = self.height_range_m
-        return {"mesh": replace(self.mesh, height_range_m=(low_m, low_m + height_m))}
-
-    def scene_offset_m(self, bounds_m: tuple[float, float, float, float]) -> list[float]:
-        """Return the world position [m] of the origin of a scene in whole metres."""
-        (x0, y0, x1, y1), heights_m = bounds_m, self.height_range_m
-        return [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), heights_m)]
-
-    def sheet(self, _image: str) -> dict[str, object]:
-        """Return its keys in the YAML of an exported scene, which has the triangles."""
-        return {
-            "mesh": {"height_range": [*self.height_range_m], "materials": material_records(self.mesh.materials)},
-        }
-
-    def arrays(self) -> dict[str, Any]:
-        """Return its arrays in a map's `.npz`."""
-        return {
-            "mesh_vertices_m": self.mesh.vertices_m,
-            "mesh_triangles": self.mesh.triangles,
-            "mesh_material": self.mesh.material,
-            "mesh_materials": json.dumps(material_records(self.mesh.materials)),
-            "mesh_height_range_m": self.mesh.height_range_m,
-        }
 
 
 def _whole_offset_m(low_m: float, high_m: float) -> float:

@@ -60,7 +60,7 @@ NAMES = {
     "wood": r"wood|timber|lumber|holz|\bbois",
     "metal": r"metal|steel|stahl|alumini|iron",
 }
-"""What names of materials contain, by our names for them; the first that fits counts."""
+"""Parts of the names of materials, by our names for them; the first that fits counts."""
 
 
 PANES = ("IfcWindow", "IfcCurtainWall")

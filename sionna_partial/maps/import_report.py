@@ -42,9 +42,8 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
     """
     factor = math.ceil(math.sqrt(free.size / MAX_ROOM_CELLS))
     if factor > 1:
-        shape = [size // factor * factor for size in free.shape]
-        blocks = free[: shape[0], : shape[1]].reshape(shape[0] // factor, factor, shape[1] // factor, factor)
-        free = np.asarray(blocks.all(axis=(1, 3)))
+        for axis, size in enumerate(free.shape):  # a block is free if all of its cells are
+            free = np.logical_and.reduceat(free, np.arange(0, size, factor), axis=axis)
     clearance = ndimage.distance_transform_edt(np.pad(free, 1)).astype(np.float32)
     inside = np.flatnonzero(clearance)
     order = inside[np.argsort(-clearance.ravel()[inside], kind="stable")]
@@ -133,7 +132,7 @@ class ImportReport(ImportSource, Shown):
     unit_m : float
         Length of a unit of the file [m].
     unit_source : str
-        Where the unit comes from: a header, an option, the file format, or a guess.
+        Source of the unit: a header, an option, the file format, or a guess.
     used, skipped : tuple of Elements
         Elements of the file by name or type, with their number, and the reason for which they were skipped.
     notes : tuple of str

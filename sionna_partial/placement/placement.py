@@ -39,7 +39,7 @@ _INDOOR_POSITIONS = 8
 
 _UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
 """Visibility falls as exp(-u / 4 m) with the unobserved length u; behind walls it is 0.8 exp(-d / 4 m) of that at the
-distance d. Fitted on made homes (other than those of `benchmarks/placement.py`) to predicted coverage at -100 dB."""
+distance d. Fitted on made homes (others than in `benchmarks/placement.py`) to predicted coverage at -100 dB."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ class PlacementArea:
         return replace(self, rx_m=self.rx_m[weight > 0.0], weight=weight[weight > 0.0])
 
     def visibility(self, positions_m: Floats, range_m: float = math.inf) -> Floats:
-        """How well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
+        """Return how well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
         walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
         seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
         seen *= np.where(walled, _WALL_FACTOR * np.exp(-distance_m / _WALL_LENGTH_M), distance_m <= range_m)
@@ -213,7 +213,7 @@ SIMILARITY_PENALTY = 0.6
 """Loss of score of a start that sees the same receivers as one that is chosen already."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
-"""Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
+"""The worst 5 % of the receivers, sorted by gain, count in full, and linearly less up to 15 %."""
 
 
 @read_only
@@ -307,7 +307,7 @@ def place_transmitter(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> TransmitterPlacement:
-    """Find the transmitter position that covers a partly known building best, as predicted from what is known.
+    """Find the transmitter position that covers a partly known building best, as predicted from its known part.
 
     Positions all over the free cells are compared by visibility, without tracing. The best of them that see different
     receivers are traced and predicted, as `predict_map` does. Around the best of these, neighbours at 0.6 and 0.25 m
@@ -329,7 +329,7 @@ def place_transmitter(
     tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m].
     seed : int
-        Of the positions that are compared.
+        Seed of the positions that are compared.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     scene_settings : SceneSettings, optional
@@ -462,7 +462,7 @@ class Search:
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> Floats:
-    """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
+    """Return the value of each link (N,) for the objective: P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
     return prediction.probability_above(settings.threshold_db)
@@ -479,7 +479,7 @@ def placement_score(values: Floats, weight: Floats, settings: PlacementSettings)
 
 
 def _counted(fraction: Floats) -> Floats:
-    """Integral of what the worst receivers count, from 0 to a fraction of them."""
+    """Return the integral of the weight of the worst receivers, from 0 to a fraction of them."""
     falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
     width = LAST_FRACTION - FULL_FRACTION
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)

@@ -1,4 +1,4 @@
-"""Pictures of an exploration: what the robot has seen, its trajectory and field of view, and where to drive next."""
+"""Pictures of an exploration: the map of the robot, its trajectory and field of view, and the next poses."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _PREDICTED = {
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw what the robot had seen at each step, with its trajectory and its field of view.
+    """Draw the map of the robot at each step, with its trajectory and its field of view.
 
     Parameters
     ----------

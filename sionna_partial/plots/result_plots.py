@@ -144,7 +144,7 @@ def _headline(placement: TransmitterPlacement) -> str:
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
-    """Part of the map that is drawn: what is known, and what counts (x0, x1, y0, y1) [m]."""
+    """Return the limits x0, x1, y0, y1 of the drawn part of the map: known cells and receivers that count [m]."""
     partial, half = placement.partial, 0.5 * placement.spacing_m
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
@@ -192,7 +192,7 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
 
     Left the loss after each step; in the middle the measured gains against those that are traced with the material of
     the start and with the calibrated one; right the loss of a reflection at walls, with two standard deviations to
-    either side, and that of the start: a panel for each material of a mesh.
+    either side, and of the start: a panel for each material of a mesh.
 
     Parameters
     ----------

@@ -105,7 +105,7 @@ _WIDTH_IN, _DPI = 6.4, 110
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
-    """Draw a map, and where radios would stand on it: whether it is the right way up is seen before predicting.
+    """Draw a map and the positions of radios on it, to check before predicting that it is the right way up.
 
     Positions outside the map are drawn, too.
 

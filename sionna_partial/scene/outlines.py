@@ -11,12 +11,10 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, cross
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import wall_cells
-from sionna_partial.planar import cross
-from sionna_partial.scene.lines import fit_runs
+from sionna_partial.maps.wall_cells import fit_runs, wall_cells
 
 _KEY = 1 << 32
 _LOOK_EDGES = 6
@@ -407,7 +405,7 @@ def _extended(outlines: Outlines, state: States) -> Points:
 def cut_by_material(outlines: Outlines, partial: PartialMap) -> tuple[Outlines, Indices]:
     """Cut outlines where the material of the wall cells changes, and sort them by material (S,).
 
-    A point of an outline is of the material of the nearest wall cell; what is shorter than a cell, of its neighbour.
+    A point of an outline has the material of the nearest wall cell; a piece shorter than a cell, of its neighbour.
     """
     count = len(outlines.segments)
     if partial.wall_material is None or not count:

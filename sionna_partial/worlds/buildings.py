@@ -50,7 +50,7 @@ def furnish(
 ) -> Iterator[Polygon]:
     """Yield furniture and pillars (they may overlap each other and the walls) that leave a room and its doors passable.
 
-    `room` is the outline through the middle of its walls, `walls` includes door leaves; `openings` are those of the
+    `room` is the outline through the middle of its walls, `walls` includes door leaves; `openings` are openings of the
     whole home. `clutter` is the mean number of things that are tried for every 4 m2, `pillars` the probability that
     a large room has some.
     """
@@ -143,14 +143,14 @@ _FAR_M = 1e3
 
 
 class Layout(NamedTuple):
-    """Rooms, through the middle of their walls, and what stands fixed in them: columns, machines, shelves [m]."""
+    """Rooms, through the middle of their walls, and fixed objects in them: columns, machines, shelves [m]."""
 
     rooms: list[Polygon]
     fixtures: list[Polygon]
 
 
 Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
-"""Draws what stands in a hall."""
+"""Draws the objects in a hall."""
 
 LayoutMaker = Callable[[Rng, float, float], Layout]
 """Draws a layout from the area of the building and a typical area of its small rooms [m2]."""
@@ -308,7 +308,7 @@ def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
 
 
 def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
-    """Blocks of shelves with aisles between; of some, only the legs and what lies on the floor is as low as a robot."""
+    """Blocks of shelves with aisles between; in some, only legs and goods on the floor are as low as a robot."""
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
     if inner.is_empty:
         return

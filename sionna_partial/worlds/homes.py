@@ -20,11 +20,10 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, largest_part
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.planar import largest_part
 from sionna_partial.settings import HomeKind
 from sionna_partial.worlds.buildings import (
     GRID_M,
@@ -148,7 +147,7 @@ def make_home(
     -------
     PartialMap
         Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture.
-        Nothing is missing (`is_complete`). Free cells are connected, but for those of locked rooms and of rooms behind
+        Nothing is missing (`is_complete`). Free cells are connected, except in locked rooms and in rooms behind
         closed doors, which some homes and many office floors have. Walls meet at least at the corners of cells.
 
     Raises

@@ -2,7 +2,7 @@
 
 It follows Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
 degrees of turn, and a long-term goal every 25 steps. Its learnt policies are replaced by frontiers between seen and
-unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over what it has seen.
+unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over the seen cells.
 """
 
 import math
@@ -14,10 +14,9 @@ from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, grid_edges, largest_part
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap, frontier_cells
-from sionna_partial.planar import grid_edges, largest_part
 from sionna_partial.process import njit
 from sionna_partial.settings import SensorSettings
 
@@ -99,7 +98,7 @@ def unknown_in_view(
 
 
 def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Floats:
-    """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
+    """Return the corners (N, 2) [m] of the view from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     range_cells = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
@@ -148,7 +147,7 @@ class _Walk(NamedTuple):
 def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-def]
     """Write what one picture reports into `view`, whose first cell is `corner` of the home: free up to the reading.
 
-    Where rays disagree about a cell, a wall counts (as in OctoMap).
+    A cell about which rays disagree counts as a wall (as in OctoMap).
     """
     (x, y), shift, angles, noise, range_cells = rays
     for ray in range(len(angles)):
@@ -359,7 +358,7 @@ class Robot:
         return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
 
     def _draw(self, frontiers: list[Frontier]) -> int:
-        """Draw a frontier, the likelier the more it promises for few steps."""
+        """Draw a frontier with a probability that grows with its promise for each step."""
         promises = [math.sqrt(len(each.cells)) / (self.steps_to(each) + _DECISION_STEPS) for each in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
         return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
@@ -459,7 +458,7 @@ def find_frontiers(
 
 
 def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
-    """Return those of at least a robot's width, or all if none is."""
+    """Return the frontiers of at least a robot's width, or all if none is."""
     return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
 
 

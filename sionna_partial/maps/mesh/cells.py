@@ -1,4 +1,4 @@
-"""SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and what has been observed of it."""
+"""SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and its observed area."""
 
 import math
 import os
@@ -11,16 +11,15 @@ import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, largest_by_area, span_in_strip
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import Mesh, SceneMesh, height_pair
+from sionna_partial.maps.environment import SceneMesh, height_pair
 from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
-from sionna_partial.planar import largest_by_area, span_in_strip
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
@@ -142,8 +141,7 @@ def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
     """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
-    environment = partial.environment
-    if not isinstance(environment, Mesh):
+    if partial.mesh is None:
         return partial
     row, start, end = row_runs(partial.state != CellState.UNKNOWN)
     cells = shapely.union_all(shapely.box(start, row, end, row + 1))
@@ -153,7 +151,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
         area = shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
     else:
         area = shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
-    return replace(partial, mesh=environment.mesh.within(area))
+    return replace(partial, mesh=partial.mesh.within(area))
 
 
 def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bools:
@@ -243,7 +241,7 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
 def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
-    What runs along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
+    A surface along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
     """
     ny, nx = cells.shape
     for index in range(len(polygons)):

@@ -66,7 +66,7 @@ LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
 """Height from which a layer may be the ceiling; heights below the floor and above the ceiling that count [m]."""
 
 WALL_FRACTION = 0.25
-"""Of the layers of the height band that its fuller cells (90 %) have, the fraction that makes a wall."""
+"""Fraction of the layers of the height band that makes a wall, relative to the layers of fuller cells (90 %)."""
 
 THIN_FRACTION = 0.5
 """Cells with certainly less than this fraction of the points of a cell beside them hold the noise of its wall."""
@@ -107,12 +107,12 @@ def map_from_points(
     points : (N, 3) array-like or path-like
         x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are left out.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
-        Where the sensor was, in the axes of the cloud [m]: what lies between it and a point is free as well.
+        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free as well.
     height_band_m : (float, float) or None
         z of the cloud between which points are walls [m], which also selects a storey. By default `DEFAULT_BAND_M`
         above the lowest floor.
     observed : (M, 2) array-like, PartialMap or None
-        What has been observed, as for the meshes of `load_map`. By default the cells that are free or wall as above.
+        The observed area, as for the meshes of `load_map`. By default the cells that are free or wall as above.
     resolution_m : float or None
         Edge of the cells [m], 0.05 by default.
     up : {"z", "y"} or None
@@ -479,7 +479,7 @@ def _beside(cells: Bools) -> Bools:
 
 @njit(cache=True)
 def _see_through(wall, targets, sensors, free):  # type: ignore[no-untyped-def]
-    """Mark what lies between a sensor and the cells that it sees (row, column) as free."""
+    """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):
         x0, y0 = sensors[sensor]
