@@ -11,6 +11,7 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 from sionna_partial.live.topics import UPDATE_TEXT, UPDATE_TYPE, Listener, Topics
 from sionna_partial.maps.bags import MAX_MESSAGE_BYTES
+from sionna_partial.resources import optional_packages
 
 HIGHEST_DOMAIN = 232
 """Domains that have ports."""
@@ -48,11 +49,9 @@ class Dds:
 
     def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
         number = _domain(domain)
-        try:
+        with optional_packages(SettingsError):
             from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
-        except ImportError as error:
-            raise SettingsError("DDS needs cyclonedds: pip install '.[live]' in the repository.") from error
         try:
             config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
             self._domain: Any = Domain(number, config)

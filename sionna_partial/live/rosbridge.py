@@ -13,6 +13,7 @@ from sionna_partial.checks import shown
 from sionna_partial.errors import SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 from sionna_partial.live.topics import Listener, Topics
+from sionna_partial.resources import optional_packages
 
 MAX_BYTES = 100_000_000
 """Largest message that is taken [bytes]."""
@@ -41,10 +42,8 @@ class Rosbridge:
     """
 
     def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
-        try:
+        with optional_packages(SettingsError):
             from websockets.uri import parse_uri
-        except ImportError as error:
-            raise SettingsError("rosbridge needs websockets: pip install '.[live]' in the repository.") from error
         try:
             good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
         except ValueError:  # a port that is none
