@@ -65,13 +65,14 @@ class Dds:
             for topic, kind in topics.types().items()
             for latched in ((True, False) if topic in (topics.map, "/tf_static") else (False,))
         ]
-        self._writers = {topic: (kind, self._writer(topic, kind)) for topic, kind in topics.published(names).items()}
+        self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer, reliably; who joins later gets the last one."""
-        for topic, message in self.topics.messages(answer).items():
-            kind, writer = self._writers[topic]
-            writer.write(filled(kind, message))
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._writers:
+                self._writers[topic] = self._writer(topic, kind)
+            self._writers[topic].write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
         """Hand messages to a `LiveCoverage`, for ever."""
