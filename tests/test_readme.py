@@ -165,7 +165,8 @@ def test_files_named_in_code_exist() -> None:
     for page in PAGES:
         if page.name == "experiments.md":  # scripts of earlier commits
             continue
-        for name in re.findall(r"\b(?:benchmarks|examples|scenes|sionna_partial)/[\w/]+\.\w+", page.read_text("utf-8")):
+        folders = r"\b(?:benchmarks|examples|scenes|sionna_partial)"
+        for name in re.findall(rf"{folders}/[\w/]+(?:\.\w+)+", page.read_text("utf-8")):
             assert (ROOT / name).exists(), f"{page.name} names {name}"
 
 
