@@ -180,8 +180,10 @@ class Page:
         ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
         plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self._values, **where}
+        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
         self._parts = {
-            name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
+            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below")
+            for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
         plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
@@ -244,7 +246,7 @@ class Page:
         self.fields = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[00]"),
-                functools.partial(self._change_field, name),
+                functools.partial(lambda name, value: self._change(**{name: float(value)}), name),
                 "value_throttled",
             )
             for name, title, step, low, high in (
@@ -391,9 +393,6 @@ class Page:
         if name in self.session.transmitters:
             self.session.chosen = name
         self.show()
-
-    def _change_field(self, name: str, value: float) -> None:
-        self._change(**{name: float(value)})
 
     def _change_antenna(self, name: str, value: Any) -> None:
         antenna = self.session.transmitters[self.session.chosen].antenna
@@ -623,10 +622,6 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
     return text + " Hatched: not observed."
-
-
-def _words(name: str) -> list[str]:
-    return {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}.get(name, [])
 
 
 def _state_words() -> Any:

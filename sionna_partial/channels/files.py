@@ -53,7 +53,7 @@ CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
 
 MAX_BYTES = 2**44
-"""Largest file that is opened [bytes]; it is read as far as it is used."""
+"""Largest file that is opened [bytes]; only the used parts are read."""
 
 
 def save_channels(

@@ -252,7 +252,7 @@ class Dds:
             self._writers[topic].write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage`, for ever."""
+        """Hand messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.poll(listener)
@@ -412,7 +412,7 @@ class Rosbridge:
             self._send(self._last[topic])
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage`, for ever."""
+        """Hand messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.connect(listener)

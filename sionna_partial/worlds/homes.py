@@ -140,7 +140,7 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
-        Whether the home may have free rooms that cannot be reached, behind closed doors too; the rest of it does not
+        True if the home may have free rooms that cannot be reached, also behind closed doors; the other rooms do not
         depend on it.
 
     Returns
