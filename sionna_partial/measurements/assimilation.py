@@ -16,7 +16,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr, logsumexp
 
-from sionna_partial.arrays import Bools, Floats, States, read_only
+from sionna_partial.arrays import Bools, Floats, States, grid_edges, read_only
 from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
@@ -33,7 +33,6 @@ from sionna_partial.measurements.wall_evidence import (
     log_std_prior,
     mean_square,
 )
-from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import FREQUENCIES_HZ
