@@ -323,7 +323,7 @@ def _hypotheses(
 class _Compared(NamedTuple):
     """Measurements of one transmitter through walls, under K candidates for their material.
 
-    `kinds` has the kinds of measurements of each candidate, `residuals` the received averages under each kind.
+    `kinds` has the kinds of measurements under each candidate; `correlation` (P, P) is the correlation of residuals.
     """
 
     sample: _Sample
@@ -362,7 +362,9 @@ class _Compared(NamedTuple):
             residuals = Residuals(
                 self.correlation[np.ix_(received, received)],
                 self.sample.size[received].astype(np.float64),
-                *(each[:, received] for each in (residual_db, below_db, std_db)),
+                residual_db[:, received],
+                below_db[:, received],
+                std_db[:, received],
                 np.stack([kinds[kind].covariance for kinds in self.kinds]),
             )
             parts.append(log_kind + residuals.log_evidence(np.hypot(FADINGS_DB, self._given_db)))
@@ -382,10 +384,10 @@ class _Compared(NamedTuple):
         return self._hypothesis(k, p)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
-        """Return averages (P,) of the loss below free space, of the measured above the predicted, and of its spread."""
-        sample, free_db = self.sample, self.links.free_space_db(self.sample.measured.rx)
-        levels = prior.gain_mean_db - free_db, sample.level_db - prior.gain_mean_db, prior.gain_std_db
-        return sample.averaged(levels[0]), sample.averaged(levels[1]), sample.averaged(levels[2])
+        """Return averages (P,) of the prior above free space, of the measured above the prior, and of its spread."""
+        averaged, free_db = self.sample.averaged, self.links.free_space_db(self.sample.measured.rx)
+        below_db, above_db = prior.gain_mean_db - free_db, self.sample.level_db - prior.gain_mean_db
+        return averaged(below_db), averaged(above_db), averaged(prior.gain_std_db)
 
     @property
     def _given_db(self) -> float:
@@ -429,6 +431,9 @@ class Assimilation(Shown):
     Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
     common are those that make the measurements likeliest. Where that offset is large, so that a real radio is behind
     them, what is predicted below the gain in free space is scaled, too.
+
+    Through walls of an unknown material there is a process for each candidate. Their evidence, with the evidence of
+    other transmitters, gives the probabilities of the candidates, and the deviations of process and fading.
 
     `predict_map` does this for a map; for single links, predict the measured links, and those that are wanted.
 
