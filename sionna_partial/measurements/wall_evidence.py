@@ -30,8 +30,9 @@ correlated over more than the process has."""
 class Residuals(NamedTuple):
     """Residuals of P averages of `size` (P,) measurements under K candidates.
 
-    `correlation` (P, P); residuals (K, P) less the expected common part, predictions above free space (K, P), and standard
-    deviations of the predictions without the process (K, P) [dB]; prior covariance (K, 2, 2) of offset [dB] and factor.
+    `correlation` (P, P); residuals (K, P) less the expected common part, predictions above free space (K, P), and
+    standard deviations of the predictions without the process (K, P) [dB]; prior covariance (K, 2, 2) of offset [dB]
+    and factor.
     """
 
     correlation: Floats
