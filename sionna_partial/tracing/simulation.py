@@ -38,9 +38,6 @@ InvalidLinks = Literal["raise", "nan"]
 
 _log = logging.getLogger(__name__)
 
-UNKNOWN_MATERIAL_TOLERANCE_DB = 0.01
-"""`power_tolerance_db` by default where paths go through walls of an unknown material [dB]."""
-
 SHORTEST_M = 0.011
 """Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
 
@@ -461,13 +458,7 @@ def trace_links(
 def resolved_settings(
     partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings
 ) -> ResolvedSettings:
-    """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency.
-
-    With an unknown material, weak paths through drywall are kept: they may be the strongest through other walls.
-    """
-    unknown = trace_settings.through_walls and material_is_unknown(partial, scene_settings)
-    if unknown and trace_settings.power_tolerance_db is None:
-        trace_settings = replace(trace_settings, power_tolerance_db=UNKNOWN_MATERIAL_TOLERANCE_DB)
+    """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency."""
     scene_settings = scene_settings_of(partial, scene_settings)
     for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
