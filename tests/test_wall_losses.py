@@ -18,6 +18,7 @@ from sionna_partial.prediction.unseen_walls import WALL_LOSSES
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
+DRYWALL = sp.SceneSettings(material="drywall")
 
 
 def half_seen() -> sp.PartialMap:
@@ -56,7 +57,7 @@ def test_walls_of_a_map_count_by_their_cells() -> None:
 
 
 def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
-    model = sp.LinkModel(half_seen(), trace_settings=WIFI)
+    model = sp.LinkModel(half_seen(), trace_settings=WIFI, scene_settings=DRYWALL)
     phi = model.features((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
     found = model.predict((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
     assert phi.unobserved_distance_m[0] == 0.0
@@ -92,7 +93,7 @@ def test_measured_powers_through_walls() -> None:
     home, tx, rng = all_seen(), (1.0, 2.0, 1.5), np.random.default_rng(0)
     rx = np.column_stack([rng.uniform(0.5, 7.5, 60), rng.uniform(0.5, 3.5, 60), np.full(60, 1.4)])
     rx = rx[(np.abs(rx[:, 0] - 4.05) > 0.2) & (np.linalg.norm(rx - tx, axis=1) > 0.3)]
-    model = sp.LinkModel(home, trace_settings=WIFI)
+    model = sp.LinkModel(home, trace_settings=WIFI, scene_settings=DRYWALL)
     power_dbm = model.predict(tx, rx).gain_mean_db + 17.0 + 2.0 * rng.standard_normal(len(rx))
     prior = model.predict(tx, rx[:20])
     assert (prior.gain_std_db == 0.0).any()
