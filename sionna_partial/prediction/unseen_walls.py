@@ -278,7 +278,8 @@ def _by_mean_losses(phi: LinkFeatures, walls: Floats, max_walls: int) -> tuple[F
     std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * context.wall_loss_db * np.sqrt(count) * near**2)
     ratio = (context.straight_walls + count) / max_walls
     around = np.where(ratio > 1.0, expit((AROUND_RATIO - ratio) / AROUND_SPREAD), 1.0)
-    linked = np.where(count == 0, phi.gain_db > GAIN_FLOOR_DB, around * ndtr((gain_db - GAIN_FLOOR_DB) / std_db))
+    around *= ndtr((gain_db - GAIN_FLOOR_DB) / std_db)
+    linked = np.where(count == 0, 1.0, around) * (phi.gain_db > GAIN_FLOOR_DB)
     p_los = np.where(los, probabilities[0], 0.0)
     joint = probabilities * linked * ((count > 0) | ~los)
     p_nlos = joint.sum(axis=0)
