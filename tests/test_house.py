@@ -40,7 +40,7 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawing_units", "drawings", "ifc", "bags", "map_files"),
+        *("drawing_lines", "drawing_units", "drawings", "ifc", "bags", "vacuum", "pictures", "map_files"),
     ),
     "worlds": ("furniture", "buildings", "homes", "camera", "robot"),
     "scene": ("lines", "outlines", "floor_plan", "scene"),

@@ -32,7 +32,7 @@ MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 MAX_WALL_MATERIALS = 255
-"""Most materials of the walls of a map, and most heights of obstacles, which a byte per cell counts."""
+"""Most materials of the walls of a map, heights of obstacles, and rooms, which a byte per cell counts."""
 
 FREE_STANDING_M = 2.5
 """Extent along x and y up to which walls that stand free are furniture [m]."""
@@ -88,6 +88,10 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
+    room : (ny, nx) uint8 array or None
+        Room of each free cell: k for `room_names[k - 1]`, 0 for none. Kept read-only, and 0 where the cell is not free.
+    room_names : tuple of str
+        At most 255 names that `room` counts, such as those of the segments of a vacuum robot's map.
     import_source : ImportSource or None
         Facts about the file that the map was read from, for `import_report`. Maps that differ in it alone are equal.
 
@@ -115,6 +119,8 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     wall_materials: tuple[Material, ...] = ()
     obstacle: NDArray[np.uint8] | None = None
     obstacle_heights_m: tuple[float, ...] = ()
+    room: NDArray[np.uint8] | None = None
+    room_names: tuple[str, ...] = ()
     import_source: ImportSource | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -139,13 +145,15 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         object.__setattr__(self, "wall_material", self._layer("wall_material", "wall_materials"))
         object.__setattr__(self, "obstacle_heights_m", _checked_heights(self.obstacle_heights_m))
         object.__setattr__(self, "obstacle", self._layer("obstacle", "obstacle_heights_m"))
+        object.__setattr__(self, "room_names", _checked_names(self.room_names))
+        object.__setattr__(self, "room", self._layer("room", "room_names", CellState.FREE))
 
-    def _layer(self, name: str, counted: str) -> NDArray[np.uint8] | None:
-        """Return the numbers of the wall cells as a new read-only array, None where all are 0."""
+    def _layer(self, name: str, counted: str, of: CellState = CellState.WALL) -> NDArray[np.uint8] | None:
+        """Return the numbers of the cells of a state as a new read-only array, None where all are 0."""
         values = getattr(self, name)
         if values is None:
             return None
-        if self.mesh is not None:
+        if self.mesh is not None and of == CellState.WALL:
             raise MapError(f"{name} is for floor plans: a mesh has walls of its own.")
         cells, count = grid_array(name, values, "iub"), len(getattr(self, counted))
         if cells.shape != self.shape:
@@ -153,7 +161,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         if cells.min() < 0 or cells.max() > count:
             what = f"{name} has values {cells.min()} to {cells.max()}, and {counted} has {count} entries"
             raise MapError(f"{what}: give one for each value from 1 on; 0 is the default.")
-        cells = np.where(self.state == CellState.WALL, cells, 0).astype(np.uint8)
+        cells = np.where(self.state == of, cells, 0).astype(np.uint8)
         cells.setflags(write=False)
         return cells if cells.any() else None
 
@@ -174,7 +182,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             window[inside] = cells[own]
             return window
 
-        names = "wall_material", "obstacle"
+        names = "wall_material", "obstacle", "room"
         layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
@@ -621,6 +629,16 @@ def _checked_materials(values: object) -> tuple[Material, ...]:
     if len(materials) > MAX_WALL_MATERIALS:
         raise MapError(f"wall_materials has {len(materials)} materials: give at most {MAX_WALL_MATERIALS}.")
     return materials
+
+
+def _checked_names(values: object) -> tuple[str, ...]:
+    """Return names of rooms as a tuple, or raise a MapError."""
+    names = tuple(values) if isinstance(values, tuple | list) else (values,)
+    if len({*names}) < len(names) or not all(isinstance(name, str) and name and name.isprintable() for name in names):
+        raise MapError(f"room_names = {shown(values)} is not allowed: give different texts of printable characters.")
+    if len(names) > MAX_WALL_MATERIALS:
+        raise MapError(f"room_names has {len(names)} names: give at most {MAX_WALL_MATERIALS}.")
+    return names
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:
