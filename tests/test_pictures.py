@@ -75,10 +75,10 @@ def test_threshold() -> None:
     ("shade", "resolution_m", "message"),
     [
         (plan(), None, "is a bare image without resolution and origin: give its YAML, such as"),
-        (plan(), None, "or resolution_m, the metres per pixel of a floor plan: a known length [m] over its number"),
+        (plan(), None, "or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"),
         (plan(), "0.02", "resolution_m = '0.02' is not allowed: give the metres per pixel"),
         (plan(), 1e-5, "resolution_m = 1e-05 is not allowed"),
-        (plan(), 0.002, "resolution_m = 0.002 makes walls that span 0.76 m: give the metres per pixel"),
+        (plan(), 0.002, "resolution_m = 0.002 makes walls that span 0.8 m: give the metres per pixel"),
         (np.full((50, 60), 9, np.uint8), 0.02, "has one shade alone: give a picture of walls"),
         (np.eye(200, dtype=np.uint8)[::-1] * 255, 0.02, "has walls that enclose nothing with resolution_m = 0.02"),
         (np.eye(9, dtype=np.uint8) * 255, 0.02, "has no connected walls longer than 0.5 m with resolution_m = 0.02"),

@@ -21,7 +21,6 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
 from sionna_partial.files import decoding, is_path, read_columns
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.vacuum import read_json
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 
 LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
@@ -314,6 +313,8 @@ def _read(
 
 def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
     """Return the received powers of an access point in a recording of Valeronoi, and their positions."""
+    from sionna_partial.maps.vacuum import read_json  # few measurements are recordings of robots
+
     raw, _, frame = read_json(path, "measurements", MeasurementError)
     with decoding(path, "no recording of Valeronoi", MeasurementError):
         rows = [row for row in raw["measurements"] if len(row["data"])]
