@@ -47,8 +47,8 @@ def predict_map(
     a receiver is indoors wherever a cell is free, and outdoors elsewhere.
 
     Receivers inside walls, within 1.1 cm of a wall or at the transmitter (within 1.1 cm, or within wavelength / 4 pi,
-    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables are NaN and link
-    states 255.
+    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables and link states
+    are NaN. A NetCDF file holds these link states as 255, its `_FillValue`.
 
     Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
     probabilities and gains are averaged over 8 positions drawn from it.
