@@ -45,7 +45,7 @@ format: $(READY) ## Format the code
 
 lock: $(READY) ## Lock the newest allowed dependencies from PyPI in requirements.lock
 	@env -u PIP_FIND_LINKS -u PIP_EXTRA_INDEX_URL PIP_CONFIG_FILE=/dev/null CUSTOM_COMPILE_COMMAND="make lock" \
-		$(BIN)/pip-compile --upgrade --extra dev --extra ifc --extra live --generate-hashes --allow-unsafe --strip-extras --quiet \
+		$(BIN)/pip-compile --upgrade --extra dev --extra all --generate-hashes --allow-unsafe --strip-extras --quiet \
 		--constraint constraints.txt --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --output-file requirements.lock pyproject.toml
 
 scenes: $(READY) ## Make the demo scenes again (scenes/)

@@ -8,6 +8,7 @@ from pkgutil import resolve_name
 from typing import Any, ClassVar
 
 from sionna_partial.checks import shown
+from sionna_partial.resources import optional_packages
 
 LONGEST = 240
 """Length of the longest line [characters]."""
@@ -20,7 +21,8 @@ _FEW = 4
 
 def later(name: str) -> Any:
     """Return a function of a later room, as "plots.map_plot:plot_map", whose module is imported by no result."""
-    return resolve_name(f"sionna_partial.{name}")
+    with optional_packages():
+        return resolve_name(f"sionna_partial.{name}")
 
 
 def picture_html(line: str, plot: str, value: object) -> str:

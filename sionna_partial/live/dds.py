@@ -11,6 +11,7 @@ from sionna_partial.errors import SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 from sionna_partial.live.topics import UPDATE_TEXT, UPDATE_TYPE, Listener, Topics
 from sionna_partial.maps.bags import MAX_MESSAGE_BYTES
+from sionna_partial.resources import optional_packages
 
 HIGHEST_DOMAIN = 232
 """Domains that have ports."""
@@ -48,11 +49,9 @@ class Dds:
 
     def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
         number = _domain(domain)
-        try:
+        with optional_packages(SettingsError):
             from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
-        except ImportError as error:
-            raise SettingsError("DDS needs cyclonedds: pip install '.[live]' in the repository.") from error
         try:
             config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
             self._domain: Any = Domain(number, config)
@@ -66,13 +65,14 @@ class Dds:
             for topic, kind in topics.types().items()
             for latched in ((True, False) if topic in (topics.map, "/tf_static") else (False,))
         ]
-        self._writers = {topic: (kind, self._writer(topic, kind)) for topic, kind in topics.published(names).items()}
+        self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer, reliably; who joins later gets the last one."""
-        for topic, message in self.topics.messages(answer).items():
-            kind, writer = self._writers[topic]
-            writer.write(filled(kind, message))
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._writers:
+                self._writers[topic] = self._writer(topic, kind)
+            self._writers[topic].write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
         """Hand messages to a `LiveCoverage`, for ever."""

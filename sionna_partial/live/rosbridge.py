@@ -13,6 +13,7 @@ from sionna_partial.checks import shown
 from sionna_partial.errors import SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 from sionna_partial.live.topics import Listener, Topics
+from sionna_partial.resources import optional_packages
 
 MAX_BYTES = 100_000_000
 """Largest message that is taken [bytes]."""
@@ -41,10 +42,8 @@ class Rosbridge:
     """
 
     def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
-        try:
+        with optional_packages(SettingsError):
             from websockets.uri import parse_uri
-        except ImportError as error:
-            raise SettingsError("rosbridge needs websockets: pip install '.[live]' in the repository.") from error
         try:
             good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
         except ValueError:  # a port that is none
@@ -52,13 +51,16 @@ class Rosbridge:
         if not good:
             raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
         self.url = self.source = url
-        self.topics, self._names = topics, names
+        self.topics, self._published = topics, topics.published(names)
         self._socket: Any = None
         self._last: dict[str, str] = {}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer; a server that starts again gets the last ones."""
-        for topic, message in self.topics.messages(answer).items():
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._published:
+                self._published[topic] = kind
+                self._advertise(topic)
             self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": message})
             self._send(self._last[topic])
 
@@ -88,14 +90,18 @@ class Rosbridge:
         listener.live.report(f"{self.url}: {reason}; it is tried again every {RETRY_S:g} s.")
 
     def _greet(self) -> None:
-        for topic, kind in self.topics.published(self._names).items():
-            self._send(json.dumps({"op": "advertise", "topic": topic, "type": _old(kind), "latch": True}))
+        for topic in [*self._published]:
+            self._advertise(topic)
         for topic, kind in self.topics.types().items():
             depth = 1 if topic == self.topics.map else 0
             request = {"op": "subscribe", "topic": topic, "type": _old(kind), "queue_length": depth}
             self._send(json.dumps(request))
         for text in [*self._last.values()]:
             self._send(text)
+
+    def _advertise(self, topic: str) -> None:
+        kind = _old(self._published[topic])
+        self._send(json.dumps({"op": "advertise", "topic": topic, "type": kind, "latch": True}))
 
     def _send(self, text: str) -> None:
         from websockets.exceptions import WebSocketException

@@ -71,8 +71,13 @@ class Topics(Checked):
         """Return the message type of each topic that is listened to."""
         types = {self.map: GRID_TYPE, f"{self.map}_updates": UPDATE_TYPE, "/tf": TF_TYPE, "/tf_static": TF_TYPE}
         types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32")
-        types |= {self.key_values: "diagnostic_msgs/msg/KeyValue"} if self.key_values else {}
+        types |= dict.fromkeys(filter(None, (self.key_values, self.transmitters)), "diagnostic_msgs/msg/KeyValue")
         return types | {f"{self.prefix}/request_views": "std_msgs/msg/Empty"}
+
+    @property
+    def transmitters(self) -> str:
+        """Topic of `diagnostic_msgs/KeyValue` with the name and the position of a transmitter: see `Listener`."""
+        return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
         """Return the message type of each topic that is published for transmitters of these names."""
@@ -80,13 +85,13 @@ class Topics(Checked):
         grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
         return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
 
-    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, dict[str, Any]]:
-        """Return the messages of an answer by topic."""
+    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Return the messages of an answer by topic, each with its type."""
         if isinstance(answer, LiveViews):
-            return {f"{self.prefix}/next_views": answer.message()}
+            return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
         topic = f"{self.prefix}/{answer.name}"
-        unknown = {f"{topic}/unknown": answer.message(unknown=True)} if self.unknown else {}
-        return {topic: answer.message()} | unknown
+        unknown = {f"{topic}/unknown": (GRID_TYPE, answer.message(unknown=True))} if self.unknown else {}
+        return {topic: (GRID_TYPE, answer.message())} | unknown
 
 
 class _Transform(NamedTuple):
@@ -98,7 +103,10 @@ class _Transform(NamedTuple):
 
 
 class Listener:
-    """Hands the messages of topics to a `LiveCoverage`, whatever they hold."""
+    """Hands the messages of topics to a `LiveCoverage`, whatever they hold.
+
+    The value of a transmitter is its position, "x y" or "x y z" [m]; an empty value removes it.
+    """
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
         self.live, self.topics = live, topics
@@ -122,6 +130,8 @@ class Listener:
                 live.on_power(message.data, now_s, topics.powers[topic])
             elif topic == topics.key_values:
                 live.on_power(float(message.value), now_s, message.key)
+            elif topic == topics.transmitters:
+                live.on_transmitter(message.key, [*map(float, message.value.split())] or None)
             else:
                 live.request_views()
         except Exception as error:  # messages may hold anything

@@ -12,8 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from rasterio.features import rasterize
-from rasterio.transform import Affine
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
@@ -25,6 +23,7 @@ from sionna_partial.checks import is_whole, require, require_bool, require_choic
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.planar import largest_part
+from sionna_partial.resources import optional_packages
 from sionna_partial.settings import HomeKind
 from sionna_partial.worlds.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
 from sionna_partial.worlds.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
@@ -377,6 +376,9 @@ def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineSt
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> States:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
+    with optional_packages():
+        from rasterio.features import rasterize
+        from rasterio.transform import Affine
     x0, y0, x1, y1 = shapely.total_bounds([plan.free, plan.shut])
     margin = _MARGIN_M + wall_cells * resolution_m
     x, y = x0 - margin, y0 - margin
