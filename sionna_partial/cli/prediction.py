@@ -1,5 +1,6 @@
 """Subcommands that predict: predict, network, channels, export-scene, explore, demo, info."""
 
+import math
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -9,7 +10,7 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_files, read_columns
 from sionna_partial.progress import part_of
@@ -26,25 +27,33 @@ COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 
 ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
 
+PICTURE = "coverage.png"
+"""Picture of a coverage map."""
+
 
 @opt.with_options
 def predict(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
     tx: Annotated[
-        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given.")
+        str,
+        typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given."),
     ] = "",
+    power: Annotated[float, typer.Option(help="Transmit power [dBm].")] = 20.0,
     tx_antenna: opt.TxAntenna = "iso",
     azimuth: opt.Azimuth = 0.0,
     tilt: opt.Tilt = 0.0,
+    threshold: Annotated[float, typer.Option(help="Received power that a receiver needs [dBm].")] = -67.0,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     settings: opt.Settings,
     predictor: opt.PredictorName = "",
     measurements: opt.Measured = None,
     column: opt.Columns = None,
+    access_point: opt.AccessPoint = None,
     receivers: Annotated[
-        str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
+        str,
+        typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage."),
     ] = "indoor",
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
@@ -54,6 +63,8 @@ def predict(
     position, antenna = opt.parse_position(tx) if tx else None, opt.parse_antenna(tx_antenna, azimuth, tilt)
     suffixes = [_parse_format(name) for name in formats]
     with opt.reporting_to(out, "loading the predictor") as report:
+        from sionna_partial.plots.style import figure_png
+
         coverage = sp.predict_map(
             partial,
             position,
@@ -62,7 +73,7 @@ def predict(
             spacing_m=spacing,
             predictor=predictor or None,
             **settings,
-            measurements=opt.read_measurements(measurements, column, position),
+            measurements=opt.read_measurements(measurements, column, position, access_point),
             receivers=receivers,
             memory_gb=memory,
             progress=part_of(report, 0.0, 0.9),
@@ -71,8 +82,25 @@ def predict(
         with atomic_files(out) as folder:
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
-                sp.save_coverage(coverage, folder / name)
+                if name == PICTURE:
+                    gain_db = min(max(threshold - power, GAIN_FLOOR_DB), 0.0)
+                    (folder / name).write_bytes(figure_png(sp.plot_coverage(coverage, threshold_db=gain_db)))
+                else:
+                    sp.save_coverage(coverage, folder / name)
+        area = coverage.radio.area(threshold, eirp_dbm=power)
     opt.print_files(out, names)
+    typer.echo(_covered(area, power) + (f"; open {out / PICTURE}" if PICTURE in names else ""))
+
+
+def _covered(area: Any, power_dbm: float) -> str:
+    """Return the covered fractions of each room, and in the last line of the floor, as a text."""
+    rows = zip(area.floor.values, area.fraction.values, strict=True)
+    parts = [(name, "none" if math.isnan(fraction) else f"{100 * fraction:.0f} %") for name, fraction in rows]
+    (_, observed), (_, every), *rooms = parts
+    what = f"above {area.threshold_dbm:g} dBm with probability {area.probability:g}"
+    text = f"{observed} of the observed floor, {every} of all, {what}, at {power_dbm:g} dBm"
+    listed = ", ".join(f"{name.replace('_', ' ')} {fraction}" for name, fraction in rooms)
+    return f"by room: {listed}\n{text}" if listed else text
 
 
 @opt.with_options

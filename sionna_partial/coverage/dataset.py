@@ -484,8 +484,9 @@ class CoverageAccessor:
         -------
         xarray.Dataset
             On `floor`, "observed" (free cells), "all" (each receiver weighted by the probability that it is indoors; 1
-            in free cells) and each room of the map that has a name: `fraction` with at least that probability, `fraction_mean`, the mean probability, and the
-            size `area_m2`; NaN where there is no such floor. Several transmitters are on `tx`.
+            in free cells) and each room of the map: `fraction` with at least that probability, `fraction_mean`, the
+            mean probability, and the size `area_m2`; NaN where there is no such floor. Several transmitters are on
+            `tx`.
 
         Examples
         --------

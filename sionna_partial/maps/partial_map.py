@@ -3,6 +3,7 @@
 import itertools
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -45,6 +46,9 @@ ROOM_M, BODY_M = 0.6, 0.3
 
 POCKET_M = 0.4
 """Edge of a square that an unknown region must hold for a robot to look into it [m]."""
+
+FAR_EXTENTS = 2.0
+"""Distance from the middle of a map, in its extents, from which a position is in another unit or of another map."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -395,8 +399,10 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         ]
         return np.asarray(np.any(found, axis=0))
 
-    def require_positions(self, name: str, points_m: object, *, least: int = 1) -> Floats:
-        """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
+    def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
+        """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
+
+        Messages call the argument `name`, and each position by its name in `names`, if there are any.
 
         Raises
         ------
@@ -409,9 +415,9 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         for fault, what, remedy in self._position_faults(flat):
             if fault.any():
                 index = int(np.argmax(fault))
-                which = name if points.ndim == 1 else f"{name}[{index}]"
+                which = name if points.ndim == 1 else names[index] if names else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
-                remedy += self._turned_hint(flat)
+                remedy += self._turned_hint(flat) or self._unit_hint(flat[index])
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
 
@@ -422,6 +428,19 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         for name, state in turns.items() if can_tell else ():
             if (PartialMap(state, self.resolution_m, self.origin_m).state_at(points_m) == CellState.FREE).all():
                 return f" All {len(points_m)} are free on the map {name}."
+        return ""
+
+    def _unit_hint(self, point_m: Floats) -> str:
+        """Ask for metres where a position (3,) far outside would be on the map in another unit."""
+        x0, y0, x1, y1 = self.bounds_m
+        if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
+            return ""
+        for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2)):
+            for scale in (np.full(3, factor), np.array([factor, factor, 1.0])):
+                meant = point_m * scale
+                if self.radios_can_stand(meant[None])[0]:
+                    text = ", ".join(f"{value:g}" for value in meant)
+                    return f" Did you mean metres? Taken for {unit} it is at ({text}) m."
         return ""
 
     def radios_can_stand(self, points_m: Floats) -> Bools:

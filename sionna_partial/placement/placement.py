@@ -19,7 +19,7 @@ from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.progress import reporting
-from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, nearest_m
 
 RECEIVERS = 120
@@ -123,6 +123,7 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitter(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     *,

@@ -24,7 +24,7 @@ from sionna_partial.placement.area import PlacementArea
 from sionna_partial.placement.placement import RECEIVERS, Search
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.progress import reporting
-from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation
 
 MOST_TRANSMITTERS = 16
@@ -97,6 +97,7 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitters(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,
