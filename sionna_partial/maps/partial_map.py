@@ -436,7 +436,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
             return ""
         for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2)):
-            for scale in (np.full(3, factor), np.array([factor, factor, 1.0])):
+            for scale in (np.array([factor, factor, 1.0]), np.full(3, factor)):
                 meant = point_m * scale
                 if self.radios_can_stand(meant[None])[0]:
                     text = ", ".join(f"{value:g}" for value in meant)
