@@ -32,7 +32,8 @@ docs: $(READY) ## Build the site, with its pages, notebooks and examples run (bu
 	@echo "the site is build/docs/index.html"
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
-	@$(ONE_THREAD) $(BIN)/python tests/hostile/attack.py --minutes 60 --table docs/hostile.md
+	@mkdir -p build
+	@$(ONE_THREAD) $(BIN)/python tests/hostile/attack.py --minutes 60 --table build/hostile.md
 
 lint: $(READY) ## Check style and types
 	@$(BIN)/ruff check .

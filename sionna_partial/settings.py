@@ -135,7 +135,7 @@ class Material(Checked):
 
         The names are the keys of `WALL_MATERIALS`, such as "drywall", the default, and the materials of ITU-R P.2040-3,
         with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
-        such walls: `docs/through_walls.md`.
+        such walls: `docs/walls.md`.
 
         Examples
         --------

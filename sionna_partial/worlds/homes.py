@@ -2,7 +2,8 @@
 
 A plan is drawn as polygons in metres: an outline, rooms, openings along a spanning tree of the rooms (so that every
 room can be reached) and a few more, and furniture that leaves room to walk. Then it is turned and put onto cells, where
-walls and furniture swell a little, as on maps of robots and scanners. `docs/homes.md` compares them with real homes.
+walls and furniture swell a little, as on maps of robots and scanners.
+`docs/researchers.md` compares them with real homes.
 """
 
 import math
@@ -34,7 +35,7 @@ RESOLUTION_M = 0.05
 LARGE_RESOLUTION_M = 0.1
 """Edge of a cell of the large kinds (floor, hall, warehouse) where none is given [m].
 
-That of the real floors in `docs/homes.md`; a building of 100 x 60 m has four times as many cells of 0.05 m."""
+The real floors of `docs/results.md` have it; a building of 100 x 60 m has four times as many cells of 0.05 m."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""
