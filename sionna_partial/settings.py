@@ -74,6 +74,10 @@ _Parameters = ParamSpec("_Parameters")
 _Result = TypeVar("_Result")
 
 
+_BY_CONDUCTIVITY = float("nan")
+"""Default of the exponent of a conductivity, which depends on that conductivity."""
+
+
 @dataclass(frozen=True, repr=False)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
@@ -114,13 +118,13 @@ class Material(Checked):
     conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
-    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] | None = None
+    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = _BY_CONDUCTIVITY
 
     def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.conductivity_exponent is None:
+        if self.conductivity_exponent is _BY_CONDUCTIVITY:
             is_drywall = self.itu is None and self.conductivity_s_m == DRYWALL_CONDUCTIVITY_S_M
             object.__setattr__(self, "conductivity_exponent", DRYWALL_CONDUCTIVITY_EXPONENT if is_drywall else 0.0)
+        super().__post_init__()
         if self.itu is not None:
             require_choice("itu", self.itu, ITU_BANDS_GHZ)
 

@@ -319,7 +319,7 @@ def write_mesh_scene(
 def constants_of(material: Material, frequency_hz: float) -> tuple[float, float]:
     """Return relative permittivity and conductivity [S/m] at a frequency (of ITU: ITU-R P.2040-3, eq. 28 and 29)."""
     if material.itu is None:
-        grown = (frequency_hz / CARRIER_FREQUENCY_HZ) ** (material.conductivity_exponent or 0.0)
+        grown = (frequency_hz / CARRIER_FREQUENCY_HZ) ** material.conductivity_exponent
         return material.relative_permittivity, material.conductivity_s_m * grown
     load_llvm()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
