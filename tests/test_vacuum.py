@@ -6,8 +6,10 @@ import re
 from pathlib import Path
 from typing import Any
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+import xarray as xr
 from vacuum_files import LEFT, PIXEL_CM, ROOMS, SIZE_CM, TOP, recording, valetudo_map, write_json, write_recording
 
 import sionna_partial as sp
@@ -145,6 +147,26 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
     with pytest.raises(MeasurementError, match=r"access_point = 'home' is for a recording \(\.vwm\) and not a CSV"):
         sp.load_measurements(tmp_path / "home.csv", access_point="home")
+
+
+def test_coverage_of_rooms(tmp_path: Path) -> None:
+    """Rooms are a variable of the coverage, and rows of its area."""
+    partial = sp.load_map(write_json(tmp_path / "home.json", valetudo_map()))
+    coverage = sp.predict_map(partial, {"a": (6.0, 8.0, 1.5), "b": (10.0, 8.0, 1.5)}, spacing_m=0.5)
+    assert coverage["room"].attrs["flag_meanings"] == "none bedroom kitchen"
+    np.testing.assert_array_equal(coverage["room"], partial.room)
+    area = coverage.radio.area(-65.0)
+    assert area.floor.values.tolist() == ["observed", "all", "bedroom", "kitchen"]
+    assert area.area_m2.sel(floor="kitchen", tx="b").item() == pytest.approx(25 * 0.25)
+    kitchen, bedroom = (area.fraction.sel(floor=name).values.tolist() for name in ("kitchen", "bedroom"))
+    assert kitchen[0] > kitchen[1]
+    assert bedroom[0] < bedroom[1]
+    sp.save_coverage(coverage, tmp_path / "coverage.nc")
+    xr.testing.assert_identical(sp.load_coverage(tmp_path / "coverage.nc"), coverage)
+    states = coverage["link_state"].isel(tx=0)
+    assert states.isnull().any()
+    assert states.plot().get_clim()[1] <= sp.LinkState.NLOS
+    plt.close("all")
 
 
 def test_position_of_an_access_point(tmp_path: Path) -> None:
