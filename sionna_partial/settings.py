@@ -4,7 +4,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, ParamSpec, TypeVar, get_args
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, get_args
 
 from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number, shown
 from sionna_partial.constants import (
@@ -527,7 +527,7 @@ class PlacementSettings(Checked):
 def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
     """Let a function answer a setting that was given as an argument with the settings that hold it."""
     parameters = inspect.signature(function).parameters
-    kinds = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
+    kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
     holders = {
         name: f"{argument}={kind.__name__}({name}=...)"
         for argument, kind in kinds.items()

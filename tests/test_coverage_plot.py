@@ -65,7 +65,7 @@ def test_the_likeliest_state_has_its_colour(coverage):
     assert panel.get_title() == "Likeliest link state"
     drawn = panel.images[0].to_rgba(at_receivers(panel, coverage))[..., :3]
     state = coverage["link_state"].to_numpy()[coverage["valid"].to_numpy()]
-    np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state])
+    np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state.astype(int)])
 
 
 def test_other_panels_show_their_variable_with_fixed_scales(coverage):

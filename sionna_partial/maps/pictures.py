@@ -12,7 +12,8 @@ from sionna_partial.arrays import Bools, Indices, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.drawings import POSSIBLE_M, states_of_lines
+from sionna_partial.maps.drawing_units import POSSIBLE_M
+from sionna_partial.maps.drawings import states_of_lines
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M
 from sionna_partial.maps.partial_map import PartialMap
@@ -43,7 +44,7 @@ def read_picture(path: Path, *, resolution_m: float | None = None) -> PartialMap
     wall = np.flipud(wall)
     wall = np.pad(wall, [(0, -size % factor) for size in wall.shape])
     ny, nx = (size // factor for size in wall.shape)
-    wall = wall.reshape(ny, factor, nx, factor).any(axis=(1, 3))
+    wall = np.asarray(wall.reshape(ny, factor, nx, factor).any(axis=(1, 3)))
     rows, columns = (np.flatnonzero(wall.any(axis=axis)) for axis in (1, 0))
     wall = np.pad(wall[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
     cell_m = factor * pixel_m

@@ -533,9 +533,7 @@ def bare_image(path: Path) -> MapError:
     """Return the error for an image without resolution."""
     remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
     if path.suffix.lower() != ".pgm":
-        remedy += (
-            ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its number of pixels"
-        )
+        remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"
     return MapError(f"path = '{path}' is a bare image without resolution and origin: {remedy}.")
 
 
