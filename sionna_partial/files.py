@@ -152,7 +152,7 @@ def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], stream: Any) 
 class _Sink(io.RawIOBase):
     """A raw stream for HDF5, which crashes where a disk fails: the error waits for `require_written`.
 
-    What is written after it is kept in memory.
+    Data that are written after it are kept in memory.
     """
 
     def __init__(self, stream: Any) -> None:

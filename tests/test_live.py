@@ -18,9 +18,8 @@ import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
-from sionna_partial.live.bags import replay
 from sionna_partial.live.coverage import LiveGrid, LiveViews
-from sionna_partial.live.topics import Listener, Topics
+from sionna_partial.live.topics import Listener, Topics, replay
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
 TX = (1.5, 1.5, 1.5)

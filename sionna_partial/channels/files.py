@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from sionna_partial.channels.responses import ArrayPaths, require_memory
 from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
 from sionna_partial.constants import MEMORY_GB
+from sionna_partial.display import reporting
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import (
     atomic_files,
@@ -26,7 +27,6 @@ from sionna_partial.files import (
     require_plain_hdf5,
     write_netcdf,
 )
-from sionna_partial.progress import reporting
 from sionna_partial.resources import optional_packages
 from sionna_partial.tracing.links import TracedLinks
 
@@ -53,7 +53,7 @@ CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
 
 MAX_BYTES = 2**44
-"""Largest file that is opened [bytes]; it is read as far as it is used."""
+"""Largest file that is opened [bytes]; only the used parts are read."""
 
 
 def save_channels(
@@ -69,7 +69,7 @@ def save_channels(
 
     ============ =================================================================================================
     `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
-                 where there is no path: what a generator of Sionna's `CIRDataset` yields. Responses have `h` (rx,
+                 where there is no path: as a generator of Sionna's `CIRDataset` yields them. Responses have `h` (rx,
                  rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
                  no path, of one transmitter.

@@ -15,8 +15,8 @@ from typer.core import TyperCommand
 import sionna_partial as sp
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
+from sionna_partial.display import reporting
 from sionna_partial.files import require_writable
-from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 GROUPS = {

@@ -23,6 +23,7 @@ from sionna_partial.checks import (
     float_array,
     no_progress,
     number_of,
+    reason_of,
     require,
     settings_or_default,
     shown,
@@ -33,16 +34,16 @@ from sionna_partial.errors import MapError, MeasurementError, PositionError, Set
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array, with_height
+from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 COARSER = 4
-"""Distance between the receivers of the first answer, in those of the final one."""
+"""Receiver spacing of the first answer, as a multiple of the spacing of the final one."""
 
 LATE_S = 30.0
-"""A map whose stamp is older than that of the last one by less is late and is dropped; by more, the robot's clock has
-started again [s]."""
+"""A map whose stamp is older than the last stamp by less is late and is dropped; by more, the robot's clock has started
+again [s]."""
 
 POSE_AGE_S = 2.0
 """Time for which the last pose of the robot counts as where it is [s]."""
@@ -61,12 +62,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LiveSettings(Checked):
-    """How live coverage is computed.
+    """Settings of live coverage.
 
     Parameters
     ----------
     frame : str
-        Frame in which the transmitters are given and maps are taken; "" is that of the first map.
+        Frame in which the transmitters are given and maps are taken; "" is the frame of the first map.
     threshold_db : float
         Path gain up to which a cell counts as not covered [dB].
     spacing_m, rx_height_m : float
@@ -106,7 +107,7 @@ class LiveGrid(NamedTuple):
     name : str
         The transmitter's.
     map_number : int
-        How many maps had been taken, with this one.
+        Number of maps that had been taken, including this one.
     is_final : bool
         False of the coarse answer, true of the fine one.
     coverage : xarray.Dataset
@@ -209,7 +210,7 @@ class _NewerMap(Exception):
 
 
 def _refusing(method: Callable[..., None]) -> Callable[..., None]:
-    """Log what a message is refused for, whatever it holds: a robot's message never ends the program."""
+    """Log the reason for which a message is refused: a robot's message never ends the program."""
 
     @functools.wraps(method)
     def take(self: "LiveCoverage", *given: Any, **named: Any) -> None:
@@ -352,7 +353,7 @@ class LiveCoverage:
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Compute what comes, until `close` and nothing waits."""
+        """Compute maps as they come, until `close` and nothing waits."""
         while self.step() or not self._closed:
             with self._changed:
                 if self._waiting is None and not self._closed:
@@ -365,7 +366,7 @@ class LiveCoverage:
         return thread
 
     def close(self) -> None:
-        """End `run` after what it computes and what waits."""
+        """End `run` after the current and the waiting map."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -389,7 +390,7 @@ class LiveCoverage:
         return grid is not None or views
 
     def report(self, line: str) -> None:
-        """Log what was refused, the same line once a minute."""
+        """Log a refusal, the same line once a minute."""
         now_s = time.monotonic()
         if now_s - self._lines_s.get(line, -math.inf) >= REPEATED_S:
             self._lines_s.pop(line, None)
@@ -422,10 +423,8 @@ class LiveCoverage:
         except _NewerMap:
             raise
         except Exception as error:  # whatever it is, the next map may be answered
-            known = isinstance(error, SionnaPartialError | OSError | MemoryError)
-            reason = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
             if what:
-                self.report(f"{what} not answered: {reason}")
+                self.report(f"{what} not answered: {reason_of(error)}")
 
     def _compute(self, grid: _Grid) -> None:
         if self._model is None:
@@ -493,15 +492,11 @@ class LiveCoverage:
         grid = self._newest
         assert grid is not None
         tx_m = np.stack([*self.tx_m.values()])
-        start = None if self._pose is None else _nearest_free(self._model.partial, self._pose[:2])
+        # the nearest free cell: a pose in a wall is an error of the robot's localisation
+        starts_m = [] if self._pose is None else [*nearest_free_m(self._model.partial, self._pose[:2])]
+        start = starts_m[0] if starts_m else None
         views = next_views(self._model, tx_m, start=start, threshold_db=self.settings.threshold_db)
         self._publish(LiveViews(views, grid.header))
-
-
-def _nearest_free(partial: PartialMap, at_m: tuple[float, float]) -> Floats | None:
-    """Return the middle of the nearest free cell [m]: a position in a wall is off by an error of the robot's."""
-    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
-    return free_m[np.hypot(*(free_m - at_m).T).argmin()] if len(free_m) else None
 
 
 def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:

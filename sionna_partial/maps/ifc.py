@@ -18,9 +18,9 @@ from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, read_bytes
 from sionna_partial.maps.drawing_lines import Segments
 from sionna_partial.maps.drawings import material_given, states_of_lines, with_materials
+from sionna_partial.maps.environment import MAX_TRIANGLES
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid
-from sionna_partial.maps.mesh.mesh import MAX_TRIANGLES
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.process import core_count
 from sionna_partial.resources import optional_packages
@@ -61,7 +61,7 @@ NAMES = {
     "wood": r"wood|timber|lumber|holz|\bbois",
     "metal": r"metal|steel|stahl|alumini|iron",
 }
-"""What names of materials contain, by our names for them; the first that fits counts."""
+"""Parts of the names of materials, by our names for them; the first that fits counts."""
 
 
 PANES = ("IfcWindow", "IfcCurtainWall")

@@ -113,7 +113,7 @@ def plot_coverage(
     coverage : xarray.Dataset
         From `predict_map`, or read from its NetCDF file.
     layers : sequence of str
-        A panel each: "link_state" (the likeliest), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
         three states mixed by their probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
@@ -211,7 +211,7 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
     """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
 
-    For a partial map it says that gains are of receivers indoors, unless they are of receivers anywhere.
+    For a partial map it states whether gains refer to receivers indoors or anywhere.
     """
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
@@ -240,7 +240,7 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states.
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend.
 
     They are to the right of the panels, or that fraction of the figure below them.
     """
@@ -249,8 +249,9 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
         where: dict[str, Any] = {"location": "right", "pad": 0.05}
         if pad_below:
             where = {"location": "bottom", "pad": pad_below, "shrink": 0.88}
+        extend = "neither" if layer.label == "probability" else "max"
         figure: Any = axes[0].figure
-        bar = figure.colorbar(colours, ax=axes, panchor=False, extend=_beyond(layer), **where)
+        bar = figure.colorbar(colours, ax=axes, panchor=False, extend=extend, **where)
         bar.set_label(layer.label)
         (x0, x1), (y0, y1) = axes[0].get_xlim(), axes[0].get_ylim()
         is_low = not pad_below and (y1 - y0) / (x1 - x0) < _LOW_ASPECT
@@ -259,10 +260,6 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
             bar.ax.yaxis.label.set(rotation=0, ha="left", va="center")
     elif layer.norm is None:
         _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
-
-
-def _beyond(layer: Layer) -> str:
-    return "neither" if layer.label == "probability" else "max"
 
 
 def _draw_triangle(key: Axes) -> None:
@@ -314,7 +311,7 @@ def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, 
 
 
 def wall_cells(coverage: xr.Dataset) -> Bools:
-    """Where walls are, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
+    """Return the walls, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
     merge = WALL_PARTS // fine
@@ -325,7 +322,7 @@ def wall_cells(coverage: xr.Dataset) -> Bools:
 
 
 def outside(coverage: xr.Dataset) -> Bools:
-    """Where nobody can be: the unknown cells of a complete map."""
+    """Return the unknown cells of a complete map, where no receiver can be."""
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
 
@@ -375,7 +372,7 @@ def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
-    """Name what is drawn; walls that only the first of several maps has are not observed in the others."""
+    """Return the legend of the map; walls that only the first of several maps has are not observed in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
     located = any("p_transmitter" in coverage for coverage in coverages)
     if located:
@@ -437,7 +434,7 @@ def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
 
 
 def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float) -> str:
-    """Return settings, covered area by received power, and what the numbers are worth."""
+    """Return settings, covered area by received power, and the accuracy of the numbers."""
     lines, attributes = [], coverage.attrs
     for (name, one), eirp_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]

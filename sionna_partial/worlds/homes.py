@@ -19,15 +19,25 @@ from scipy.sparse.csgraph import minimum_spanning_tree
 from shapely import LineString, Polygon, affinity, box
 from shapely.ops import split, substring
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, largest_part
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.planar import largest_part
 from sionna_partial.resources import optional_packages
 from sionna_partial.settings import HomeKind
-from sionna_partial.worlds.buildings import LayoutMaker, floor_layout, hall_layout, warehouse_layout
-from sionna_partial.worlds.furniture import GRID_M, NEAR_M, Rng, furnish, log_uniform, parts_of, union_of
+from sionna_partial.worlds.buildings import (
+    GRID_M,
+    NEAR_M,
+    LayoutMaker,
+    Rng,
+    floor_layout,
+    furnish,
+    hall_layout,
+    log_uniform,
+    parts_of,
+    union_of,
+    warehouse_layout,
+)
 
 RESOLUTION_M = 0.05
 """Edge of a cell of the other kinds where none is given [m]."""
@@ -130,14 +140,14 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
-        Whether the home may have free rooms that cannot be reached, behind closed doors too; the rest of it does not
+        True if the home may have free rooms that cannot be reached, also behind closed doors; the other rooms do not
         depend on it.
 
     Returns
     -------
     PartialMap
         Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture.
-        Nothing is missing (`is_complete`). Free cells are connected, but for those of locked rooms and of rooms behind
+        Nothing is missing (`is_complete`). Free cells are connected, except in locked rooms and in rooms behind
         closed doors, which some homes and many office floors have. Walls meet at least at the corners of cells.
 
     Raises
