@@ -41,6 +41,30 @@ if TYPE_CHECKING:
 _WIDTH_IN, _DPI = 9.0, 130
 _STAR: dict[str, Any] = STAR | {"markersize": 15}
 
+ANGLES_DEG = np.linspace(0.0, 85.0, 171)
+"""Angles of incidence at which reflections are drawn [degrees]."""
+
+LARGEST_LOSS_DB = 30.0
+"""Largest loss of a reflection that is drawn [dB]."""
+
+_LINE: dict[str, Any] = {"linewidth": 1.6}
+
+_PANELS = {
+    "accuracy": "accuracy of the link state",
+    "rmse_db": "RMSE of the path gain [dB]",
+    "rmse_linked_db": "RMSE without outages [dB]",
+}
+
+_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
+"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
+
+_STYLES: dict[str, dict[str, Any]] = {
+    "test": {"marker": "o", "linestyle": "-"},
+    "train": {"marker": "s", "linestyle": "--", "fillstyle": "none"},
+}
+
+_IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
+
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
     """Draw the map, the positions that were traced first, the refinement, and the best position with its coverage.
@@ -180,15 +204,6 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
     axis.plot(x, y, zorder=6, **_STAR)
 
 
-ANGLES_DEG = np.linspace(0.0, 85.0, 171)
-"""Angles of incidence at which reflections are drawn [degrees]."""
-
-LARGEST_LOSS_DB = 30.0
-"""Largest loss of a reflection that is drawn [dB]."""
-
-_LINE: dict[str, Any] = {"linewidth": 1.6}
-
-
 def plot_calibration(calibration: MaterialCalibration) -> Figure:
     """Draw a calibration of materials.
 
@@ -271,21 +286,6 @@ def _draw_reflection(axis: Axes, calibration: MaterialCalibration, which: int) -
 
 def _words(material: Material) -> str:
     return f"{material.relative_permittivity:.3g}, {material.conductivity_s_m:.2g} S/m"
-
-
-_PANELS = {
-    "accuracy": "accuracy of the link state",
-    "rmse_db": "RMSE of the path gain [dB]",
-    "rmse_linked_db": "RMSE without outages [dB]",
-}
-_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
-"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
-
-_STYLES: dict[str, dict[str, Any]] = {
-    "test": {"marker": "o", "linestyle": "-"},
-    "train": {"marker": "s", "linestyle": "--", "fillstyle": "none"},
-}
-_IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 
 
 def plot_stages(evaluation: "Evaluation") -> Figure:

@@ -44,6 +44,8 @@ _SERVERS = "tab20"
 _POINTS = 72
 """Pixels of a notebook for each inch of a figure."""
 
+_WIDTH_IN, _DPI = 6.4, 110
+
 
 class Figure(matplotlib.figure.Figure):
     """A figure that a notebook shows when a cell ends with it, although pyplot has no part in it."""
@@ -99,9 +101,6 @@ def server_colours(count: int) -> list[tuple[float, ...]]:
 def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:
     """Draw a legend below the axes, in one row by default."""
     figure.legend(handles=handles, loc="outside lower center", ncols=columns or len(handles), frameon=False)
-
-
-_WIDTH_IN, _DPI = 6.4, 110
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
