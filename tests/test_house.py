@@ -38,7 +38,7 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawings", "ifc", "bags", "map_files"),
+        *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "pictures", "map_files"),
     ),
     "worlds": ("buildings", "homes", "robot"),
     "scene": ("outlines", "floor_plan", "scene"),
