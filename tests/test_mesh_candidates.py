@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from extruded import blocks_of, drywall
-from mesh_rays import TURN, joined, load_meshes, shapes_of
+from extruded import blocks_of
+from mesh_rays import TURN, joined, load_meshes, opaque, shapes_of
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.mesh.candidates import MeshCandidates
-from sionna_partial.tracing.mesh.faces import group_planes
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.paths import Candidates
 
@@ -32,8 +32,8 @@ def candidates_of(
     **options: int,
 ) -> Candidates:
     shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
-    mesh = group_planes(*joined(*meshes)), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
-    parts = blocks_of(MeshCandidates(*mesh, shot, tx, rx, depth, drywall()).listed(np.zeros(len(rx)), **options))
+    kind = MeshReflections(opaque(*meshes), tx, rx, TraceSettings(max_depth=depth), shot)
+    parts = blocks_of(kind.listed(np.zeros(len(rx)), **options))
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
     assert depth == 0 or shares[-1] == 1.0
@@ -154,7 +154,7 @@ class TestRoom:
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole = candidates_of(scene, room(), TX, RX)
-        parts = candidates_of(scene, room(), TX, RX, receivers_per_part=50)
+        parts = candidates_of(scene, room(), TX, RX, sequences_at_once=50)
         for name in ("rx", "kind", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
@@ -177,5 +177,5 @@ class TestOpenMesh:
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
 
     def test_without_rays_there_is_line_of_sight(self) -> None:
-        kind = MeshCandidates(group_planes(*joined(self.TRIANGLE)), np.zeros(1, np.int64), [], TX, RX, 2, drywall())
+        kind = MeshReflections(opaque(self.TRIANGLE), TX, RX, TraceSettings(max_depth=2), [])
         assert [part.rx.tolist() for part, _ in blocks_of(kind.listed(np.zeros(len(RX))))] == [list(range(len(RX)))]
