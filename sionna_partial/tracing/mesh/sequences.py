@@ -1,8 +1,9 @@
 """The sequences of planes that rays from a transmitter meet.
 
 Between opaque faces, Mitsuba reflects many rays. Where faces let power through, every ray splits at every face into a
-reflected ray and one that goes on; few rays are followed, here, to the power that still matters. Opaque faces are
-faces of transmission 0, and splitting would find their sequences, too, but 30 times slower than Mitsuba.
+reflected ray and one that goes on; fewer rays are followed, here, down to the power that still matters. An opaque face
+is a face with transmission 0, where only the reflected ray is left: Mitsuba follows ten times as many of these rays in
+less time. Both fill the same tree.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -202,13 +203,6 @@ def _add_rays(sequences, size, added, face, leg, direction, plane_of):  # type: 
 
 
 @njit(cache=True)
-def _counted(sequences, size, rays):  # type: ignore[no-untyped-def]
-    """Return sequences with the size, and the number of further rays, that they have now."""
-    parent, plane, low, high, reach, left, table, _, before = sequences
-    return Sequences(parent, plane, low, high, reach, left, table, size, before + rays)
-
-
-@njit(cache=True)
 def _slot(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
     """Slot in the hash table of the sequence that adds the plane `last` to the sequence `node`, or where it belongs."""
     mask = np.uint64(len(table) - 1)
@@ -251,31 +245,31 @@ class _RayStack(NamedTuple):
 
 
 def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequences:
-    """Make the tree of the sequences of planes that `count` rays meet which split at all faces, by the power needed."""
+    """Make the tree of the sequences of planes that rays meet which split at all faces, down to the power needed."""
     boxes = links.mesh.tree.boxes
     low, high = np.minimum(boxes.low_m[0], links.tx_m), np.maximum(boxes.high_m[0], links.tx_m)
     far = float(np.linalg.norm(high - low)) + 1.0
-    return _split(_no_sequences(), lattice(np.arange(count), count).astype(np.float64), needed, links, far)  # type: ignore[no-any-return]
+    directions = lattice(np.arange(count), count).astype(np.float64)
+    sequences, size = _split(_no_sequences(), directions, needed, links, far)
+    return sequences._replace(size=size, rays=count)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
 def _split(sequences, directions, needed, links, far):  # type: ignore[no-untyped-def]
-    """Add the sequences of rays in some directions (R, 3); no line within the mesh is longer than `far`."""
+    """Add the sequences of rays in some directions (R, 3), and count them; no line in the mesh is longer than `far`."""
     room, size = MOST_FACES * (links.limits.reflections + 1), sequences.size
     stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
-    for i in range(len(directions)):
-        for axis in range(3):
-            stack.value[0, axis], stack.value[0, 3 + axis] = links.tx_m[axis], directions[i, axis]
-        gain = gain_towards(links.gains, directions[i, 0], directions[i, 1], directions[i, 2])
+    for direction in directions:
+        stack.value[0, :3], stack.value[0, 3:6] = links.tx_m, direction
+        gain = gain_towards(links.gains, direction[0], direction[1], direction[2])
         stack.value[0, 6], stack.value[0, 7] = 0.0, gain
         stack.number[0, 0], stack.number[0, 1], stack.number[0, 2] = -1, 0, 0
         top = 1
         while top > 0:
-            sequences = (
-                _with_room(sequences, size, MOST_FACES) if size + MOST_FACES > len(sequences.parent) else sequences
-            )
+            if size + MOST_FACES > len(sequences.parent):
+                sequences = _with_room(sequences, size, MOST_FACES)
             size, top = _go_on(sequences, size, stack, top - 1, needed, links, far)
-    return _counted(sequences, size, len(directions))
+    return sequences, size
 
 
 @njit(cache=True)
