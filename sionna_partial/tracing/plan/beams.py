@@ -15,8 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
-from sionna_partial.planar import span_in_strip
+from sionna_partial.arrays import Floats, span_in_strip
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, bin_points, grow
 
