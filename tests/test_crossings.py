@@ -12,7 +12,7 @@ import sionna_partial as sp
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.plan.diffraction import find_wedges
+from sionna_partial.tracing.plan.edges import find_wedges
 from sionna_partial.tracing.power import transmission_coefficients
 from sionna_partial.tracing.simulation import resolved_settings
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths

@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 
+SHORTEST_LEG_M = 0.0101
+"""Sionna RT drops paths with legs of 1 cm or less."""
+
 
 @dataclass(frozen=True)
 class SolvedPaths:
@@ -260,6 +263,13 @@ class Candidates:
         kind, face = widened(self.kind, depth, 0), widened(self.face, depth, -1)
         vertices_m = widened(self.vertices_m, depth, 0.0)
         return replace(self, kind=kind, face=face, vertices_m=vertices_m, same_wall=same_wall)
+
+    def narrowed(self) -> "Candidates":
+        """Return them without the last columns, which none of them uses."""
+        used = max(1, int((self.kind > 0).sum(axis=1).max(initial=0)))
+        same_wall = None if self.same_wall is None else self.same_wall[:, :used]
+        columns = {name: getattr(self, name)[:, :used] for name in ("kind", "face", "vertices_m")}
+        return replace(self, **columns, same_wall=same_wall)
 
     def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""

@@ -38,8 +38,7 @@ from sionna_partial.tracing.mesh.sequences import (
     rehash,
     view_sequences,
 )
-from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
+from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates
 from sionna_partial.tracing.power import (
     COSINES,
     ISOTROPIC,
