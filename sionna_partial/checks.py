@@ -30,6 +30,12 @@ def no_progress(fraction: float, message: str) -> None:
     """Report nothing."""
 
 
+def reason_of(error: Exception) -> str:
+    """Return the message of an expected error; of any other error, its type and message."""
+    known = isinstance(error, SionnaPartialError | OSError | MemoryError)
+    return str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
+
+
 def shown(value: object) -> str:
     """Return a value as a short text of one line."""
     try:

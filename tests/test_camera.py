@@ -10,7 +10,7 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
-from sionna_partial.worlds.camera import Camera, view_corners_m
+from sionna_partial.worlds.robot import Camera, view_corners_m
 
 NOWHERE = np.empty((0, 2), dtype=np.intp)
 EXACT, LIDAR = SensorSettings(), SensorSettings(field_of_view_deg=360.0)

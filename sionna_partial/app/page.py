@@ -1,4 +1,4 @@
-"""The page of the app: what a session has, drawn by Bokeh, and what is clicked, given to the session."""
+"""The page of the app: the state of a session drawn by Bokeh, and clicks that are handed to the session."""
 
 import functools
 import html
@@ -41,7 +41,7 @@ _TOOLTIPS = (
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
 _UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click, or the next drag would move what was clicked as well."""
+"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
@@ -122,7 +122,7 @@ TEMPLATE = """\
 
 
 class Page:
-    """What one window shows.
+    """Page of one window.
 
     Parameters
     ----------
@@ -146,7 +146,7 @@ class Page:
             document.add_root(model)
         document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
-    # What is made once
+    # Widgets
 
     def _make_picture(self) -> None:
         from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
@@ -180,8 +180,10 @@ class Page:
         ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
         plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self._values, **where}
+        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
         self._parts = {
-            name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
+            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below")
+            for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
         plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
@@ -244,7 +246,7 @@ class Page:
         self.fields = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[00]"),
-                functools.partial(self._change_field, name),
+                functools.partial(lambda name, value: self._change(**{name: float(value)}), name),
                 "value_throttled",
             )
             for name, title, step, low, high in (
@@ -345,12 +347,12 @@ class Page:
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
-        """Give what is chosen to a function; what is refused is shown."""
+        """Call a function with the chosen value; a refusal is shown."""
 
         def changed(_name: str, _old: Any, new: Any) -> None:
             if self._is_showing:
                 return
-            if new is None:  # a field was emptied: what it had comes back
+            if new is None:  # a field was emptied: its old value is shown again
                 self.show()
             else:
                 self._guarded(take, new)
@@ -372,7 +374,7 @@ class Page:
         except SionnaPartialError as error:
             self.session.refuse(error)
 
-    # What is clicked
+    # Callbacks
 
     def _on_points(self, _name: str, _old: Any, new: Any) -> None:
         if not self._is_showing:
@@ -392,9 +394,6 @@ class Page:
             self.session.chosen = name
         self.show()
 
-    def _change_field(self, name: str, value: float) -> None:
-        self._change(**{name: float(value)})
-
     def _change_antenna(self, name: str, value: Any) -> None:
         antenna = self.session.transmitters[self.session.chosen].antenna
         self._change(antenna=replace(antenna, **{name: value}))
@@ -405,10 +404,10 @@ class Page:
     def _change(self, **values: Any) -> None:
         self.session.change(self.session.chosen, **values)
 
-    # What changes
+    # Updates
 
     def show(self) -> None:
-        """Draw what the session has."""
+        """Draw the state of the session."""
         self._is_showing = True
         try:
             self._show_status()
@@ -421,7 +420,7 @@ class Page:
             self._is_showing = False
 
     def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
-        """Draw what has changed alone."""
+        """Draw changes only."""
         if self._drawn.get(name) != key:
             draw()
             self._drawn[name] = key
@@ -480,7 +479,7 @@ class Page:
         self._once("aims", (repr(aims),), functools.partial(setattr, self._aims, "data", aims))
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
-        if self.which.options != options:  # of several, first what a receiver gets
+        if self.which.options != options:  # of several transmitters, first the sum at a receiver
             self.which.options, self.which.value = options, options[0][0]
         self.layer.options = self._options(len(names))
         if self.layer.value not in [value for value, _ in self.layer.options]:
@@ -623,10 +622,6 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
     return text + " Hatched: not observed."
-
-
-def _words(name: str) -> list[str]:
-    return {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}.get(name, [])
 
 
 def _state_words() -> Any:

@@ -73,11 +73,11 @@ def live(
     last: dict[str, Any] = {}
     robot: Any = None
     if bag is None and rosbridge:
-        from sionna_partial.live.rosbridge import Rosbridge
+        from sionna_partial.live.topics import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.live.dds import Dds
+        from sionna_partial.live.topics import Dds
 
         robot = Dds(topics, positions, domain)
 
@@ -104,8 +104,7 @@ def live(
 
 
 def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
-    from sionna_partial.live.bags import replay
-    from sionna_partial.live.topics import Listener
+    from sionna_partial.live.topics import Listener, replay
 
     thread = coverage.start() if rate else None
     replay(Listener(coverage, topics), bag, rate)

@@ -14,8 +14,8 @@ from typer.core import TyperCommand
 import sionna_partial as sp
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
+from sionna_partial.display import reporting
 from sionna_partial.files import require_writable
-from sionna_partial.progress import reporting
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, DXF floor plan, or IFC model."

@@ -10,9 +10,9 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.display import part_of
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_files, read_columns
-from sionna_partial.progress import part_of
 from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")

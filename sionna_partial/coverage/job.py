@@ -24,6 +24,7 @@ from sionna_partial.coverage.dataset import (
     provenance,
     with_posterior,
 )
+from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.link_model import LinkModel, PredictedLinks
 from sionna_partial.maps.partial_map import PartialMap, with_height
@@ -36,7 +37,6 @@ from sionna_partial.measurements.measurements import (
     nearest_transmitters,
 )
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.progress import part_of, reporting
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 

@@ -26,10 +26,10 @@ _NO_SPREAD_DB = 1e-6
 """A standard deviation below this is rounding [dB]."""
 
 LEAST_PROBABILITY = 1e-4
-"""Of the true link state in a likelihood: a map with errors excludes true states now and then."""
+"""Least probability of the true link state in a likelihood: a map with errors excludes true states now and then."""
 
 LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
-"""Of the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, and now and then wrong."""
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, but may be wrong."""
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
@@ -140,7 +140,7 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
-    that of an outage has, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
+    in an outage, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
     prediction returns the levels themselves.
     """
     if len(link_state) == 0:
@@ -167,7 +167,7 @@ def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Fl
 
 
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
-    """Of the link state, and of link state and gain."""
+    """Return the loss of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)

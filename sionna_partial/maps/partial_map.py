@@ -1,4 +1,4 @@
-"""PartialMap: what has been observed of a floor plan, cell by cell."""
+"""PartialMap: the observed part of a floor plan, cell by cell."""
 
 import itertools
 import math
@@ -12,17 +12,15 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
+from sionna_partial.arrays import Bools, Floats, Indices, States, largest_by_area, read_only
 from sionna_partial.checks import float_array, is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.environment import FloorPlan, Mesh
+from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.maps.wall_cells import wall_cells
-from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -56,7 +54,7 @@ _RANK = np.argsort(_FREEST)
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
+class PartialMap(Pictured, plot="plots.style:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
 
     World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.
@@ -74,17 +72,17 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     interior_cells : int or None
         Number of free cells of the complete home, where a simulation gives it.
     mesh : SceneMesh or None
-        What has been observed of the building, in place of walls extruded from the cells. Its z is the world's.
+        Observed part of the building, instead of walls extruded from the cells. Its z is the z of the world.
     material : Material or None
-        Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
-        SceneSettings.
+        Material of its walls, floor and ceiling, or of the parts of its mesh that name none; None is the
+        material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
         Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Kept read-only, and 0 where there
         is no wall. A mesh has its own. See `with_wall_material`.
     wall_materials : tuple of Material
         At most 255 materials that `wall_material` counts.
     obstacle : (ny, nx) uint8 array or None
-        Which wall cells end below the ceiling: k for those of `obstacle_heights_m[k - 1]`, 0 for walls that reach it.
+        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls.
         Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
@@ -213,7 +211,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return replace(self, wall_material=cells, wall_materials=materials)
 
     def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
-        """Return the map with the walls of an area ending at a height: what a low lidar saw need not be a wall.
+        """Return the map with the walls of an area ending at a height: a low lidar also sees furniture.
 
         Paths go over such obstacles, and radios may stand above them.
 
@@ -276,16 +274,16 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return x, y, x + nx * self.resolution_m, y + ny * self.resolution_m
 
     @property
-    def environment(self) -> FloorPlan | Mesh:
-        """What stands in it: walls extruded from its cells, or its mesh."""
-        if self.mesh is None:
-            return FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
-        return Mesh(self.mesh)
+    def environment(self) -> FloorPlan | SceneMesh:
+        """Walls extruded from its cells, or its mesh."""
+        return self.mesh or FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
 
     @property
     def height_range_m(self) -> tuple[float, float]:
         """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
-        return self.environment.height_range_m
+        range_m = self.environment.height_range_m
+        assert range_m is not None  # a mesh has it once it is built
+        return range_m
 
     @cached_property
     def import_report(self) -> ImportReport | None:
@@ -299,7 +297,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     def is_complete(self) -> bool:
         """Return whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
 
-        What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
+        The space beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
         out of a larger one. A map without free cells is not complete.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
@@ -317,12 +315,12 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def wall_noise(self) -> float:
-        """How much range noise thickened and roughened the walls, 0 (exact) to 1."""
+        """Degree to which range noise thickened and roughened the walls, 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:
-        """How many cells in every direction, corners included, are in the state of each cell (ny, nx)."""
+        """Number of cells in every direction, corners included, in the state of each cell (ny, nx)."""
         return uniform_cells(self.state)
 
     @property
@@ -363,9 +361,9 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
-        """Heights up to which walls reach [m], and a map with the walls of that height alone; first those of a room.
+        """Heights up to which walls reach [m], and a map with the walls of that height alone; first the walls of rooms.
 
-        The first map has free cells in place of obstacles and of what they enclose, and the infinite height.
+        The first map has the infinite height, and free cells instead of obstacles and the areas that they enclose.
         """
         if self.obstacle is None:
             return ((math.inf, self),)
@@ -421,7 +419,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
     def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
-        """Which points (N, 3) [m] have each fault, what it is, and the remedy."""
+        """Return, for each fault, the points (N,) that have it, its description, and the remedy."""
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         finite = np.asarray(np.isfinite(points_m).all(axis=1))
@@ -481,6 +479,12 @@ def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
     return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
 
 
+def nearest_free_m(partial: PartialMap, at_m: ArrayLike, count: int = 1) -> Floats:
+    """Return the centres (K, 2) of the free cells that are nearest to a position (2,) [m], at most `count`."""
+    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
+    return free_m[np.hypot(*(free_m - np.asarray(at_m, dtype=np.float64)).T).argsort(kind="stable")[:count]]
+
+
 def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
     """Return the cells in blocks of `factor` cells a side (ny, factor, nx, factor), and the blocks' lower-left corner.
 
@@ -529,7 +533,7 @@ def frontier_cells(state: States) -> Bools:
 
 
 def uniform_cells(state: States) -> NDArray[np.int32]:
-    """How many cells in every direction, corners included, are in the state of each cell."""
+    """Return the number of cells in every direction, corners included, that are in the state of each cell."""
     uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
@@ -539,7 +543,7 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
 
 
 def warn_of_odd_states(what: str, partial: PartialMap) -> None:
-    """Warn of a map, called `what`, that is probably not what was meant: without walls or free cells, or inverted."""
+    """Warn of a map, called `what`, that is probably wrong: without walls or free cells, or inverted."""
     count = np.bincount(partial.state.ravel(), minlength=len(CellState))
     free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
     if partial.state.size < ODD_CELLS or not free + wall:

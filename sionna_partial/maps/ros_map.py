@@ -21,8 +21,8 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.import_report import ImportNotes
-from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import (
     MAX_CELLS,
     MAX_INTERIOR_CELLS,
@@ -36,7 +36,7 @@ from sionna_partial.settings import Material
 logger = logging.getLogger(__name__)
 
 MODES = ("trinary", "scale", "raw")
-"""How map_server may read an image."""
+"""Modes in which map_server reads an image."""
 
 UNKNOWN_SHADE = 205
 """Shade that map savers give to unknown cells [of 255]."""
@@ -76,7 +76,7 @@ MAX_YAW_RAD = 6.2832
 
 
 class _Sheet(NamedTuple):
-    """How the image of a map YAML is to be read."""
+    """Settings of a map YAML for the reading of its image."""
 
     source: Path
     image: Path
@@ -161,7 +161,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
 
 
 def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
-    """Return what the shades of the image of a layer count."""
+    """Return the list of materials or heights that the shades of the image of a layer number."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
     other = sorted(str(key) for key in given if key not in ("image", listed))
@@ -204,7 +204,7 @@ def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
     """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map, or neither.
 
-    Of a mesh, the YAML has what the exported scene beside it does not.
+    The YAML of a map with a mesh completes the exported scene beside it.
     """
     sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
     if partial.interior_cells is not None:
@@ -512,7 +512,7 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
-    """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
+    """Read every pixel to the letter of nav2's loadMapFromFile; occupancies between the thresholds are unknown."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
     if sheet.mode == "raw":

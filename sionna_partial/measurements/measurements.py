@@ -410,7 +410,8 @@ def nearest_transmitters(tx_m: Floats, sources_m: Sequence[Floats]) -> Bools:
     The array is (T, N). Transmitters at one position share their measurements; no position is near an unknown (0, 3).
     """
     apart_m = np.array([np.linalg.norm(tx_m - (each_m if len(each_m) else np.nan), axis=1) for each_m in sources_m])
-    return np.asarray((apart_m <= SAME_TX_M) & (apart_m <= apart_m.min(axis=0)))
+    apart_m = apart_m.reshape(len(sources_m), len(tx_m))
+    return np.asarray((apart_m <= SAME_TX_M) & (apart_m <= apart_m.min(axis=0, initial=np.inf)))
 
 
 def measurements_of_others(

@@ -110,7 +110,7 @@ def plot_coverage(
     coverage : xarray.Dataset
         From `predict_map`, or read from its NetCDF file.
     layers : sequence of str
-        A panel each: "link_state" (the likeliest), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
         three states mixed by their probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
@@ -208,7 +208,7 @@ def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
     """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
 
-    For a partial map it states that gains are those of receivers indoors, unless they are of receivers anywhere.
+    For a partial map it states whether gains refer to receivers indoors or anywhere.
     """
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
@@ -237,21 +237,18 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; the legend has that of link states.
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend.
 
     They are to the right of the panels, or that fraction of the figure below them.
     """
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
-        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=_beyond(layer))
+        extend = "neither" if layer.label == "probability" else "max"
+        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=extend)
         bar.set_label(layer.label.replace("; ", ";\n"))
     elif layer.norm is None:
         _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
-
-
-def _beyond(layer: Layer) -> str:
-    return "neither" if layer.label == "probability" else "max"
 
 
 def _draw_triangle(key: Axes) -> None:
@@ -303,7 +300,7 @@ def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, 
 
 
 def wall_cells(coverage: xr.Dataset) -> Bools:
-    """Where walls are, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
+    """Return the walls, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
     merge = WALL_PARTS // fine
@@ -314,7 +311,7 @@ def wall_cells(coverage: xr.Dataset) -> Bools:
 
 
 def outside(coverage: xr.Dataset) -> Bools:
-    """Where nobody can be: the unknown cells of a complete map."""
+    """Return the unknown cells of a complete map, where no receiver can be."""
     return ~coverage["observed"].to_numpy() & bool(coverage.attrs.get("map_complete", 0))
 
 
@@ -364,7 +361,7 @@ def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
-    """Name what is drawn; walls that only the first of several maps has are not observed in the others."""
+    """Return the legend of the map; walls that only the first of several maps has are not observed in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
     located = any("p_transmitter" in coverage for coverage in coverages)
     if located:
@@ -425,7 +422,7 @@ def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
 
 
 def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float) -> str:
-    """Return settings, covered area by received power, and what the numbers are worth."""
+    """Return settings, covered area by received power, and the accuracy of the numbers."""
     lines, attributes = [], coverage.attrs
     for (name, one), eirp_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]

@@ -18,11 +18,11 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress, no_progress, require, require_choice, require_memory, settings_or_default
 from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S
+from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
-from sionna_partial.progress import part_of, reporting
 from sionna_partial.scene.scene import scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna

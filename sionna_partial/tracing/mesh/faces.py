@@ -9,8 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats
-from sionna_partial.planar import span_in_strip
+from sionna_partial.arrays import Floats, span_in_strip
 from sionna_partial.process import njit
 
 MOST_FACES = 64

@@ -22,8 +22,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Floats, Indices
-from sionna_partial.planar import span_in_strip
+from sionna_partial.arrays import Floats, Indices, span_in_strip
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import Plan, PointBins, grow
 from sionna_partial.tracing.plan.room import FACES, Building, Room
