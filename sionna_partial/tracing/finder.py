@@ -23,10 +23,9 @@ from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, g
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges
-from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
-from sionna_partial.tracing.plan.crossings import CrossingCandidates
-from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
-from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
+from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
 from sionna_partial.tracing.select import Block, Kind, rounds
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths

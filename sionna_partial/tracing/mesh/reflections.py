@@ -10,6 +10,7 @@ walls, and the power of the path follows. Where no wall may be crossed, Sionna R
 
 import itertools
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -31,8 +32,7 @@ from sionna_partial.tracing.mesh.sequences import (
     split_rays,
     view_sequences,
 )
-from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.legs import SHORTEST_LEG_M
+from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates
 from sionna_partial.tracing.power import (
     ISOTROPIC,
     Gains,
@@ -178,12 +178,11 @@ class MeshReflections:
 
     def _written(self, traced: Traced, node: Indices, rx: NDArray[np.int32], rows: Indices) -> Candidates:
         depth = max(1, self._links.limits.depth)
-        columns = _write(node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES)
-        if self._opaque:
-            return Candidates(rx[rows], *columns[:3])
-        used = max(1, int((columns[0] > 0).sum(axis=1).max()))
-        kind, face, vertices_m, same_wall = (column[:, :used] for column in columns)
-        return Candidates(rx[rows], kind, face, vertices_m, same_wall=same_wall)
+        kind, face, vertices_m, same_wall = _write(
+            node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES
+        )
+        candidates = Candidates(rx[rows], kind, face, vertices_m)
+        return candidates if self._opaque else replace(candidates, same_wall=same_wall).narrowed()
 
 
 @njit(cache=True, nogil=True)
