@@ -17,6 +17,9 @@ NO_RECEIVER = 255
 DEFAULT_HEIGHT_M = 1.5
 """Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
 
+COARSER = 4
+"""Receiver spacing of a first, quick coverage map, as a multiple of the spacing of the final one."""
+
 MEMORY_GB = 2.0
 """Memory that a job may take where no other limit is given [GB]."""
 
