@@ -57,6 +57,13 @@ BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File formats of rosbags; one of ROS 2 may also be a folder with a metadata.yaml."""
 
 
+VACUUM_SUFFIXES = (".json", ".vwm")
+"""File formats of maps of vacuum robots: Valetudo, and recordings of Valeronoi."""
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+"""File formats of floor plans as pictures."""
+
+
 class LinkState(IntEnum):
     """State of a radio link (paper, Section II-B).
 

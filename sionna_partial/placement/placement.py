@@ -21,7 +21,7 @@ from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, require_
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
-from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
@@ -294,6 +294,7 @@ class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitter(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     *,

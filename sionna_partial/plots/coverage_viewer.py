@@ -137,7 +137,7 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
 def radio_layers(servers: int) -> dict[str, Layer]:
     """Return layers of a transmitter with its power, or of the strongest of so many, by the name of their variable."""
     known = coverage_layers(THRESHOLD_DB)
-    level = Normalize(-130.0, -30.0), "viridis", "dBm; an outage counts \N{MINUS SIGN}150 dB of gain"
+    level = Normalize(-130.0, -30.0), "viridis", "dBm"
     ratio, numbers = (Normalize(-20.0, 50.0), "viridis", "dB"), Normalize(0, servers - 1)
     added: dict[str, tuple[str, Normalize, str | ListedColormap, str]] = {
         "power_mean_dbm": ("Mean received power", *level),

@@ -98,9 +98,12 @@ def server_colours(count: int) -> list[tuple[float, ...]]:
     return [cmap(number % cmap.N) for number in range(count)]
 
 
-def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:
-    """Draw a legend below the axes, in one row by default."""
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns or len(handles), frameon=False)
+def legend_below(
+    figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None, title: str = ""
+) -> None:
+    """Draw a legend below the axes, in one row by default, with a line above it."""
+    count = columns or len(handles)
+    figure.legend(handles=handles, loc="outside lower center", ncols=count, frameon=False, title=title or None)
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
