@@ -69,7 +69,7 @@ ROOMS = {
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("jobs", "uploads", "session", "page", "server"),
+    "app": ("jobs", "files", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }
