@@ -149,7 +149,7 @@ class LinkModel:
     def predictor(self) -> AnyPredictor:
         """The predictor of links that are not complete."""
         if self.by_mean_losses:
-            return MeanLosses(self._networks, self.partial)
+            return MeanLosses(self._networks, self.partial, self.simulation.trace_settings.max_walls)
         return self._networks
 
     @property

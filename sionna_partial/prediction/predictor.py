@@ -51,7 +51,7 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import PredictorSettings
+from sionna_partial.settings import PredictorSettings, TraceSettings
 
 if TYPE_CHECKING:
     import keras
@@ -188,12 +188,14 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
     @classmethod
-    def of_mean_losses(cls, phi: LinkFeatures, walls: Floats) -> LinkPrediction:
-        """Return what the mean loss of walls predicts of links through walls, which have a context.
+    def of_mean_losses(
+        cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
+    ) -> LinkPrediction:
+        """Return the prediction by the mean loss of walls, for links through walls, which have a context.
 
-        `walls` (N,) are the expected numbers of unseen walls on their direct lines.
+        `walls` (N,) are the expected numbers of unseen walls on their direct lines, `max_walls` is that of the trace.
         """
-        return cls.of_parts(*by_mean_losses(phi, walls))
+        return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
@@ -648,8 +650,8 @@ class MeanLosses:
 
     name = WALL_LOSSES
 
-    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap) -> None:
-        self._networks, self._partial = networks, partial
+    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap, max_walls: int) -> None:
+        self._networks, self._partial, self._max_walls = networks, partial, max_walls
         self.settings, self.fingerprint = networks.settings, networks.fingerprint
         self.predict_indoor = networks.predict_indoor
 
@@ -659,7 +661,7 @@ class MeanLosses:
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links (N,)."""
-        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi))
+        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi), self._max_walls)
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses
