@@ -4,21 +4,72 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from scipy import ndimage
 
 from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.process import njit
 from sionna_partial.settings import SensorSettings
 
 MISSED_PATCH_M = 0.5
 """Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
 
-HIT_LOG_ODDS, MISS_LOG_ODDS = 0.85, -0.4
-"""Change of a cell's log odds where a picture reports a wall, and free space (Hornung et al., 2013, Section 5)."""
+GRAZING_DEG = 5.0
+"""Angle between a ray and the face of a wall below which a sensor with errors gets no return [degree]."""
 
-LOG_ODDS_LIMITS = (-2.0, 3.5)
-"""Least and greatest log odds of a wall (as above), so that a map can still change."""
+
+class Fusion(NamedTuple):
+    """Rule of a mapper that makes states of cells from the rays that end in them (hits) and cross them (passes).
+
+    Parameters
+    ----------
+    by_scan : bool
+        Whether each picture counts once in a cell, as a hit if any of its rays ends there.
+    passes_of_hit : int
+        Number of passes that a hit counts as, too.
+    min_passes : int
+        Number of passes from which on a cell is known.
+    max_free : float
+        Ratio of hits to passes above which a cell is wall.
+    cleared_m : float
+        Largest range up to which rays without a wall in range mark free cells [m].
+    """
+
+    by_scan: bool
+    passes_of_hit: int
+    min_passes: int
+    max_free: float
+    cleared_m: float = math.inf
+
+
+def _log_odds(probability: float) -> float:
+    return math.log(probability / (1.0 - probability))
+
+
+_SUM_OF_ODDS = _log_odds(0.55) - _log_odds(0.49)
+
+FUSIONS = {
+    "exact": Fusion(False, 1, 1, 0.0),
+    "slam_toolbox": Fusion(False, 2, 3, 0.1),
+    "gmapping": Fusion(False, 1, 1, 0.25),
+    "cartographer": Fusion(True, 1, 1, -_log_odds(0.49) / _SUM_OF_ODDS, 5.0),
+    "vacuum": Fusion(False, 1, 1, 0.25),
+}
+"""Rules of mappers, with their default parameters.
+
+- slam_toolbox (`karto_sdk/Karto.h`, `OccupancyGrid::UpdateCell`): wall where hits / passes > 0.1, known from more than
+  two passes. A ray adds a pass to its last cell, and one more with its hit.
+- gmapping (`occ_thresh` of `slam_gmapping`): wall where hits / (hits + passes) > 0.25.
+- Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55 and `miss_probability` 0.49 for each picture; wall
+  where the log odds are positive, here without their limits. Returns from beyond the range clear
+  `missing_data_ray_length`.
+- vacuum: as gmapping, and walls are thinned (`Camera.map`). Firmware is not published.
+
+Rays that return from beyond the range clear it, as with `max_laser_range` and `maxUrange` below the limit of the
+sensor. Rays without a return are dropped, as these mappers and their ROS drivers do.
+"""
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
@@ -37,34 +88,54 @@ class Camera:
         self._missed = missed[np.ix_(rows, columns)]
         self._range_cells = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
-        self._noise = sensor.range_noise_m / resolution_m
-        self._rng = rng
-        self._log_odds = np.zeros(truth.shape)
+        self._sensor, self._cell_m, self._rng = sensor, resolution_m, rng
+        self._fusion = FUSIONS["exact" if sensor.is_exact else sensor.fusion]
+        self._hits, self._passes = np.zeros((2, *truth.shape), dtype=np.int32)
         self.seen = np.full_like(self._truth, _UNKNOWN)
+
+    @property
+    def map(self) -> States:
+        """The map that is handed out: a vacuum robot thins its walls, and what it takes off them is free or unknown."""
+        if self._sensor.is_exact or self._sensor.fusion != "vacuum":
+            return self.seen
+        wall = self.seen == _WALL
+        kept = wall & wall_cells(self.seen, self._cell_m).cells
+        beside = ndimage.binary_dilation(self.seen == _FREE)
+        return np.where(wall & ~kept, np.where(beside, _FREE, _UNKNOWN), self.seen).astype(np.uint8)
 
     def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: Indices) -> None:
         """Add one picture to the map, taken at x, y but believed to be taken `shift` from there.
 
         The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
         """
-        angles = _ray_angles(heading_deg, self._view_deg, self._range_cells)
-        noise = self._noise * self._rng.standard_normal(len(angles))
+        rays = self._rays(x, y, heading_deg, shift)
         middle = np.array([y + shift[1], x + shift[0]])
         range_cells = max(self._range_cells, float(np.abs(under - middle).max(initial=0.0)))
         corner = np.clip(middle - range_cells - 1, 0, self.seen.shape).astype(np.intp)
         end = np.clip(middle + range_cells + 2, 0, self.seen.shape).astype(np.intp)
         part = slice(corner[0], end[0]), slice(corner[1], end[1])
-        log_odds, seen = self._log_odds[part], self.seen[part]
-        view = np.full_like(seen, _UNKNOWN)
-        rays = _Rays((x, y), shift, angles, noise, self._range_cells)
-        _cast_rays(self._truth, self._missed, view, (int(corner[0]), int(corner[1])), rays)
+        seen, fusion = self.seen[part], self._fusion
+        hits, passes = np.zeros((2, *seen.shape), dtype=np.int32)
+        _cast_rays(self._truth, self._missed, hits, passes, (int(corner[0]), int(corner[1])), rays)
+        _fuse(self._hits[part], self._passes[part], hits, passes, fusion, seen)
         rows, columns = (under - corner).T
-        view[rows, columns] = _FREE
-        log_odds[rows, columns] = LOG_ODDS_LIMITS[0]
-        known = view != _UNKNOWN
-        change = np.where(view[known] == _WALL, HIT_LOG_ODDS, MISS_LOG_ODDS)
-        log_odds[known] = np.clip(log_odds[known] + change, *LOG_ODDS_LIMITS)
-        seen[known] = np.where(log_odds[known] > 0, _WALL, _FREE)
+        seen[rows, columns] = _FREE
+        self._hits[part][rows, columns] = 0
+        self._passes[part][rows, columns] += fusion.min_passes
+
+    def _rays(self, x: float, y: float, heading_deg: float, shift: tuple[float, float]) -> "_Rays":
+        """Draw the errors of the rays of one picture."""
+        sensor, rng = self._sensor, self._rng
+        angles = _ray_angles(heading_deg, self._view_deg, self._range_cells)
+        noise = sensor.range_noise_m / self._cell_m * rng.standard_normal(len(angles))
+        if sensor.is_exact:
+            return _Rays((x, y), shift, angles, noise, self._range_cells)
+        turn = math.radians(sensor.heading_noise_deg) * rng.standard_normal()
+        lost = rng.random(len(angles)) < sensor.missed_return_fraction
+        noise[lost] = math.nan
+        cleared_cells = min(self._range_cells, self._fusion.cleared_m / self._cell_m)
+        grazing = math.sin(math.radians(GRAZING_DEG))
+        return _Rays((x, y), shift, angles, noise, self._range_cells, cleared_cells, turn, grazing)
 
 
 def unknown_in_view(
@@ -79,12 +150,11 @@ def unknown_in_view(
     row, column = cell - low + 1.5
     shown = []
     for heading_deg in headings_deg:
-        view = np.full_like(window, _UNKNOWN)
+        hits, passes = np.zeros((2, *window.shape), dtype=np.int32)
         angles = _ray_angles(heading_deg, sensor.field_of_view_deg, range_cells)
-        _cast_rays(
-            bright, missed, view, (0, 0), _Rays((column, row), (0.0, 0.0), angles, np.zeros_like(angles), range_cells)
-        )
-        shown.append(np.argwhere((view == _FREE) & (window == _UNKNOWN)) + low - 1)
+        rays = _Rays((column, row), (0.0, 0.0), angles, np.zeros_like(angles), range_cells)
+        _cast_rays(bright, missed, hits, passes, (0, 0), rays)
+        shown.append(np.argwhere((passes > 0) & (window == _UNKNOWN)) + low - 1)
     return shown
 
 
@@ -106,13 +176,21 @@ def _ray_angles(heading_deg: float, view_deg: float, range_cells: float) -> Floa
 
 
 class _Rays(NamedTuple):
-    """Rays of one picture: angles [radian]; start, where the robot believes to be less start, errors, range [cells]."""
+    """Rays of one picture: start, where the robot believes to be less start, and angles [radian].
+
+    `noise` is the error of each reading, NaN where there is none, `range_cells` and `cleared_cells` are the ranges of
+    readings and of rays that meet no wall [cells], `turn` is the error of the heading [radian], and `grazing` the sine
+    of the angle to a face below which there is no reading.
+    """
 
     start: tuple[float, float]
     shift: tuple[float, float]
     angles: Floats
     noise: Floats
     range_cells: float
+    cleared_cells: float = math.inf
+    turn: float = 0.0
+    grazing: float = 0.0
 
 
 class _Walk(NamedTuple):
@@ -135,28 +213,42 @@ class _Walk(NamedTuple):
 
 
 @njit(cache=True)
-def _cast_rays(truth, missed, view, corner, rays):  # type: ignore[no-untyped-def]
-    """Write what one picture reports into `view`, whose first cell is `corner` of the home: free up to the reading.
-
-    Where rays disagree about a cell, a wall counts (as in OctoMap).
-    """
-    (x, y), shift, angles, noise, range_cells = rays
+def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-untyped-def]
+    """Count the rays of one picture that end in walls, and those that cross cells, from the cell `corner` on."""
+    (x, y), shift, angles, noise, range_cells, cleared_cells, turn, grazing = rays
     for ray in range(len(angles)):
-        echo, reading = _read(truth, missed, x, y, angles[ray], range_cells)
+        echo, reading = _read(truth, missed, x, y, angles[ray], range_cells, grazing)
         reading += noise[ray]
-        walk = _start(x + shift[0], y + shift[1], angles[ray])
+        if math.isnan(reading):
+            continue
+        length = min(range_cells, cleared_cells) if echo == _FAR else range_cells
+        walk = _start(x + shift[0], y + shift[1], angles[ray] + turn)
         row, column = walk.row - corner[0], walk.column - corner[1]
-        while 0 <= row < view.shape[0] and 0 <= column < view.shape[1]:
+        while 0 <= row < hits.shape[0] and 0 <= column < hits.shape[1] and walk.enters <= length:
             if echo != _FAR and walk.leaves > reading:
                 if echo == _WALL_ECHO:
-                    view[row, column] = _WALL
+                    hits[row, column] += 1
                 break
-            if walk.enters > range_cells:
-                break
-            if view[row, column] == _UNKNOWN:
-                view[row, column] = _FREE
+            passes[row, column] += 1
             walk = _next(walk)
             row, column = walk.row - corner[0], walk.column - corner[1]
+
+
+@njit(cache=True)
+def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-untyped-def]
+    """Add the counts of one picture to those of all, and update the states (ny, nx) that a mapper makes of them."""
+    for row in range(seen.shape[0]):
+        for column in range(seen.shape[1]):
+            hit, passed = hits[row, column], passes[row, column]
+            if hit + passed == 0:
+                continue
+            if fusion.by_scan:
+                hit, passed = min(hit, 1), 1 - min(hit, 1)
+            all_hits[row, column] += hit
+            all_passes[row, column] += passed + fusion.passes_of_hit * hit
+            if all_passes[row, column] >= fusion.min_passes:
+                is_wall = all_hits[row, column] > fusion.max_free * all_passes[row, column]
+                seen[row, column] = _WALL if is_wall else _FREE
 
 
 @njit(cache=True)
@@ -164,18 +256,25 @@ def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
     """Length of each ray [cells]."""
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
-        ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells)[1]
+        ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells, 0.0)[1]
     return ranges
 
 
 @njit(cache=True)
-def _read(truth, missed, x, y, angle, range_cells):  # type: ignore[no-untyped-def]
-    """Return what ends a ray (a wall that is noticed, one that is not, or nothing), and a distance within that cell."""
-    walk = _start(x, y, angle)
+def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-untyped-def]
+    """Return the end of a ray (a wall, an unknown cell, or nothing), and a distance within that cell.
+
+    The distance is NaN where a wall is missed, or met at a sine of less than `grazing` to its face.
+    """
+    walk, row = _start(x, y, angle), -1
     while walk.enters <= range_cells:
-        if truth[walk.row, walk.column] != _FREE:
-            noticed = truth[walk.row, walk.column] == _WALL and not missed[walk.row, walk.column]
-            return (_WALL_ECHO if noticed else _NO_ECHO), (walk.enters + walk.leaves) / 2
+        if truth[walk.row, walk.column] == _WALL:
+            sine = abs(math.cos(angle)) if walk.row == row else abs(math.sin(angle))
+            is_lost = missed[walk.row, walk.column] or sine < grazing
+            return _WALL_ECHO, math.nan if is_lost else (walk.enters + walk.leaves) / 2
+        if truth[walk.row, walk.column] == _UNKNOWN:
+            return _NO_ECHO, (walk.enters + walk.leaves) / 2
+        row = walk.row
         walk = _next(walk)
     return _FAR, range_cells
 

@@ -107,8 +107,13 @@ class Robot:
 
     @property
     def seen(self) -> States:
-        """The map (ny, nx)."""
+        """The map (ny, nx) that it plans on."""
         return self._camera.seen
+
+    @property
+    def map(self) -> States:
+        """The map (ny, nx) that is handed out: see `Camera.map`."""
+        return self._camera.map
 
     @property
     def believed_position(self) -> tuple[float, float]:
