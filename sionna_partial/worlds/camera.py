@@ -20,6 +20,10 @@ GRAZING_DEG = 5.0
 """Angle between a ray and the face of a wall below which a sensor with errors gets no return [degree]."""
 
 
+RAY_DEG = 0.5
+"""Angle between rays of a sensor with errors, at least [degree]: lidars of robots have 0.25 to 1."""
+
+
 class Fusion(NamedTuple):
     """Rule of a mapper that makes states of cells from the rays that end in them (hits) and cross them (passes).
 
@@ -33,6 +37,8 @@ class Fusion(NamedTuple):
         Number of passes from which on a cell is known.
     max_free : float
         Ratio of hits to passes above which a cell is wall.
+    travel_m, turn_deg : float
+        Distance and turn since the last picture, either of which makes it take another [m], [degree].
     cleared_m : float
         Largest range up to which rays without a wall in range mark free cells [m].
     """
@@ -41,6 +47,8 @@ class Fusion(NamedTuple):
     passes_of_hit: int
     min_passes: int
     max_free: float
+    travel_m: float
+    turn_deg: float
     cleared_m: float = math.inf
 
 
@@ -50,22 +58,26 @@ def _log_odds(probability: float) -> float:
 
 _SUM_OF_ODDS = _log_odds(0.55) - _log_odds(0.49)
 
+_HALF_RADIAN_DEG = math.degrees(0.5)
+
 FUSIONS = {
-    "exact": Fusion(False, 1, 1, 0.0),
-    "slam_toolbox": Fusion(False, 2, 3, 0.1),
-    "gmapping": Fusion(False, 1, 1, 0.25),
-    "cartographer": Fusion(True, 1, 1, -_log_odds(0.49) / _SUM_OF_ODDS, 5.0),
-    "vacuum": Fusion(False, 1, 1, 0.25),
+    "exact": Fusion(False, 1, 1, 0.0, 0.0, 0.0),
+    "slam_toolbox": Fusion(False, 2, 3, 0.1, 0.5, _HALF_RADIAN_DEG),
+    "gmapping": Fusion(False, 1, 1, 0.25, 1.0, _HALF_RADIAN_DEG),
+    "cartographer": Fusion(True, 1, 1, -_log_odds(0.49) / _SUM_OF_ODDS, 0.2, 1.0, 5.0),
+    "vacuum": Fusion(False, 1, 1, 0.25, 0.5, _HALF_RADIAN_DEG),
 }
 """Rules of mappers, with their default parameters.
 
-- slam_toolbox (`karto_sdk/Karto.h`, `OccupancyGrid::UpdateCell`): wall where hits / passes > 0.1, known from more than
-  two passes. A ray adds a pass to its last cell, and one more with its hit.
-- gmapping (`occ_thresh` of `slam_gmapping`): wall where hits / (hits + passes) > 0.25.
+- slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from more
+  than two passes. A ray adds a pass to its last cell, and one more with its hit. `minimum_travel_distance` and
+  `minimum_travel_heading` are 0.5.
+- gmapping (`slam_gmapping.cpp`): wall where hits / (hits + passes) > `occ_thresh`, 0.25. `linearUpdate` is 1 m,
+  `angularUpdate` 0.5.
 - Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55 and `miss_probability` 0.49 for each picture; wall
-  where the log odds are positive, here without their limits. Returns from beyond the range clear
-  `missing_data_ray_length`.
-- vacuum: as gmapping, and walls are thinned (`Camera.map`). Firmware is not published.
+  where the log odds are positive, here without their limits. `motion_filter` takes 0.2 m and 1 degree. Returns from
+  beyond the range clear `missing_data_ray_length`, 5 m.
+- vacuum: as gmapping, and walls are thinned (`Camera.map`). The rules of firmware are not published.
 
 Rays that return from beyond the range clear it, as with `max_laser_range` and `maxUrange` below the limit of the
 sensor. Rays without a return are dropped, as these mappers and their ROS drivers do.
@@ -89,7 +101,7 @@ class Camera:
         self._range_cells = sensor.range_m / resolution_m
         self._view_deg = sensor.field_of_view_deg
         self._sensor, self._cell_m, self._rng = sensor, resolution_m, rng
-        self._fusion = FUSIONS["exact" if sensor.is_exact else sensor.fusion]
+        self.fusion = FUSIONS["exact" if sensor.is_exact else sensor.fusion]
         self._hits, self._passes = np.zeros((2, *truth.shape), dtype=np.int32)
         self.seen = np.full_like(self._truth, _UNKNOWN)
 
@@ -114,7 +126,7 @@ class Camera:
         corner = np.clip(middle - range_cells - 1, 0, self.seen.shape).astype(np.intp)
         end = np.clip(middle + range_cells + 2, 0, self.seen.shape).astype(np.intp)
         part = slice(corner[0], end[0]), slice(corner[1], end[1])
-        seen, fusion = self.seen[part], self._fusion
+        seen, fusion = self.seen[part], self.fusion
         hits, passes = np.zeros((2, *seen.shape), dtype=np.int32)
         _cast_rays(self._truth, self._missed, hits, passes, (int(corner[0]), int(corner[1])), rays)
         _fuse(self._hits[part], self._passes[part], hits, passes, fusion, seen)
@@ -126,14 +138,15 @@ class Camera:
     def _rays(self, x: float, y: float, heading_deg: float, shift: tuple[float, float]) -> "_Rays":
         """Draw the errors of the rays of one picture."""
         sensor, rng = self._sensor, self._rng
-        angles = _ray_angles(heading_deg, self._view_deg, self._range_cells)
+        apart_deg = 0.0 if sensor.is_exact else RAY_DEG
+        angles = _ray_angles(heading_deg, self._view_deg, self._range_cells, apart_deg)
         noise = sensor.range_noise_m / self._cell_m * rng.standard_normal(len(angles))
         if sensor.is_exact:
             return _Rays((x, y), shift, angles, noise, self._range_cells)
         turn = math.radians(sensor.heading_noise_deg) * rng.standard_normal()
         lost = rng.random(len(angles)) < sensor.missed_return_fraction
         noise[lost] = math.nan
-        cleared_cells = min(self._range_cells, self._fusion.cleared_m / self._cell_m)
+        cleared_cells = min(self._range_cells, self.fusion.cleared_m / self._cell_m)
         grazing = math.sin(math.radians(GRAZING_DEG))
         return _Rays((x, y), shift, angles, noise, self._range_cells, cleared_cells, turn, grazing)
 
@@ -169,9 +182,11 @@ def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Fl
     return np.concatenate([pose[None, :2], ends])
 
 
-def _ray_angles(heading_deg: float, view_deg: float, range_cells: float) -> Floats:
-    """Directions of the rays [radian], at most half a cell apart where they end."""
+def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_deg: float = 0.0) -> Floats:
+    """Directions of the rays [radian], at most half a cell apart where they end, but at least `apart_deg`."""
     rays = int(2 * math.radians(view_deg) * range_cells) + 2
+    if apart_deg > 0.0:
+        rays = min(rays, int(view_deg / apart_deg) + 2)
     return math.radians(heading_deg) + math.radians(view_deg) * (np.arange(rays) / (rays - 1) - 0.5)
 
 

@@ -103,6 +103,7 @@ class Robot:
         direction = errors.uniform(0.0, math.tau)
         self._drift = sensor.drift_m_per_m * math.cos(direction), sensor.drift_m_per_m * math.sin(direction)
         self._camera = Camera(truth, resolution_m, sensor, errors)
+        self._pictured = (math.inf, math.inf), 0.0
         self._look()
 
     @property
@@ -147,6 +148,13 @@ class Robot:
         self._look()
 
     def _look(self) -> None:
+        """Take a picture, if the mapper wants another one here."""
+        (x, y), heading_deg = self._pictured
+        turned_deg = abs((self.heading_deg - heading_deg + 180.0) % 360.0 - 180.0)
+        moved_m = math.hypot(self.position[0] - x, self.position[1] - y) * self._cell_m
+        if moved_m < self._camera.fusion.travel_m and turned_deg < self._camera.fusion.turn_deg:
+            return
+        self._pictured = self.position, self.heading_deg
         under = self._footprint + self._cell()
         inside = ((under >= 0) & (under < self.seen.shape)).all(axis=1)
         self._camera.look(*self.position, self.heading_deg, self._shift, under[inside])
