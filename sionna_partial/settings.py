@@ -350,11 +350,13 @@ MIXED_SENSORS = {
     "range_noise_m": (0.0, 0.05),
     "drift_m_per_m": (0.0, 0.02),
     "missed_wall_fraction": (0.0, 0.1),
+    "heading_noise_deg": (0.0, 0.5),
+    "missed_return_fraction": (0.0, 0.1),
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
-The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
-than large (the square of a uniform number).
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras and the mapper uniformly, and errors
+more often small than large (the square of a uniform number).
 """
 
 

@@ -4,6 +4,7 @@ import hashlib
 import logging
 import math
 from dataclasses import dataclass
+from typing import get_args
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from sionna_partial.errors import MapError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings
+from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, Fusion, SensorSettings
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 
@@ -107,7 +108,8 @@ def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
     values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
     if rng.random() < _LIDAR_FRACTION:
         values["field_of_view_deg"] = 360.0
-    return SensorSettings(**values)
+    fusions = get_args(Fusion)
+    return SensorSettings(**values, fusion=fusions[rng.integers(len(fusions))])
 
 
 def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
