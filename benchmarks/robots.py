@@ -29,8 +29,8 @@ from sionna_partial.maps.wall_cells import ragged_edges, row_runs
 from sionna_partial.settings import Fusion
 
 REAL = ("slam/*.yaml", "ros/*.yaml", "measured/dae/map.yaml", "measured/bleflat/robot.yaml", "vacuum/*.json")
-ERRORS = {"drift_m_per_m": 0.002, "heading_noise_deg": 0.3}
-RANGE_NOISES_M = (0.0, 0.01, 0.02, 0.03)
+ERRORS = {"drift_m_per_m": 0.0005, "heading_noise_deg": 0.2}
+RANGE_NOISES_M = (0.0, 0.005, 0.01, 0.02, 0.03)
 FIRST_SEED, OBSERVED = 74_000, 0.9
 COLUMNS = ("1", "2", "3", "4", "5+", "specks", "gaps", "ragged", "noise")
 

@@ -469,7 +469,7 @@ def context_of(phi: LinkFeatures) -> LinkContext:
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
-    """Return the weight, 0 to 1, of errors on maps of full noise against exact ones: a little noise has most of them."""
+    """Return the weight, 0 to 1, of the errors of maps with full noise: a little noise causes most of them."""
     return np.sqrt(np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE))
 
 
