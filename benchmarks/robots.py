@@ -45,7 +45,8 @@ def main() -> None:
     print("| map | " + " | ".join(COLUMNS) + " |\n" + "|---" * (1 + len(COLUMNS)) + "|")
     for name, partial in real_maps(arguments.shared):
         print(row(name, shape(partial)), flush=True)
-    for kind, count, range_m in ((None, arguments.homes, 12.0), ("warehouse", arguments.warehouses, 20.0)):
+    cases = ((None, arguments.homes, 12.0), ("warehouse", arguments.warehouses, 20.0))
+    for kind, count, range_m in (case for case in cases if case[1]):
         buildings = [sp.make_home(FIRST_SEED + index, kind) for index in range(count)]
         for fusion in get_args(Fusion):
             for noise_m in RANGE_NOISES_M:
