@@ -27,8 +27,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.datasets.home_links import closed_home, home_links, map_area
-from sionna_partial.datasets.home_sources import home_sources
+from sionna_partial.datasets.home_links import closed_home, home_links, home_sources, map_area
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
 from sionna_partial.evaluation.metrics import measure

@@ -1,11 +1,15 @@
-"""Short names for the types of arrays, and dataclasses whose arrays cannot be changed."""
+"""Types of arrays, read-only arrays of dataclasses, and geometry in the plane."""
 
+import math
 from dataclasses import fields
 from functools import wraps
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
+
+from sionna_partial.process import njit
 
 Floats: TypeAlias = NDArray[np.float64]
 Bools: TypeAlias = NDArray[np.bool_]
@@ -49,3 +53,55 @@ def read_only(cls: _Class) -> _Class:
 
     cls.__init__, cls.__setstate__ = __init__, __setstate__  # type: ignore[misc, attr-defined]
     return cls
+
+
+def cross(first: Floats, second: Floats) -> Floats:
+    """Return the cross products of vectors (..., 2)."""
+    return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
+
+
+def largest_part(mask: Bools) -> Bools:
+    """Return the cells (ny, nx) of the largest part of a mask whose cells touch by edges."""
+    labels, _ = ndimage.label(mask)
+    return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
+
+
+def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
+    """Return the largest value in each of the areas 0 to `count`, which `area` numbers. Faster than ndimage.maximum."""
+    largest = np.zeros(count + 1)
+    np.maximum.at(largest, area.ravel(), values.ravel())
+    return largest
+
+
+def grid_edges(cost: Floats) -> tuple[Indices, Floats]:
+    """Return pairs (2, E) of neighbouring cells of a grid, in eight directions, and the cost of a step between them.
+
+    A cell that costs 0 cannot be crossed, nor can the corner at which two such cells meet (skimage's MCP would take
+    that corner).
+    """
+    cell, (ny, nx), passable = np.arange(cost.size).reshape(cost.shape), cost.shape, cost > 0
+    ends, costs = [], []
+    for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        here = slice(0, ny - down), slice(max(0, -right), nx - max(0, right))
+        there = slice(down, ny), slice(max(0, right), nx + min(0, right))
+        beside = passable[here[0], there[1]] | passable[there[0], here[1]]
+        linked = passable[here] & passable[there] & beside
+        ends.append([cell[here][linked], cell[there][linked]])
+        costs.append(math.hypot(down, right) * (cost[here][linked] + cost[there][linked]) / 2)
+    return np.concatenate(ends, axis=1), np.concatenate(costs)
+
+
+@njit(cache=True)
+def span_in_strip(corners, low, high):  # type: ignore[no-untyped-def]
+    """Return the smallest and largest x of a convex polygon (n, 2) within low <= y <= high; inf and -inf if outside."""
+    left, right = np.inf, -np.inf
+    for here in range(len(corners)):
+        x, y = corners[here, 0], corners[here, 1]
+        next_x, next_y = corners[(here + 1) % len(corners), 0], corners[(here + 1) % len(corners), 1]
+        if low <= y <= high:
+            left, right = min(left, x), max(right, x)
+        for level in (low, high):
+            if (y - level) * (next_y - level) < 0.0:
+                at = x + (level - y) / (next_y - y) * (next_x - x)
+                left, right = min(left, at), max(right, at)
+    return left, right

@@ -30,6 +30,12 @@ def no_progress(fraction: float, message: str) -> None:
     """Report nothing."""
 
 
+def reason_of(error: Exception) -> str:
+    """Return the message of an expected error; of any other error, its type and message."""
+    known = isinstance(error, SionnaPartialError | OSError | MemoryError)
+    return str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
+
+
 def shown(value: object) -> str:
     """Return a value as a short text of one line."""
     try:
@@ -84,6 +90,11 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
     """Raise a SettingsError unless `value` is one of several words."""
     words = tuple(choices)
     require(isinstance(value, str) and value in words, name, value, f"choose one of {', '.join(words)}.")
+
+
+def transmitter_names(count: int) -> list[str]:
+    """Return the names of several transmitters that were given without: "tx1", "tx2" and so on."""
+    return [f"tx{number}" for number in range(1, count + 1)]
 
 
 def plain(value: Any) -> Any:

@@ -26,7 +26,7 @@ class Finding:
     ----------
     name, value : str
     remedy : str
-        What to do; "" if all is well.
+        The remedy; "" if all is well.
     """
 
     name: str

@@ -1,7 +1,7 @@
 """Loads the LLVM library of Dr.Jit before Dr.Jit and TensorFlow meet.
 
 Dr.Jit compiles its kernels with an LLVM that it finds when it is imported, and accepts versions 15 and 16, which abort
-the process in path solving. TensorFlow exports LLVM symbols that would replace those of that library. So pip's library
+the process in path solving. TensorFlow exports LLVM symbols that would replace its symbols. So pip's library
 is loaded when `sionna_partial` is imported, with its own symbols first, and `DRJIT_LIBLLVM_PATH` names it for Dr.Jit,
 stock Sionna RT too, and for child processes.
 """

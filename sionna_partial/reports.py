@@ -88,7 +88,7 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
 
 def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
     """Write `REPORT_FILES`, all or none, and return them."""
-    from sionna_partial.plots.evaluation_plot import plot_reliability, plot_stages
+    from sionna_partial.plots.result_plots import plot_reliability, plot_stages
     from sionna_partial.plots.style import figure_png
 
     text = json.dumps(as_json(evaluation), indent=2, allow_nan=False) + "\n"

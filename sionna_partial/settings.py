@@ -1,9 +1,12 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
+import functools
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, get_args
 
-from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number
+from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number, shown
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -12,6 +15,7 @@ from sionna_partial.constants import (
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
 )
+from sionna_partial.errors import ArgumentError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "vacuum": ((0.001, 100.0),),
@@ -69,8 +73,15 @@ Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]
 Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
 
-@dataclass(frozen=True)
+
+_BY_CONDUCTIVITY = float("nan")
+"""Default of the exponent of a conductivity, which depends on that conductivity."""
+
+
+@dataclass(frozen=True, repr=False)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
@@ -88,8 +99,9 @@ class Material(Checked):
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
     conductivity_exponent : float
-        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. Ignored
-        for an ITU material.
+        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. By default
+        it is 0.94 with the conductivity of drywall, so that `Material()` is the default drywall, and 0 with any other.
+        Ignored for an ITU material.
 
     Raises
     ------
@@ -109,12 +121,20 @@ class Material(Checked):
     conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
-    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = 0.0
+    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = _BY_CONDUCTIVITY
 
     def __post_init__(self) -> None:
+        if self.conductivity_exponent is _BY_CONDUCTIVITY:
+            is_drywall = self.itu is None and self.conductivity_s_m == DRYWALL_CONDUCTIVITY_S_M
+            object.__setattr__(self, "conductivity_exponent", DRYWALL_CONDUCTIVITY_EXPONENT if is_drywall else 0.0)
         super().__post_init__()
         if self.itu is not None:
             require_choice("itu", self.itu, ITU_BANDS_GHZ)
+
+    def __repr__(self) -> str:
+        names = ["relative_permittivity", "conductivity_s_m"] if self.itu is None else ["itu"]
+        names += ["thickness_m", *(["conductivity_exponent"] if self.itu is None else [])]
+        return f"Material({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     @classmethod
     def named(cls, name: str) -> "Material":
@@ -122,7 +142,7 @@ class Material(Checked):
 
         The names are the keys of `WALL_MATERIALS`, such as "drywall", the default, and the materials of ITU-R P.2040-3,
         with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
-        such walls: `docs/through_walls.md`.
+        such walls: `docs/walls.md`.
 
         Examples
         --------
@@ -146,7 +166,7 @@ class Material(Checked):
 
 
 WALL_MATERIALS = {
-    "drywall": Material(conductivity_exponent=DRYWALL_CONDUCTIVITY_EXPONENT),
+    "drywall": Material(),
     "brick": Material(itu="brick", thickness_m=0.11),
     "concrete": Material(itu="concrete", thickness_m=0.2),
     "reinforced concrete": Material(itu="concrete", thickness_m=0.25),
@@ -157,7 +177,7 @@ WALL_MATERIALS = {
     "metal": Material(itu="metal", thickness_m=0.005),
 }
 """Materials that walls have, with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less
-below; coated glass is glass whose conductivity stands for its film of metal."""
+below; coated glass is glass with the conductivity of its metal film."""
 
 DRYWALL = WALL_MATERIALS["drywall"]
 """The default material."""
@@ -178,7 +198,7 @@ class SceneSettings(Checked):
     floor_extent : {"observed", "none"}
         Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or no floor and ceiling.
     ceiling : bool
-        Whether there is a ceiling above the floor.
+        True for a ceiling above the floor.
     outline : {"lines", "cells"}
         Position of the walls: few straight lines fitted to the wall cells, or the staircase through the centres of
         the wall cells as they are, for which `bridge_gap_m` does not count.
@@ -219,14 +239,14 @@ class TraceSettings(Checked):
     diffraction_walls : int
         Largest number of reflections at walls of a floor plan before the diffraction, and after it: 0, 1 or 2.
     open_ends : bool
-        Whether a wall of a floor plan diffracts also where it ends because observation did.
+        True if a wall of a floor plan diffracts also at an end where observation stopped.
     power_tolerance_db : float or None
         By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
-        every path. The power of all candidates is computed before any is verified, and is at least what Sionna RT finds
-        but for rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir` and the like),
-        which are sums of fields: links that were traced with None are traced again for them.
+        every path. The power of all candidates is computed before any is verified, and is at least the power that
+        Sionna RT finds, up to rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir`
+        and the like), which are sums of fields: links that were traced with None are traced again for them.
     refraction : bool or None
-        Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
+        True if paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
         below.
     max_walls : int
         Largest number of walls that a path goes through, 1 to 16. `max_depth` does not count them.
@@ -438,13 +458,13 @@ class PredictorSettings(Checked):
     Parameters
     ----------
     networks : {"paper", "paths", "map"}
-        "paper" has the networks of the paper alone. "paths" adds one that sees what each path crosses, "map" adds two,
+        "paper" has the networks of the paper alone. "paths" adds one that sees the crossings of paths, "map" adds two,
         of which one sees the map around the transmitter; both need features with a context, as `link_features`
         returns them.
     frequency_hz : float
         Carrier frequency of the links [Hz]; it sets the gain of free space.
     diffraction : bool
-        Whether the links were traced with diffraction.
+        True if the links were traced with diffraction.
     passes : int
         Number of passes of the added networks over the training links.
     steps : int
@@ -452,14 +472,14 @@ class PredictorSettings(Checked):
     batch_size : int
         Links in such a step.
     learning_rate : float
-        Of Adam at the first such step; it falls to 0 along a cosine.
+        Learning rate of Adam at the first such step; it falls to 0 along a cosine.
     minimum_links : int
         A network of the paper with fewer links is not trained: it returns mean and standard deviation of those it has
         and of prior knowledge.
     seed : int
-        Of first weights and batches.
+        Seed of first weights and batches.
     through_walls : bool
-        Whether the links were traced through walls.
+        True if the links were traced through walls.
 
     Raises
     ------
@@ -519,3 +539,24 @@ class PlacementSettings(Checked):
     tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
+
+
+def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Let a function answer a setting that was given as an argument with the settings that hold it."""
+    parameters = inspect.signature(function).parameters
+    kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
+    holders = {
+        name: f"{argument}={kind.__name__}({name}=...)"
+        for argument, kind in kinds.items()
+        if argument in parameters
+        for name in kind.__dataclass_fields__
+    }
+
+    @functools.wraps(function)
+    def call(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        name = next((name for name in kwargs if name not in parameters and name in holders), None)
+        if name is not None:
+            raise ArgumentError(f"{name} = {shown(kwargs[name])} is a setting: give {holders[name]}.")
+        return function(*args, **kwargs)
+
+    return call

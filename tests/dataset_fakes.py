@@ -44,9 +44,9 @@ if "home_process" in " ".join(sys.orig_argv):
 
 def install() -> None:
     """Replace the making and the tracing of homes in this process."""
-    from sionna_partial.datasets import home_links, home_sources
+    from sionna_partial.datasets import home_links
 
-    home_sources.make_home = make_home  # type: ignore[assignment]
+    home_links.make_home = make_home  # type: ignore[assignment]
     home_links.home_links = fake_links  # type: ignore[assignment]
 
 

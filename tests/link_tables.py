@@ -8,7 +8,7 @@ from predictor_links import corridor_of, corridors, make_context, make_links, qu
 
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.datasets.shards import INDEX_FILE, shard_path, write_shard
-from sionna_partial.evaluation.baselines import Baselines, Majority
+from sionna_partial.evaluation.evaluate import Baselines, Majority
 
 
 def make_table(homes=4, links=300, stages=(0, 100), seed=0):

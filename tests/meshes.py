@@ -4,7 +4,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from sionna_partial.maps.mesh.mesh import SceneMesh, merged_mesh
+from sionna_partial.maps.environment import SceneMesh, merged_mesh
 
 OBSERVED = [(0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0)]
 """Floor of the room."""

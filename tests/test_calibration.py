@@ -15,8 +15,8 @@ import sionna_partial as sp
 from sionna_partial.calibration import material_fit
 from sionna_partial.calibration.measured_building import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
+from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-from sionna_partial.maps.mesh.mesh import merged_mesh
 from sionna_partial.scene.scene import constants_of
 from sionna_partial.tracing.power import reflection_loss_db
 

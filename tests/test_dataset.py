@@ -22,8 +22,8 @@ from link_tables import assert_same
 
 from sionna_partial.datasets import dataset, home_process
 from sionna_partial.datasets.dataset import DatasetReport, build_dataset
+from sionna_partial.datasets.home_links import HomeSource
 from sionna_partial.datasets.home_process import HomeTask, run_home
-from sionna_partial.datasets.home_sources import HomeSource
 from sionna_partial.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
 from sionna_partial.files import locked_folder

@@ -9,11 +9,12 @@ from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation.baselines import Baselines, Majority
 from sionna_partial.evaluation.evaluate import (
     ALWAYS_OUTAGE,
     WITH_INDOOR,
     WITHOUT_INDOOR,
+    Baselines,
+    Majority,
     evaluate,
     home_scores,
 )

@@ -11,8 +11,8 @@ from test_trace import all_paths
 
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.tracing import simulation
 from sionna_partial.tracing.finder import PlanScene, write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths, Wedges

@@ -2,7 +2,7 @@ import numpy as np
 import shapely
 from shapely import LineString, Polygon, box
 
-from sionna_partial.worlds.furniture import furnish, union_of
+from sionna_partial.worlds.buildings import furnish, union_of
 
 ROOM = box(0, 0, 5, 4)
 DOOR = LineString([(1, 0), (1.9, 0)])

@@ -17,22 +17,20 @@ from types import CodeType, ModuleType
 import pytest
 
 import sionna_partial
+from sionna_partial.resources import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("arrays", "constants", "errors", "checks", "display", "progress", "settings", "resources"),
-        *("process", "files", "planar", "llvm"),
+        *("process", "arrays", "constants", "errors", "resources", "checks", "display", "settings", "files", "llvm"),
     ),
     "maps": (
         *(
             "mesh.cut",
-            "mesh.mesh",
             "environment",
             "wall_cells",
-            "rooms",
             "import_report",
             "partial_map",
             "mesh.cells",
@@ -40,15 +38,14 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawing_units", "drawings", "ifc", "bags", "map_files"),
+        *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "pictures", "map_files"),
     ),
-    "worlds": ("furniture", "buildings", "homes", "camera", "robot"),
-    "scene": ("lines", "outlines", "floor_plan", "scene"),
+    "worlds": ("buildings", "homes", "camera", "robot"),
+    "scene": ("outlines", "floor_plan", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
-        *("plan.beams", "plan.specular", "plan.legs", "plan.obstacles", "plan.crossing_beams", "plan.crossings"),
-        *("plan.diffraction", "plan.crossed_edges"),
-        *("mesh.sequences", "mesh.candidates", "mesh.crossings", "stock", "finder"),
+        *("plan.room", "plan.beams", "plan.reflections", "plan.edges"),
+        *("mesh.sequences", "mesh.reflections", "stock", "finder"),
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
@@ -64,16 +61,13 @@ ROOMS = {
     "networks": ("coverage.network",),
     "differentiable": ("smooth_lengths", "scene"),
     "calibration": ("measured_building", "material_fit", "calibration"),
-    "placement": ("area", "placement", "several"),
+    "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
-    "live": ("coverage", "topics", "bags", "dds", "rosbridge"),
-    "datasets": ("link_table", "home_sources", "home_links", "shards", "home_process", "dataset", "dataset_links"),
-    "evaluation": ("metrics", "baselines", "evaluate"),
+    "live": ("coverage", "topics"),
+    "datasets": ("link_table", "home_links", "shards", "home_process", "dataset"),
+    "evaluation": ("metrics", "evaluate"),
     "training": ("predictor", "paths", "walls"),
-    "plots": (
-        *("style", "map_plot", "coverage_plot", "coverage_viewer", "exploration_plot"),
-        *("material_plot", "placement_plot", "evaluation_plot"),
-    ),
+    "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
     "app": ("jobs", "uploads", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
@@ -131,6 +125,9 @@ NOT_IMPORTED = {
 }
 """Declared dependencies that no module imports, and why they are needed."""
 
+COME_WITH = {"drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
+"""Imported packages that a declared one cannot do without, and which it therefore installs in a version that fits."""
+
 
 @cache
 def tree_of(module: str) -> ast.Module:
@@ -166,7 +163,7 @@ def own_imports(module: str) -> set[str]:
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["ifc"], *extras["live"]] if kind == "run" else extras[kind]
+    lines = extras["dev"] if kind == "dev" else sum((extras[name] for name in EXTRAS), project["dependencies"])
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
@@ -254,7 +251,7 @@ for name in ("", *typer.main.get_command(app).commands):
         finally:
             sys.setprofile(None)
         files = {code.co_filename for code in codes if code.co_name != "<module>"}
-        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 42
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 43
 
 
 class TestPublicNames:
@@ -288,7 +285,15 @@ class TestDependencies:
         names = {name.partition(".")[0] for module in MODULES for name in imported(tree_of(module))} - own
         distributions = metadata.packages_distributions()
         used = {distributions[name][0].lower().replace("_", "-") for name in names}
-        assert declared("run") == used | NOT_IMPORTED.keys()
+        assert COME_WITH.keys() < used
+        assert declared("run") == used - COME_WITH.keys() | NOT_IMPORTED.keys()
+
+    def test_packages_of_extras_are_known_to_the_error_that_names_them(self) -> None:
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        extras = {name: lines for name, lines in project["optional-dependencies"].items() if name not in ("all", "dev")}
+        packages = {name: {*re.findall(r"\w+(?=[]>[])", " ".join(lines))} for name, lines in extras.items()}
+        assert packages == {name: {*known} for name, known in EXTRAS.items()}
+        assert project["optional-dependencies"]["all"] == [f"sionna-partial[{','.join(sorted(extras))}]"]
 
     def test_what_is_declared_is_locked(self) -> None:
         lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")

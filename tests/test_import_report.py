@@ -10,9 +10,8 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.maps.import_report import Elements, ImportNotes, MapWarning
+from sionna_partial.maps.import_report import Elements, ImportNotes, MapWarning, rooms_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.rooms import rooms_of
 
 
 def flat(cell_m: float = 0.05, scale: float = 1.0) -> PartialMap:

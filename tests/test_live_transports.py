@@ -19,12 +19,22 @@ from typer.testing import CliRunner
 
 import sionna_partial as sp
 from sionna_partial import cli
-from sionna_partial.live.topics import GRID_TYPE, UPDATE_TYPE, VIEWS_TYPE, Listener, Topics
+from sionna_partial.live import topics as topics_module
+from sionna_partial.live.topics import (
+    GRID_TYPE,
+    UPDATE_TYPE,
+    VIEWS_TYPE,
+    Dds,
+    Listener,
+    Rosbridge,
+    Topics,
+    _store,
+    filled,
+    struct,
+)
 
 pytest.importorskip("cyclonedds")
 pytest.importorskip("websockets")
-
-from sionna_partial.live import dds, rosbridge
 
 CELLS = [[100, 100, 100, 100], [100, 0, 0, -1], [100, 100, 100, 100]]
 POSE = {"position": dict.fromkeys("xyz", 0.0), "orientation": {**dict.fromkeys("xyz", 0.0), "w": 1.0}}
@@ -41,11 +51,10 @@ LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25"]
 ROBOT = """
 import sys, time
 from test_live_transports import GRID, GRID_TYPE
-from sionna_partial.live import dds
-from sionna_partial.live.topics import Topics
-robot = dds.Dds(Topics(map="/unused"), {})
+from sionna_partial.live.topics import Dds, Topics, filled
+robot = Dds(Topics(map="/unused"), {})
 writer = robot._writer("/map", GRID_TYPE)
-writer.write(dds.filled(GRID_TYPE, GRID))
+writer.write(filled(GRID_TYPE, GRID))
 reader = robot._reader("/radio/tx", GRID_TYPE, True)
 for _ in range(30_000):
     for each in reader.take(1):
@@ -73,13 +82,13 @@ class TestDds:
         ],
     )
     def test_wire_format_is_that_of_ros(self, kind: str, values: dict[str, Any]) -> None:
-        store = get_typestore(Stores.ROS2_HUMBLE) if kind != UPDATE_TYPE else dds._store()
-        message = store.deserialize_cdr(dds.filled(kind, values).serialize(), kind)
+        store = get_typestore(Stores.ROS2_HUMBLE) if kind != UPDATE_TYPE else _store()
+        message = store.deserialize_cdr(filled(kind, values).serialize(), kind)
         assert message.header.frame_id == "map"
         assert message.header.stamp.nanosec == 8
         if kind == GRID_TYPE:
             assert message.data.tolist() == GRID["data"]
-        assert dds.struct(kind).deserialize(bytes(store.serialize_cdr(message, kind))) == dds.filled(kind, values)
+        assert struct(kind).deserialize(bytes(store.serialize_cdr(message, kind))) == filled(kind, values)
 
     def test_robot_in_another_process(self, domain: dict[str, str]) -> None:
         command = [sys.executable, "-m", "sionna_partial", "live", *LIVE]
@@ -109,7 +118,7 @@ class TestDds:
 
         grids: list[Any] = []
         live = sp.LiveCoverage((1.5, 1.5, 1.5), grids.append)
-        robot = dds.Dds(Topics(), {"tx": None})
+        robot = Dds(Topics(), {"tx": None})
         robot._readers = [("/map", Reader())]
         robot.poll(Listener(live, Topics()))
         robot.close()
@@ -119,7 +128,7 @@ class TestDds:
     def test_refused_domain(self, number: Any, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("ROS_DOMAIN_ID", str(number))
         with pytest.raises(sp.SionnaPartialError, match=r"domain|ROS_DOMAIN_ID"):
-            dds.Dds(Topics(), {})
+            Dds(Topics(), {})
 
 
 class Server:
@@ -164,7 +173,7 @@ def server() -> Iterator[Server]:
 class TestRosbridge:
     def test_server_that_starts_again(self, server: Server, caplog: pytest.LogCaptureFixture) -> None:
         topics = Topics()
-        robot = rosbridge.Rosbridge(server.url, topics, {"tx": None})
+        robot = Rosbridge(server.url, topics, {"tx": None})
         live = sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish, sp.LiveSettings(spacing_m=0.25))
         thread = live.start()
         for _ in range(2):  # the second time it gets the last answer at once
@@ -181,23 +190,23 @@ class TestRosbridge:
         assert "it ended the connection; it is tried again every 1 s" in caplog.text
 
     def test_too_large(self, server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
-        monkeypatch.setattr(rosbridge, "MAX_BYTES", 100)
+        monkeypatch.setattr(topics_module, "MAX_BYTES", 100)
         server.texts = ["x" * 200]
-        robot = rosbridge.Rosbridge(server.url, Topics(), {})
+        robot = Rosbridge(server.url, Topics(), {})
         robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
         assert "1009 (message too big)" in caplog.text
 
     def test_no_server(self, caplog: pytest.LogCaptureFixture) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
             url = f"ws://127.0.0.1:{free.getsockname()[1]}"
-        robot = rosbridge.Rosbridge(url, Topics(), {})
+        robot = Rosbridge(url, Topics(), {})
         robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
         assert "it is tried again" in caplog.text
 
     @pytest.mark.parametrize("url", ["robot:9090", "ws://robot:99999", "ws://[::1", "ws://robot/\0"])
     def test_refused_address(self, url: str) -> None:
         with pytest.raises(sp.SionnaPartialError, match="give for example ws://robot:9090"):
-            rosbridge.Rosbridge(url, Topics(), {})
+            Rosbridge(url, Topics(), {})
 
 
 @pytest.mark.usefixtures("command_line")

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps.mesh import mesh as mesh_module
-from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps import environment
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.settings import Material
 
 CONCRETE = Material(itu="concrete")
@@ -106,7 +106,7 @@ class TestSceneMesh:
             SceneMesh(**(SQUARE | change))
 
     def test_too_many_triangles(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(mesh_module, "MAX_TRIANGLES", 1)
+        monkeypatch.setattr(environment, "MAX_TRIANGLES", 1)
         with pytest.raises(MapError, match="triangles has 2 rows, more than 1: cut or simplify the mesh"):
             SceneMesh(**SQUARE)
 

@@ -14,8 +14,8 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
-from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

@@ -19,9 +19,9 @@ CELLS = {
     "inline": "%matplotlib inline\nimport matplotlib.pyplot as plt\nfigure = sp.plot_map(partial)",
     "again": "figure",
     "open": "plt.get_fignums()",
-    "short": "from sionna_partial import progress\nwith progress.reporting(None) as report:\n    report(0.5, 'half')",
-    "bar": "progress.WAIT_S = 0.0\nwith progress.reporting(None) as report:\n    report(0.5, 'half <of it>')",
-    "silent": "with progress.reporting(False) as report:\n    report(0.5, 'half')",
+    "short": "from sionna_partial import display\nwith display.reporting(None) as report:\n    report(0.5, 'half')",
+    "bar": "display.WAIT_S = 0.0\nwith display.reporting(None) as report:\n    report(0.5, 'half <of it>')",
+    "silent": "with display.reporting(False) as report:\n    report(0.5, 'half')",
 }
 
 

@@ -15,7 +15,7 @@ class CancelledError(Exception):
 
 @dataclass(frozen=True)
 class Status:
-    """What the page shows: a message, the fraction of the work that is done or None, and whether it is an error."""
+    """Status on the page: a message, the fraction of the work that is done or None, and whether it is an error."""
 
     message: str = ""
     fraction: float | None = None
@@ -92,7 +92,7 @@ class _Collector(logging.Handler):
 
 @contextmanager
 def collected_warnings(found: list[str] | None = None) -> Iterator[list[str]]:
-    """Collect what the package logs as a warning in this thread."""
+    """Collect the warnings that the package logs in this thread."""
     found = [] if found is None else found
     logger, collector = logging.getLogger("sionna_partial"), _Collector(found)
     logger.addHandler(collector)

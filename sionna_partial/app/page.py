@@ -1,10 +1,11 @@
-"""The page of the app: what a session has, drawn by Bokeh, and what is clicked, given to the session."""
+"""The page of the app: the state of a session drawn by Bokeh, and clicks that are handed to the session."""
 
 import functools
 import html
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,7 @@ _TOOLTIPS = (
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 
 _UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click, or the next drag would move what was clicked as well."""
+"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
@@ -52,77 +53,11 @@ _LOST = (
     "message.text = 'The connection has ended: start sionna-partial app again, and open the address that it prints.'"
 )
 
-TEMPLATE = """\
-{% block title %}Radio coverage{% endblock %}
-{% block postamble %}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="referrer" content="no-referrer">
-<style>
-  body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
-  main { display: grid; grid-template: "title title" auto "map status" auto "map controls" 1fr / minmax(0, 1fr) 21rem;
-    gap: 0 1rem; max-width: 90rem; margin: auto; padding: 0.8rem; box-sizing: border-box }
-  #status { grid-area: status } #picture { grid-area: map } #controls { grid-area: controls }
-  h1 { font-size: 1.15rem; margin: 0 0 1rem; grid-area: title }
-  h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
-  section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.7rem; margin-bottom: 0.8rem }
-  @media (max-width: 52rem) { main { padding: 0.4rem;
-    grid-template: "title" auto "status" auto "map" auto "controls" auto / minmax(0, 1fr) } }
-</style>
-{% endblock %}
-{% block contents %}
-<main>
-  <h1>Radio coverage of a partly known building</h1>
-  <section id="status" aria-label="Status">{{ embed(roots.status) }}</section>
-  <div id="picture">
-    <section aria-label="Map with transmitters and coverage">{{ embed(roots.choices) }}
-      {{ embed(roots.picture) }}{{ embed(roots.summary) }}</section>
-    <section aria-labelledby="files"><h2 id="files">Download and repeat</h2>{{ embed(roots.files) }}</section>
-  </div>
-  <div id="controls">
-    <section aria-labelledby="map"><h2 id="map">Map</h2>{{ embed(roots.map) }}</section>
-    <section aria-labelledby="tx"><h2 id="tx">Transmitters</h2>{{ embed(roots.transmitters) }}</section>
-    <section aria-labelledby="radio"><h2 id="radio">Radio</h2>{{ embed(roots.radio) }}</section>
-    <section aria-labelledby="robot"><h2 id="robot">Robot and measurements</h2>{{ embed(roots.robot) }}</section>
-  </div>
-</main>
-<input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
-<input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
-<script>
-  try { // a pause before a drag is no long press, which no tool here takes
-    Bokeh.require("core/ui_gestures").UIGestures.press_threshold = 2 ** 30
-  } catch { console.info("A drag begins within 0.3 s.") }
-  const labels = {
-    "noUi-handle": "Threshold [dBm]", "bk-spin-btn-up": "more", "bk-spin-btn-down": "less",
-    "bk-events": "Map; the fields x and y move its transmitters",
-  }
-  document.addEventListener("focusin", event => {
-    const node = event.composedPath()[0]
-    const name = Object.keys(labels).find(each => node.classList?.contains(each))
-    if (name || node.title) node.setAttribute("aria-label", labels[name] ?? node.title)
-    if (name == "bk-events") node.setAttribute("role", "img")
-    else if (node.tagName == "DIV" && node.title) node.setAttribute("role", "button")
-  })
-  for (const [id, kind] of [["map-file", "map"], ["csv-file", "measurements"]]) {
-    const input = document.getElementById(id)
-    input.onchange = async () => {
-      const form = new FormData()
-      let size = 0
-      for (const file of input.files) { form.append("file", file); size += file.size }
-      input.value = ""
-      if (size > {{ most_bytes }}) return alert("Too large: start sionna-partial app with the map's path.")
-      try {
-        const answer = await fetch("{{ files_url }}/" + kind, { method: "POST", body: form })
-        if (!answer.ok) alert(await answer.text())
-      } catch { alert("The file was not sent: start sionna-partial app again, and open the address that it prints.") }
-    }
-  }
-</script>
-{% endblock %}
-"""
+TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 
 
 class Page:
-    """What one window shows.
+    """Page of one window.
 
     Parameters
     ----------
@@ -146,7 +81,7 @@ class Page:
             document.add_root(model)
         document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
-    # What is made once
+    # Widgets
 
     def _make_picture(self) -> None:
         from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
@@ -180,8 +115,10 @@ class Page:
         ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
         plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self._values, **where}
+        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
         self._parts = {
-            name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in _LAYERS.items()
+            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below")
+            for name, layer in _LAYERS.items()
         }
         plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
         plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
@@ -244,7 +181,7 @@ class Page:
         self.fields = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[00]"),
-                functools.partial(self._change_field, name),
+                functools.partial(lambda name, value: self._change(**{name: float(value)}), name),
                 "value_throttled",
             )
             for name, title, step, low, high in (
@@ -345,12 +282,12 @@ class Page:
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
-        """Give what is chosen to a function; what is refused is shown."""
+        """Call a function with the chosen value; a refusal is shown."""
 
         def changed(_name: str, _old: Any, new: Any) -> None:
             if self._is_showing:
                 return
-            if new is None:  # a field was emptied: what it had comes back
+            if new is None:  # a field was emptied: its old value is shown again
                 self.show()
             else:
                 self._guarded(take, new)
@@ -372,7 +309,7 @@ class Page:
         except SionnaPartialError as error:
             self.session.refuse(error)
 
-    # What is clicked
+    # Callbacks
 
     def _on_points(self, _name: str, _old: Any, new: Any) -> None:
         if not self._is_showing:
@@ -392,9 +329,6 @@ class Page:
             self.session.chosen = name
         self.show()
 
-    def _change_field(self, name: str, value: float) -> None:
-        self._change(**{name: float(value)})
-
     def _change_antenna(self, name: str, value: Any) -> None:
         antenna = self.session.transmitters[self.session.chosen].antenna
         self._change(antenna=replace(antenna, **{name: value}))
@@ -405,10 +339,10 @@ class Page:
     def _change(self, **values: Any) -> None:
         self.session.change(self.session.chosen, **values)
 
-    # What changes
+    # Updates
 
     def show(self) -> None:
-        """Draw what the session has."""
+        """Draw the state of the session."""
         self._is_showing = True
         try:
             self._show_status()
@@ -421,7 +355,7 @@ class Page:
             self._is_showing = False
 
     def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
-        """Draw what has changed alone."""
+        """Draw changes only."""
         if self._drawn.get(name) != key:
             draw()
             self._drawn[name] = key
@@ -480,7 +414,7 @@ class Page:
         self._once("aims", (repr(aims),), functools.partial(setattr, self._aims, "data", aims))
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
-        if self.which.options != options:  # of several, first what a receiver gets
+        if self.which.options != options:  # of several transmitters, first the sum at a receiver
             self.which.options, self.which.value = options, options[0][0]
         self.layer.options = self._options(len(names))
         if self.layer.value not in [value for value, _ in self.layer.options]:
@@ -623,10 +557,6 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
     return text + " Hatched: not observed."
-
-
-def _words(name: str) -> list[str]:
-    return {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}.get(name, [])
 
 
 def _state_words() -> Any:

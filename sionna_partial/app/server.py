@@ -1,9 +1,10 @@
 """The server of the app: one page for each window, under a secret path, and the files that windows send and fetch."""
 
+import asyncio
 import functools
 import secrets
 import socket
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from sionna_partial.app.page import TEMPLATE, Page
@@ -23,6 +24,14 @@ _OTHER_BYTES = 100_000
 _FORM_BYTES = 1_000_000
 """Size of an upload besides its files [bytes]."""
 
+_DOWNLOAD_HEADERS = {
+    "Content-Type": "application/octet-stream",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-store",
+}
+
+_NOTHING_TO_SEND = 404, "There is nothing to send, or the window was closed."
+
 
 class AppServer:
     """Serves the app until `stop`; without a map, windows begin with an example.
@@ -33,7 +42,7 @@ class AppServer:
         With `title`, the name of its file.
     title : str
     address : str
-        Of the interface that is listened at.
+        Address of the network interface.
     port : int
         0 is any free one.
     warnings : sequence of str
@@ -42,7 +51,7 @@ class AppServer:
     Attributes
     ----------
     url : str
-        Of the page; nobody can guess it.
+        Address of the page, with a secret part.
 
     Raises
     ------
@@ -120,96 +129,118 @@ class AppServer:
         self._open_first(session)
 
 
-def _files_handler() -> Any:
-    from tornado.httputil import HTTPFile, HTTPInputError, parse_body_arguments
-    from tornado.ioloop import IOLoop
-    from tornado.web import RequestHandler, stream_request_body
-
-    @stream_request_body
-    class Files(RequestHandler):
-        """Files that a window sends and fetches; `key` is known to that window alone."""
-
-        def initialize(self, sessions: dict[str, Session]) -> None:
-            self._sessions, self._chunks = sessions, list[bytes]()
-            self._receiver: Session | None = None
-
-        def prepare(self) -> None:
-            """Refuse an upload by its header, before anything of its body is read."""
-            if self.request.method != "POST":
-                return
-            key, kind = self.path_args
-            session, size = self._sessions.get(key), self.request.headers.get("Content-Length", "")
-            if session is None or kind not in ("map", "measurements"):
-                self._refuse(404, "There is nothing to send, or the window was closed.")
-            elif not size.isdecimal():
-                self._refuse(411, "The size of an upload has to be in its header.")
-            elif int(size) > MOST_BYTES + _FORM_BYTES:
-                self._refuse(413, f"An upload may have {MOST_BYTES:,} bytes.")
-            elif not self.request.headers.get("Content-Type", "").startswith("multipart/form-data"):
-                self._refuse(415, "An upload has to be a form with files.")
-            elif session.is_receiving:
-                self._refuse(409, "Another upload of this window is under way: wait for its end.")
-            else:
-                session.is_receiving, self._receiver = True, session
-                self.request.connection.set_max_body_size(MOST_BYTES + _FORM_BYTES)  # type: ignore[union-attr]
-
-        def data_received(self, chunk: bytes) -> None:
-            """Keep a part of an upload that `prepare` has accepted."""
-            if self._receiver is not None:
-                self._chunks.append(chunk)
-
-        def on_finish(self) -> None:
-            """Let the window send again."""
-            if self._receiver is not None:
-                self._receiver.is_receiving = False
-
-        on_connection_close = on_finish
-
-        def _refuse(self, code: int, text: str) -> None:
-            self.set_status(code)
-            self.set_header("Content-Type", "text/plain; charset=utf-8")
-            self.finish(text)
-
-        async def get(self, key: str, kind: str) -> None:
-            session = self._sessions.get(key)
-            if session is None or kind not in FILES:
-                self._refuse(404, "There is no such file, or its window was closed.")
-                return
-            try:
-                content = await IOLoop.current().run_in_executor(None, session.file, kind)
-            except (SionnaPartialError, OSError) as error:
-                self._refuse(409, str(error))
-                return
-            self.set_header("Content-Type", "application/octet-stream")
-            self.set_header("Content-Disposition", f'attachment; filename="{FILES[kind]}"')
-            self.set_header("X-Content-Type-Options", "nosniff")
-            self.set_header("Cache-Control", "no-store")
-            await self.finish(content)
-
-        async def post(self, key: str, kind: str) -> None:
-            form: dict[str, list[HTTPFile]] = {}
-            body = b"".join(self._chunks)
-            self._chunks.clear()
-            try:
-                parse_body_arguments(self.request.headers["Content-Type"], body, {}, form)
-            except HTTPInputError as error:
-                self._refuse(400, f"The upload cannot be read: {error}")
-                return
-            files = [(each.filename, each.body) for each in form.get("file", [])]
-            session = self._sessions.get(key)
-            if session is None or not files:
-                self._refuse(404, "There is nothing to send, or the window was closed.")
-                return
-            take = session.upload_map if kind == "map" else session.learn
-            given: Any = files if kind == "map" else files[0][1]
-            session.do(functools.partial(_guarded, session, take, given))
-            await self.finish()
-
-    return Files
+def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]) -> tuple[int, str] | None:
+    """Return the HTTP status and the reason for which an upload is refused by its headers."""
+    size = headers.get("Content-Length", "")
+    if session is None or kind not in ("map", "measurements"):
+        return _NOTHING_TO_SEND
+    if not size.isdecimal():
+        return 411, "The size of an upload has to be in its header."
+    if int(size) > MOST_BYTES + _FORM_BYTES:
+        return 413, f"An upload may have {MOST_BYTES:,} bytes."
+    if not headers.get("Content-Type", "").startswith("multipart/form-data"):
+        return 415, "An upload has to be a form with files."
+    if session.is_receiving:
+        return 409, "Another upload of this window is under way: wait for its end."
+    return None
 
 
-def _guarded(session: Session, take: Callable[[Any], None], given: Any) -> None:
+def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) -> None:
+    """Let a window read uploaded files (name, content), and show why it cannot."""
     try:
-        take(given)
+        if kind == "map":
+            session.upload_map(files)
+        else:
+            session.learn(files[0][1])
     except SionnaPartialError as error:
         session.refuse(error)
+
+
+class _Files:
+    """Handler of the files that a window sends and fetches; `key` is known to that window alone.
+
+    `_files_handler` adds tornado's base class, which is imported when the app is.
+    """
+
+    request: Any
+    path_args: Any
+    set_status: Any
+    set_header: Any
+    finish: Any
+
+    def initialize(self, sessions: dict[str, Session]) -> None:
+        self._sessions, self._chunks = sessions, list[bytes]()
+        self._receiver: Session | None = None
+
+    def prepare(self) -> None:
+        """Refuse an upload by its header, before anything of its body is read."""
+        if self.request.method != "POST":
+            return
+        key, kind = self.path_args
+        session = self._sessions.get(key)
+        fault = _upload_fault(session, kind, self.request.headers)
+        if fault is not None:
+            self._refuse(*fault)
+            return
+        assert session is not None
+        session.is_receiving, self._receiver = True, session
+        self.request.connection.set_max_body_size(MOST_BYTES + _FORM_BYTES)
+
+    def data_received(self, chunk: bytes) -> None:
+        """Keep a part of an upload that `prepare` has accepted."""
+        if self._receiver is not None:
+            self._chunks.append(chunk)
+
+    def on_finish(self) -> None:
+        """Let the window send again."""
+        if self._receiver is not None:
+            self._receiver.is_receiving = False
+
+    on_connection_close = on_finish
+
+    def _refuse(self, code: int, text: str) -> None:
+        self.set_status(code)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(text)
+
+    async def get(self, key: str, kind: str) -> None:
+        session = self._sessions.get(key)
+        if session is None or kind not in FILES:
+            self._refuse(404, "There is no such file, or its window was closed.")
+            return
+        try:
+            content = await asyncio.to_thread(session.file, kind)
+        except (SionnaPartialError, OSError) as error:
+            self._refuse(409, str(error))
+            return
+        for name, value in _DOWNLOAD_HEADERS.items():
+            self.set_header(name, value)
+        self.set_header("Content-Disposition", f'attachment; filename="{FILES[kind]}"')
+        await self.finish(content)
+
+    async def post(self, key: str, kind: str) -> None:
+        from tornado.httputil import HTTPFile, HTTPInputError, parse_body_arguments
+
+        form: dict[str, list[HTTPFile]] = {}
+        body, session = b"".join(self._chunks), self._sessions.get(key)
+        self._chunks.clear()
+        try:
+            parse_body_arguments(self.request.headers["Content-Type"], body, {}, form)
+        except HTTPInputError as error:
+            self._refuse(400, f"The upload cannot be read: {error}")
+            return
+        files = [(file.filename, file.body) for file in form.get("file", [])]
+        if session is None or not files:
+            self._refuse(*_NOTHING_TO_SEND)
+            return
+        session.do(functools.partial(_take_upload, session, kind, files))
+        await self.finish()
+
+
+def _files_handler() -> Any:
+    from tornado.web import RequestHandler, stream_request_body
+
+    class Files(_Files, RequestHandler):
+        pass
+
+    return stream_request_body(Files)

@@ -22,34 +22,32 @@ import xarray as xr
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
 from sionna_partial.app.uploads import uploaded_map
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Checked, Progress, Within, require, require_choice, shown
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.checks import Checked, Progress, Within, reason_of, require, require_choice
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
 from sionna_partial.coverage.network import network_map
+from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.export import save_coverage, save_network
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, nearest_free_m
 from sionna_partial.measurements.measurements import (
     SAME_TX_M,
     Measurements,
     can_be_used,
     load_measurements,
     measurements_of_each,
+    nearest_transmitters,
 )
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.progress import part_of
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
-
-COARSER = 4
-"""Distance between the receivers of the first picture, in those of the final one."""
 
 MOST_TRANSMITTERS = 10
 """Number of transmitters of one window."""
@@ -77,7 +75,7 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Transmitter(Checked):
-    """Where a transmitter stands [m], its power [dBm], and its antenna, whose gain comes on top."""
+    """Position of a transmitter [m], its power [dBm], and its antenna, whose gain is added."""
 
     x_m: Annotated[float, Within(-1e6, 1e6)]
     y_m: Annotated[float, Within(-1e6, 1e6)]
@@ -93,7 +91,7 @@ class Transmitter(Checked):
 
 @dataclass(frozen=True)
 class RadioSettings(Checked):
-    """What is predicted, and how densely."""
+    """Settings of the prediction."""
 
     frequency_hz: Annotated[float, Within(*FREQUENCIES_HZ)] = CARRIER_FREQUENCY_HZ
     through_walls: bool | None = None
@@ -120,7 +118,7 @@ class Answer:
     truth: xr.Dataset | None = None
 
     def layers_of(self, name: str, threshold_dbm: float, *, truth: bool = False) -> xr.Dataset:
-        """Return variables (y, x) of a transmitter, or of the strongest for "": those of `predict_map` and radio.
+        """Return the variables (y, x) of `predict_map` and `radio` of a transmitter, or of the strongest for "".
 
         `power_mean_dbm`, `snr_mean_db`, `p_above` (the received power exceeds the threshold), and of several
         transmitters `sinr_mean_db` and `best_server`.
@@ -143,7 +141,7 @@ class Answer:
         return one.assign(found)
 
     def agreement(self) -> tuple[float, float] | None:
-        """Return how many of the likeliest states on the free floor of the home are true [1], and the RMSE [dB]."""
+        """Return the fraction of correct link states on the free floor of the home, and the RMSE of the gain [dB]."""
         if self.truth is None:
             return None
         here = (self.truth["valid"] & self.coverage["valid"]).to_numpy() == 1
@@ -158,9 +156,9 @@ class Answer:
 
 
 class Session:
-    """State of one window. Its methods are called in one thread; what takes time is computed in another.
+    """State of one window. Its methods are called in one thread; long computations run in another.
 
-    A new job cancels the one before it: what that has found is dropped, so that no answer follows that of a newer job.
+    A new job cancels the one before it and drops its results, so that no old answer follows a newer one.
 
     Parameters
     ----------
@@ -201,14 +199,14 @@ class Session:
             self._waiting.popleft()()
 
     def close(self) -> None:
-        """Cancel what is computed, and compute nothing any more."""
+        """Cancel the job, and accept no other."""
         self.cancel()
         self._call = lambda function: None
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     @property
     def warnings(self) -> list[str]:
-        """Warnings of the map, of what was done last, of the predictor, and of the answer and what followed it."""
+        """Warnings of the map, the last action, the predictor, and the jobs since the last answer."""
         on_networks = self.partial is not None and not self.partial.is_complete
         of_models = [warning for _, found in [*self._models.values()] for warning in found if on_networks]
         found = [*self._warnings["map"], *self._warnings["act"], *of_models, *self._warnings["job"]]
@@ -252,7 +250,7 @@ class Session:
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
-        """Let the simulated robot go on, and predict from what it has seen then."""
+        """Let the simulated robot explore further, and predict on its new map."""
         home, name, seed, total = self.home, self.title, self._seed, self.steps + steps
         if home is None:
             raise SettingsError(
@@ -318,17 +316,16 @@ class Session:
             self._take_transmitters(found)
 
     def _usual_height_m(self) -> float:
-        """Return the height of a new transmitter [m], half that of the rooms where they are low or not at z = 0."""
+        """Return the height of a new transmitter [m]: the default, or the middle of rooms that do not contain it."""
         low_m, high_m = self._map().height_range_m
         return DEFAULT_HEIGHT_M if low_m < DEFAULT_HEIGHT_M < high_m else round((low_m + high_m) / 2.0, 2)
 
     def add(self) -> None:
-        """Put a transmitter into the middle of the free cell that is nearest to that of the map."""
+        """Put a transmitter into the free cell that is nearest to the middle of all free cells."""
         partial = self._map()
         free = np.argwhere(partial.state == CellState.FREE)
         require(len(free) > 0, "free cells", 0, "give a map with some.")
-        row, column = free[np.abs(free - free.mean(axis=0)).sum(axis=1).argmin()]
-        x_m, y_m = (o + (n + 0.5) * partial.resolution_m for o, n in zip(partial.origin_m, (column, row), strict=True))
+        x_m, y_m = nearest_free_m(partial, cell_centres_m(partial, free.mean(axis=0)))[0]
         self.put([*((name, each.x_m, each.y_m) for name, each in self.transmitters.items()), ("", x_m, y_m)])
 
     def change(self, name: str, new_name: str | None = None, **values: Any) -> None:
@@ -382,8 +379,7 @@ class Session:
         partial, at_m = self._map(), np.array(transmitter.position_m)
         if partial.radios_can_stand(at_m[None])[0]:
             return transmitter
-        free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
-        free_m = free_m[np.hypot(*(free_m - at_m[:2]).T).argsort()[:_NEAREST_CELLS]]
+        free_m = nearest_free_m(partial, at_m[:2], _NEAREST_CELLS)
         allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
         if not allowed.any():
             partial.require_positions("the transmitter", at_m)
@@ -392,8 +388,8 @@ class Session:
 
     def _are_ours(self, measured: Measurements) -> Bools:
         """Return whether each of the measured links (N,) is of a transmitter of this window."""
-        tx_m = np.array([each.position_m for each in self.transmitters.values()]).reshape(-1, 3)
-        return np.asarray((np.linalg.norm(measured.tx[:, None] - tx_m, axis=2) <= SAME_TX_M).any(axis=1))
+        sources_m = [np.array([transmitter.position_m]) for transmitter in self.transmitters.values()]
+        return np.asarray(nearest_transmitters(measured.tx, sources_m).any(axis=0))
 
     def measured_points(self) -> tuple[Floats, Bools]:
         """Return the receivers (N, 3) of the measurements [m], and whether each is used (N,)."""
@@ -546,7 +542,7 @@ class Session:
         return model
 
     def begin(self, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Start a job and cancel the one before: it yields what is to be done in the session's thread."""
+        """Start a job and cancel the one before: it yields functions to be called in the thread of the session."""
         if self._job is not None:
             self._job.is_cancelled.set()
         job = self._job = Job(self._tell)
@@ -556,7 +552,7 @@ class Session:
             self._worker.submit(self._run, job, work)
 
     def _run(self, job: Job, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Compute a job in turns with those of other windows."""
+        """Compute a job in turns with the jobs of other windows."""
         try:
             with TURNS, collected_warnings(job.warnings):
                 job.report(0.0, "starting")
@@ -569,7 +565,7 @@ class Session:
         except Exception as error:  # whatever it is, the page shows it and stays alive
             if not isinstance(error, SionnaPartialError | OSError | MemoryError):
                 _log.exception("a job of the app failed")
-            end = functools.partial(self._fail, error)
+            end = functools.partial(self._conclude, Status(reason_of(error), is_error=True))
         self.do(functools.partial(self._end, job, end))
 
     def _tell(self, job: Job, status: Status) -> None:
@@ -592,14 +588,8 @@ class Session:
             self._warnings["job"] += job.warnings
             end()
 
-    def _fail(self, error: Exception) -> None:
-        """Show why a job has failed."""
-        known = isinstance(error, SionnaPartialError | OSError | MemoryError)
-        message = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
-        self._conclude(Status(message, is_error=True))
-
     def _conclude(self, status: Status) -> None:
-        """Show how a job has ended; an answer to another question than that of the page goes."""
+        """Show the end of a job; an answer that no longer fits the page is removed."""
         self.status = status
         if self._is_outdated:
             self.answer, self._is_outdated = None, False

@@ -33,12 +33,11 @@ from sionna_partial.calibration.measured_building import (
 )
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, part_of, reporting
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
-from sionna_partial.progress import part_of, reporting
-from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.settings import Material, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, simulation_of
 
@@ -58,11 +57,11 @@ _NUMBERS = (
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration"):
+class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
-    Of a scene of one material the parameters are numbers. Of a map with M materials they are arrays (M,): that of
-    floor, ceiling and all other walls and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
+    The parameters of a scene of one material are numbers. On a map with M materials they are arrays (M,): the material
+    of floor, ceiling and all other walls, and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
 
     Parameters
     ----------
@@ -137,7 +136,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
         angle_deg : array-like
             Angle of incidence from the normal, 0 to 90 [degrees].
         polarisation : {"te", "tm"}
-            "te" is that of vertical antennas at walls.
+            "te" applies to vertical antennas at walls.
         which : int
             The material.
 
@@ -172,6 +171,7 @@ class MaterialCalibration(Pictured, plot="plots.material_plot:plot_calibration")
         }
 
 
+@takes_settings
 def calibrate_materials(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     measurements: Any,
@@ -187,7 +187,7 @@ def calibrate_materials(
     Paths are traced once, and Sionna RT evaluates the sum of their powers for any material. The whole plane of
     permittivity and conductivity is searched, so that the result does not depend on the start; then Newton's method
     follows the derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their
-    posterior mean: where the measurements determine little, the likeliest material would follow the noise. The
+    posterior mean: where the measurements determine little, the most probable material would follow the noise. The
     thickness is fixed.
 
     Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged. Links of a partial map are used
@@ -297,7 +297,7 @@ def calibrate_materials(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Steps to the likeliest materials, the materials that are taken, and their posteriors; deviations are (2, M)."""
+    """Steps to the most probable materials, the materials taken, and their posteriors; deviations are (2, M)."""
 
     steps: list[Point]
     point: Point
@@ -337,7 +337,7 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
 def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats) -> Floats:
     """Return the standard deviations (2, M) of permittivities and conductivities.
 
-    A posterior is that of one material while the others stay as they are. Where there are others, the curvature of all
+    A posterior is of one material while the others stay as they are. Where there are others, the curvature of all
     together gives a lower bound.
     """
     own = np.stack(

@@ -25,7 +25,7 @@ from sionna_partial.tracing.power import reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
 MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)
-"""Values of the parameters of GainErrors among which the likeliest are chosen."""
+"""Values of the parameters of GainErrors among which the most probable are chosen."""
 
 MISSED_DB, BLOCKED_DB = 8.0, 12.0
 """Mean of how much stronger links with missed paths are, and how much weaker links with blocked paths [dB]."""
@@ -89,7 +89,7 @@ class GainErrors:
     blocked_fraction: float
 
     def penalty(self) -> float:
-        """Negative logarithm of the prior, but for a constant."""
+        """Negative logarithm of the prior, up to a constant."""
         spread = math.log(self.noise_db / EXPECTED_NOISE_DB) / NOISE_SPREAD
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
@@ -120,9 +120,9 @@ _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 
 
 def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[GainErrors, float]:
-    """Return the likeliest density of errors (N,) [dB], and its negative log likelihood with the prior's.
+    """Return the most probable density of errors (N,) [dB], and its negative log likelihood with the prior's.
 
-    The variance [dB^2] is that of each mean of repeated measurements, beyond the noise of the link.
+    The variance [dB^2] is the variance of each mean of repeated measurements, beyond the noise of the link.
     """
     noise_db = np.sqrt(NOISES_DB[:, None] ** 2 + np.asarray(variance))
     densities = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
@@ -167,7 +167,7 @@ class Point:
     Parameters
     ----------
     values : (2, M), permittivity and conductivity [S/m]
-    loss : negative logarithm of the posterior density of their logarithms, but for a constant
+    loss : negative logarithm of the posterior density of their logarithms, up to a constant
     """
 
     values: Floats
@@ -198,7 +198,7 @@ class Posterior(Shown):
         return float(np.sqrt(self.weight @ (values - best) ** 2))
 
     def typical(self, thickness_m: float, frequency_hz: float) -> Floats:
-        """Return the values (2,) whose reflection losses are nearest to the mean; the likeliest may be far from it."""
+        """Return the values (2,) whose reflection losses are nearest to the mean; the most probable may be far off."""
         loss_db = reflection_loss_db(
             self.permittivity[:, None], self.conductivity_s_m[:, None], thickness_m, frequency_hz, TYPICAL_DEG
         )
@@ -287,7 +287,7 @@ def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: 
 
 
 def prior_loss(values: Floats) -> float:
-    """Negative logarithm of the prior density of the logarithms of materials (2, M), but for a constant."""
+    """Return the negative logarithm of the prior density of the logarithms of materials (2, M), up to a constant."""
     return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
 
 
@@ -305,7 +305,7 @@ def lossless_scale_s_m(index: float, thickness_m: float) -> float:
 
 
 class _Plane:
-    """The plane of one material, the others staying as they are; what was evaluated is kept.
+    """The plane of one material, the others staying as they are; evaluated points are kept.
 
     Cells of it are (4, K) arrays: refractive index and logarithm of the conductivity at the centre, and the widths in
     both.
@@ -335,7 +335,7 @@ class _Plane:
         return np.array([each.loss for each in self.points(cells)])
 
     def fractions(self, cells: Floats) -> Floats:
-        """Fraction (K,) of the posterior in each cell; the measure is that of the logarithm of permittivity less 1."""
+        """Fraction (K,) of the posterior in each cell; the measure is the logarithm of permittivity less 1."""
         loss = self.losses(cells)
         area = cells[2] * cells[3] * 2.0 * cells[0] / (cells[0] ** 2 - 1.0)
         mass: Floats = np.exp(loss.min() - loss) * area

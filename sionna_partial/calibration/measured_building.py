@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress
+from sionna_partial.display import part_of
 from sionna_partial.errors import MeasurementError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.features import SEEN_M, path_unobserved_m
-from sionna_partial.progress import part_of
 from sionna_partial.scene.scene import constants_of
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathParameters, PathSet

@@ -22,7 +22,7 @@ PATHS_AT_ONCE = 20_000
 """Number of paths whose beams are computed together at most, in no more than `WORK_BYTES`."""
 
 _BEAM_BYTES, _PAIR_BYTES = 32, 48
-"""What a beam of a path, and a pair of beams of a link, take while they are computed [bytes]."""
+"""Memory of a beam of a path, and of a pair of beams of a link, while they are computed [bytes]."""
 
 MAX_WEIGHT = 1e6
 """Largest magnitude of a weight: powers are of single precision."""

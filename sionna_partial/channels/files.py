@@ -2,6 +2,7 @@
 
 import math
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 from sionna_partial.channels.responses import ArrayPaths, require_memory
 from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
 from sionna_partial.constants import MEMORY_GB
+from sionna_partial.display import reporting
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import (
     atomic_files,
@@ -25,7 +27,7 @@ from sionna_partial.files import (
     require_plain_hdf5,
     write_netcdf,
 )
-from sionna_partial.progress import reporting
+from sionna_partial.resources import optional_packages
 from sionna_partial.tracing.links import TracedLinks
 
 Layout = Literal["sionna", "deepmimo"]
@@ -51,7 +53,7 @@ CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
 
 MAX_BYTES = 2**44
-"""Largest file that is opened [bytes]; it is read as far as it is used."""
+"""Largest file that is opened [bytes]; only the used parts are read."""
 
 
 def save_channels(
@@ -67,7 +69,7 @@ def save_channels(
 
     ============ =================================================================================================
     `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
-                 where there is no path: what a generator of Sionna's `CIRDataset` yields. Responses have `h` (rx,
+                 where there is no path: as a generator of Sionna's `CIRDataset` yields them. Responses have `h` (rx,
                  rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
                  no path, of one transmitter.
@@ -133,9 +135,17 @@ def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
     target = output_path(path)
     if target.suffix not in SUFFIXES:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(SUFFIXES)}.")
+    _require_zarr(target)
     if target.suffix == ".zarr" and os.path.lexists(target):
         raise OutputError(f"path = '{target}' is there already: remove it, or choose another name.")
     return target
+
+
+def _require_zarr(path: Path) -> None:
+    """Raise an error where a `.zarr` folder needs a package that is not installed."""
+    if path.suffix == ".zarr":
+        with optional_packages():
+            import_module("zarr")
 
 
 def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -166,6 +176,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     remedy = "give a file of save_channels."
     source = input_path(path, "path", SettingsError, remedy)
     require(source.suffix in SUFFIXES, "path", str(path), remedy)
+    _require_zarr(source)
     try:
         if source.suffix == ".zarr":
             if not source.is_dir():

@@ -1,6 +1,6 @@
 """Channel responses of links with antenna arrays: paths + arrays -> impulse responses, frequency responses, taps.
 
-And large-scale parameters of links: their spreads, K-factor and path loss.
+Large-scale parameters of links are computed, too: their spreads, K-factor and path loss.
 """
 
 import logging
@@ -85,12 +85,12 @@ class ArrayPaths:
 
     @property
     def antennas(self) -> str:
-        """How many there are, for messages."""
+        """Numbers of antennas, for messages."""
         return f"{len(self.rx)} x {len(self.tx)} antennas"
 
     @cached_property
     def first(self) -> Indices:
-        """Where the paths of each link begin, and the number of all paths: (links + 1,)."""
+        """First path of each link, and the number of all paths: (links + 1,)."""
         return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
 
     @property
@@ -110,7 +110,7 @@ class ArrayPaths:
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
 
     def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, Indices]]:
-        """Yield links, their paths, and where those of each link begin and end among them, some at a time."""
+        """Yield some links at a time: links, their paths, and the first path of each link among these, with the end."""
         start = 0
         while start < self.links:
             stop = int(np.searchsorted(self.first, self.first[start] + paths_at_once, side="right")) - 1
@@ -231,7 +231,7 @@ def _after_shortest(delay_s: Floats, first: Indices) -> Floats:
 
 @dataclass(frozen=True)
 class Block:
-    """Coefficients (P, antennas of rx, of tx) and delays, likewise or (P, 1, 1), of the paths of some links.
+    """Coefficients (P, antennas of rx, of tx) of the paths of some links, and delays of that shape or (P, 1, 1).
 
     Paths of the i-th link are those from `first[i]` up to `first[i + 1]`.
     """
@@ -242,7 +242,7 @@ class Block:
     delay_s: Floats
 
     def fill(self, a: NDArray[np.complex64], delay_s: Floats) -> None:
-        """Put them into arrays (links, paths, antennas of rx, of tx), the delays likewise or (links, paths)."""
+        """Put them into arrays (links, paths, antennas of rx, of tx); the array of delays may be (links, paths)."""
         count = np.diff(self.first)
         link = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
@@ -252,7 +252,7 @@ class Block:
 
 @dataclass(frozen=True)
 class Unfolded:
-    """How the ends of P paths move when the reflections are unfolded.
+    """Maps of displacements of both ends of P paths, with the reflections unfolded.
 
     `before` (P, 3, 3) maps displacements of the transmitter through all reflections, or to the last that lies before
     the point where a path is `split` (P,): diffracted or scattered. From there, `to_tx_m` and `to_rx_m` (P, 3) lead to
@@ -389,7 +389,7 @@ def taps(
 
 
 _VALUE_BYTES, _AXIS_BYTES = 48, 40
-"""What a value of a function of a delay takes while it is computed, and one of an axis with its index [bytes]."""
+"""Memory of a value of a function of a delay while it is computed, and of a value of an axis with its index [bytes]."""
 
 
 def _filtered(
@@ -419,7 +419,7 @@ def _filtered(
 
 
 def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
-    """Return variables of links with their transmitters and receivers, and what they were computed for."""
+    """Return a Dataset of variables of links with their transmitters and receivers, and the settings as attributes."""
     each, count = arrays.paths, len(arrays.paths.rx)
     tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
     tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
@@ -434,7 +434,7 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
 
 
 def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float, work_bytes: int) -> None:
-    """Raise a MemoryLimitError if all links, and what is needed to compute them, would take more than `memory_gb`."""
+    """Raise a MemoryLimitError if all links, and the work for them, would take more than `memory_gb`."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     size_gb = (arrays.links * link_bytes + work_bytes) / 1e9
     if size_gb > memory_gb:

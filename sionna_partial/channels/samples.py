@@ -1,4 +1,4 @@
-"""Draws of the channels of links on a partial map: what the paths may be in the building."""
+"""Draws of the channels of links on a partial map: paths that are possible in the building."""
 
 from __future__ import annotations
 
@@ -18,15 +18,14 @@ from sionna_partial.arrays import Floats, Indices, States, read_only
 from sionna_partial.channels.joint import JointLatents, states_and_gains
 from sionna_partial.checks import Progress, require_memory, require_whole
 from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.progress import reporting
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths, path_order
 from sionna_partial.tracing.simulation import Simulation
@@ -35,7 +34,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
 UNSEEN = 255
-"""Interaction of paths through what was not seen, in place of Sionna RT's `InteractionType`."""
+"""Interaction of paths through unseen space, in the place of Sionna RT's `InteractionType`."""
 
 MOST_DRAWS = 10_000
 
@@ -144,7 +143,7 @@ class ChannelSamples(Shown):
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
     def _by_draw(self, found: xr.Dataset) -> xr.Dataset:
-        """Fold links, or transmitters, into draws and those of each draw."""
+        """Split the axis of links, or of transmitters, into draws and the links of a draw."""
         along = "link" if "link" in found.dims else "tx"
         if found.sizes[along]:
             folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
@@ -157,6 +156,7 @@ class ChannelSamples(Shown):
         return folded.isel(tx=0) if self.link_state.ndim == 2 else folded
 
 
+@takes_settings
 def sample_channels(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike,
@@ -189,7 +189,7 @@ def sample_channels(
     n : int
         Number of draws, up to 10,000.
     seed : int
-        Of the draws, at least 0: equal seeds give equal draws.
+        Seed of the draws, at least 0: equal seeds give equal draws.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     trace_settings : TraceSettings, optional
@@ -313,7 +313,7 @@ class _Draws:
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Paths of some draws: those of certain links, the surviving and direct ones, and those of analogues."""
+        """Return the paths of some draws: of certain links, surviving and direct ones, and paths of analogues."""
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+import sionna_partial.cli.options as opt
 from sionna_partial import __version__
 from sionna_partial.cli.learning import dataset, evaluate, train
 from sionna_partial.cli.live import live, open_app
@@ -18,6 +19,7 @@ from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import channels, demo, explore, export_scene, info, network, predict
 from sionna_partial.errors import SionnaPartialError, one_line
 from sionna_partial.process import end_at_signals, end_process
+from sionna_partial.resources import optional_packages
 
 
 class _ErrorLineGroup(TyperGroup):
@@ -26,9 +28,10 @@ class _ErrorLineGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the subcommand."""
         try:
-            return super().invoke(ctx)
+            with optional_packages():
+                return super().invoke(ctx)
         except SionnaPartialError as error:
-            typer.echo(f"error: {error}", err=True)
+            typer.echo(f"error: {opt.in_options(str(error))}", err=True)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -44,7 +47,11 @@ class _WarningLine(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record."""
-        typer.echo(f"{record.levelname.lower()}: {one_line(record.getMessage())}", err=True)
+        _warn(record.levelname.lower(), record.getMessage())
+
+
+def _warn(level: str, message: str) -> None:
+    typer.echo(f"{level}: {opt.in_options(one_line(message))}", err=True)
 
 
 app = typer.Typer(
@@ -91,7 +98,9 @@ def _prepare(
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ["MPLBACKEND"] = "agg"  # pictures are files, whatever the variable was
     logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
-    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {one_line(str(message))}", err=True)
+    warnings.showwarning = lambda message, *_, **__: typer.echo(
+        f"warning: {opt.in_options(one_line(str(message)))}", err=True
+    )
 
 
 app.command(cls=TransmitterCommand)(predict)

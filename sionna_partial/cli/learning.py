@@ -10,7 +10,7 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
-from sionna_partial.progress import counting
+from sionna_partial.display import counting
 from sionna_partial.settings import (
     HOME_KINDS,
     SHORT_LINK_M,
@@ -124,7 +124,7 @@ def train(
     the homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.datasets.dataset_links import open_links, settings_for
+        from sionna_partial.datasets.shards import open_links, settings_for
         from sionna_partial.reports import summary
 
         links, traces = open_links(folders)

@@ -7,6 +7,7 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
+from sionna_partial.checks import transmitter_names
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MAX_COST
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.process import cleaned_up
@@ -66,18 +67,18 @@ def live(
     predictor: opt.PredictorName = "",
 ) -> None:
     """Keep up with a robot's map: coverage as cost grids for its planner, until Ctrl-C."""
-    names = name or (["tx"] if len(tx) == 1 else [f"tx{number}" for number in range(len(tx))])
+    names = name or (["tx"] if len(tx) == 1 else transmitter_names(len(tx)))
     if len(names) != len(tx) or len({*names}) < len(names):
         raise typer.BadParameter(f"{len(names)} --name for {len(tx)} --tx: give each its own.")
     positions = dict(zip(names, map(opt.parse_position, tx), strict=True))
     last: dict[str, Any] = {}
     robot: Any = None
     if bag is None and rosbridge:
-        from sionna_partial.live.rosbridge import Rosbridge
+        from sionna_partial.live.topics import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.live.dds import Dds
+        from sionna_partial.live.topics import Dds
 
         robot = Dds(topics, positions, domain)
 
@@ -104,8 +105,7 @@ def live(
 
 
 def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
-    from sionna_partial.live.bags import replay
-    from sionna_partial.live.topics import Listener
+    from sionna_partial.live.topics import Listener, replay
 
     thread = coverage.start() if rate else None
     replay(Listener(coverage, topics), bag, rate)

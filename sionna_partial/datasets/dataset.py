@@ -17,6 +17,7 @@ from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm import parse_address, parse_host_port
 
 from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
+from sionna_partial.datasets.home_links import Home, HomeSource, home_sources
 from sionna_partial.datasets.home_process import (
     HomeResult,
     HomeTask,
@@ -26,13 +27,11 @@ from sionna_partial.datasets.home_process import (
     settings_record,
     stop_homes,
 )
-from sionna_partial.datasets.home_sources import Home, HomeSource, home_sources
 from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, counting
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
 from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
-from sionna_partial.progress import counting
 from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0
@@ -190,7 +189,7 @@ def _results(
 def _prepare(
     folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
 ) -> list[HomeTask]:
-    """Write or check the folder's `dataset.json`, remove what killed runs left, and return what is to be done."""
+    """Write or check the folder's `dataset.json`, remove the remains of killed runs, and return the tasks."""
     path, versions = folder / INDEX_FILE, installed_versions()
     homes = [source.record for source in sources]
     index = {"versions": versions, "settings": settings_record(settings), "homes": homes}
@@ -230,7 +229,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
 
 
 def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield what differs, what it was, and what it is. Homes may have been added."""
+    """Yield the name, the old and the new value of each difference. Homes may have been added."""
     for part in ("settings", "versions"):
         before, after = (dict(_leaves(index[part], part)) for index in (earlier, now))
         for name in sorted(before.keys() | after.keys()):
@@ -292,7 +291,7 @@ def _remote_client(scheduler: str) -> Client:
     if by_file and not Path(scheduler).is_file():
         raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
     try:
-        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/traps.md)
+        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/development.md)
             written = json.loads(read_bytes(Path(scheduler), "scheduler", BackendError, MAX_SCHEDULER_BYTES))
             parse_host_port(parse_address(written["address"])[1])
         return Client(**where, timeout=CONNECT_S, set_as_default=False)

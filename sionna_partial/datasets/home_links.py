@@ -1,23 +1,47 @@
-"""One home -> LinkTable: a robot explores it, and each link is traced on what was seen at every stage and in truth."""
+"""Homes of a data set, and their links: a robot explores a home, and links are traced on each map and on the home."""
 
 import hashlib
 import logging
 import math
+import os
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from typing import get_args
 
 import numpy as np
 
 from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.checks import is_whole, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.link_table import LinkTable
 from sionna_partial.errors import MapError
 from sionna_partial.exploration.explore import explore_trajectory
+from sionna_partial.files import SCENE_FILES
+from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, Fusion, SensorSettings
+from sionna_partial.settings import (
+    HOME_KINDS,
+    MIXED_SENSORS,
+    SHORT_LINK_M,
+    DatasetSettings,
+    Fusion,
+    HomeKind,
+    SensorSettings,
+)
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
+from sionna_partial.worlds.homes import make_home
+
+Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]
+"""Seed of `make_home`, seed and kind, or path of a complete map or of a folder of them."""
+
+MAP_SUFFIXES = (".yaml", ".yml", ".npz")
+"""Files in a folder that are taken for maps."""
+
+COMMON_STEMS = ("map", "scene")
+"""Names of map files that do not name the home: it has the name of the folder."""
 
 NEAREST_M = 0.1
 """Shortest distance of transmitter and receiver [m]."""
@@ -34,6 +58,85 @@ _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
+class HomeSource:
+    """A home to build from: its name, seed of `make_home` or absolute path of a complete map, and kind."""
+
+    name: str
+    origin: int | str
+    kind: HomeKind | None = None
+
+    @property
+    def record(self) -> dict[str, object]:
+        """Entry of the home in a data set."""
+        kind = {"kind": self.kind} if self.kind else {}
+        return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
+
+    def load(self) -> PartialMap:
+        """Make or read the home, with the errors of `make_home` and `load_map`."""
+        return make_home(self.origin, self.kind) if isinstance(self.origin, int) else load_map(self.origin)
+
+
+def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
+    """Name the homes to build from, in their order; homes of a folder in the order of their names.
+
+    A map has the name of its file, or of its folder if the file is called map or scene.
+    """
+    if not isinstance(homes, Iterable) or isinstance(homes, (str, bytes)):
+        raise MapError(f"homes = {homes!r} is no list: give seeds of make_home, or paths of complete maps, in a list.")
+    sources: dict[str, HomeSource] = {}
+    for home in homes:
+        for source in _sources(home):
+            other = sources.setdefault(source.name, source)
+            if other is not source:
+                raise MapError(
+                    f"two homes are called {source.name!r}, {other.origin!r} and {source.origin!r}: leave one out, or "
+                    "rename its file or folder."
+                )
+    if not sources:
+        raise MapError("homes is empty: give seeds of make_home, or paths of complete maps.")
+    return list(sources.values())
+
+
+def _sources(home: Home) -> Iterator[HomeSource]:
+    if isinstance(home, int) and not isinstance(home, bool):
+        yield HomeSource(f"make_home({home})", home)
+    elif isinstance(home, tuple) and len(home) == 2:
+        seed, kind = home
+        require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")
+        require(kind is None or kind in HOME_KINDS, "kind", kind, f"choose one of {HOME_KINDS}, or None.")
+        yield HomeSource(f"make_home({seed}, {kind})" if kind else f"make_home({seed})", seed, kind)
+    elif isinstance(home, (str, os.PathLike)):
+        path = Path(os.path.abspath(home))
+        if not os.path.exists(path):
+            raise MapError(f"path = '{path}' is not there: give complete maps, or a folder with maps in it.")
+        yield from _maps_at(path)
+    else:
+        raise MapError(
+            f"home = {shown(home)} is neither a seed nor a path: give a seed of make_home or a complete map."
+        )
+
+
+def _maps_at(path: Path) -> Iterator[HomeSource]:
+    files = [path]
+    if path.is_dir():
+        entries = [path] if _scene_file(path) else sorted(path.iterdir())
+        maps = (_scene_file(each) if each.is_dir() else each for each in entries)
+        files = [each for each in maps if each and (each.name in SCENE_FILES or each.suffix.lower() in MAP_SUFFIXES)]
+    if not files:
+        raise MapError(
+            f"path = '{path}' holds no map: give a folder with maps ({', '.join(MAP_SUFFIXES)}), or with folders that "
+            f"have a {' or '.join(SCENE_FILES)}."
+        )
+    for file in files:
+        yield HomeSource(file.parent.name if file.stem in COMMON_STEMS else file.stem, str(file))
+
+
+def _scene_file(folder: Path) -> Path | None:
+    """Return the map in a folder of one home."""
+    return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)
+
+
+@dataclass(frozen=True)
 class _Positions:
     """T transmitters (3,) of a home, and for each its N receivers (N, 3), and whether they were drawn anywhere (N,)."""
 
@@ -43,7 +146,7 @@ class _Positions:
 
 
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
-    """Trace the links of a complete home on what a robot has seen of it at every stage, and on the whole of it.
+    """Trace the links of a complete home on the map of a robot at every stage, and on the complete home.
 
     Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
     cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
@@ -53,8 +156,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     receiver is nearer than `NEAREST_M` to its transmitter.
 
     The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
-    Estimation"); that of the others is their trace on the complete home. Positions and robot depend on `name` and the
-    settings, and not on other homes. The table is ordered by stage, in each by transmitter.
+    Estimation"); the truth of other receivers is their trace on the complete home. Positions and robot depend on
+    `name` and the settings, and not on other homes. The table is ordered by stage, in each by transmitter.
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)

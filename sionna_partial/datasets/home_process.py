@@ -1,8 +1,9 @@
 """Homes of a data set, each made in a process of its own: one that crashes or hangs costs itself alone.
 
 A process serves one home after the other, so that libraries load and compile once. It ends when the worker does, or
-when it has had nothing to do for a while. Pools of concurrent.futures and pebble would do if they did not spawn: that
-imports `__main__` again, so that a user's script without a guard would begin again in every process.
+when it has had nothing to do for a while. Pools of concurrent.futures and pebble, and dask's Nanny, spawn processes:
+that imports `__main__` again, so that a user's script without a guard would begin again in every process. They also
+have neither a time limit for a home nor the last lines of a process that died.
 """
 
 import contextlib
@@ -23,8 +24,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Literal
 
-from sionna_partial.datasets.home_links import home_links, home_sensor
-from sionna_partial.datasets.home_sources import HomeSource
+from sionna_partial.datasets.home_links import HomeSource, home_links, home_sensor
 from sionna_partial.datasets.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.files import temporary_folder
@@ -45,7 +45,7 @@ TIMEOUT_LINE = "Timeout ("
 """Start of the line that faulthandler writes before it ends a process that takes too long."""
 
 LAST_LINES = 20
-"""Number of lines of what a dead process wrote that are reported."""
+"""Number of the last lines of a dead process that are reported."""
 
 PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba", "scipy", "shapely", "pyarrow")
 """Packages whose versions may change the bytes of a data set."""
@@ -188,7 +188,7 @@ class _HomeProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Return whether it runs; what a dead one has left is released."""
+        """Return whether it runs; the resources of a dead one are released."""
         if self._process.poll() is None:
             return True
         self.close()
@@ -216,7 +216,7 @@ class _HomeProcess:
         _alive.discard(self)
 
     def close(self) -> None:
-        """End the process and release what it leaves, its temporary files too."""
+        """End the process and release its resources, temporary files included."""
         self.kill()
         self._link.close()
         self._log.close()

@@ -1,13 +1,16 @@
-"""LinkTable <-> Parquet: one shard for each home of a data set."""
+"""Folders of data sets: a Parquet shard for each home, read as one LinkTable, and the settings of its traces."""
 
 import base64
 import hashlib
 import io
 import json
+import math
 import os
 import zlib
-from collections.abc import Iterable, Mapping
-from dataclasses import asdict
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -18,13 +21,13 @@ from numpy.typing import NDArray
 
 from sionna_partial.checks import shown
 from sionna_partial.datasets.link_table import COLUMNS, LinkTable
-from sionna_partial.errors import MapError, PredictorError
+from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
-from sionna_partial.maps.mesh.mesh import material_records
+from sionna_partial.maps.environment import material_records
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkContext, LinkFeatures
 from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
-from sionna_partial.settings import Material
+from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 """Files and folders of a data set: settings and homes, a shard for each home, a note for each home that failed."""
@@ -56,6 +59,9 @@ _NAMES = (
     *("link_state", "gain_db", "inside", "anywhere", "observed_fraction"),
 )
 _FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
+
+Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
+"""Links, or one or more folders that `sionna-partial dataset` wrote."""
 
 
 def _columns(table: LinkTable) -> dict[str, Any]:
@@ -271,3 +277,102 @@ def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:
 def _few(names: list[str]) -> str:
     listed = ", ".join(map(repr, names[:5])) or "nothing, no home has been built"
     return listed + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+@dataclass(frozen=True)
+class LinkTraces:
+    """Settings of the traces: carrier frequency [Hz], and whether with diffraction on plans, and through walls."""
+
+    frequency_hz: float
+    diffraction: bool
+    through_walls: bool = False
+
+    @classmethod
+    def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
+        """Return the settings of the traces that a predictor was trained on."""
+        return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
+
+    def __str__(self) -> str:
+        """Return them in words."""
+        where = f"at {self.frequency_hz / 1e9:g} GHz{' through walls' if self.through_walls else ''}"
+        return f"{where} {'with' if self.diffraction else 'without'} diffraction"
+
+    def is_like(self, other: "LinkTraces") -> bool:
+        """Return whether frequency (within 1e-6), diffraction and paths through walls are the same."""
+        same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
+        return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
+
+
+def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
+    """Return the links of data sets, and how they were traced: None for a table, which does not contain that.
+
+    A home may be in several folders, explored anew in each.
+    """
+    if isinstance(dataset, LinkTable):
+        links, traces = dataset, None
+    else:
+        folders = _folders(dataset)
+        tables = [read_dataset(folder) for folder in folders]
+        traces = _read_traces(folders[0])
+        homes: dict[str, PartialMap] = {}
+        for folder, table in zip(folders, tables, strict=True):
+            remedy = "give data sets that were traced with the same settings."
+            require_like(_read_traces(folder), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
+            for name, home in table.complete_maps.items():
+                if homes.setdefault(name, home) != home:
+                    raise PredictorError(
+                        f"'{folder}' has another home {name!r} than those before: give one of the two."
+                    )
+        links = LinkTable.concatenate(tables)
+    if links.anywhere.all():
+        raise PredictorError("dataset has no links with receivers drawn indoors: build one that has homes and links.")
+    return links, traces
+
+
+def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> list[Path]:
+    folders = [dataset] if isinstance(dataset, (str, PathLike)) else dataset
+    named = isinstance(folders, Sequence) and all(isinstance(each, (str, PathLike)) for each in folders)
+    if not named or not folders:
+        raise PredictorError(
+            f"dataset = {dataset!r} is not allowed: give a LinkTable, or one or more folders that "
+            "`sionna-partial dataset` wrote."
+        )
+    paths = [Path(each) for each in folders]
+    twice = [
+        path for path, count in Counter(path.resolve() for path in paths if os.path.exists(path)).items() if count > 1
+    ]
+    if twice:
+        raise PredictorError(f"dataset has '{twice[0]}' twice, whose links would count twice: give it once.")
+    return paths
+
+
+def settings_for(
+    traces: LinkTraces | None,
+    *,
+    networks: NetworkKind = "map",
+    passes: int = PredictorSettings.passes,
+    seed: int = PredictorSettings.seed,
+) -> PredictorSettings:
+    """Return settings of a training on such links; None takes the defaults."""
+    known = traces or LinkTraces.of_settings(PredictorSettings())
+    return PredictorSettings(
+        networks, known.frequency_hz, known.diffraction, passes, seed=seed, through_walls=known.through_walls
+    )
+
+
+def require_like(
+    found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
+) -> None:
+    """Raise a PredictorError if the links of a data set were traced otherwise than `whose` links; None passes."""
+    if found is not None and not found.is_like(wanted):
+        raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
+
+
+def _read_traces(folder: Path) -> LinkTraces:
+    index = read_index(folder)
+    try:
+        trace = TraceSettings(**index["settings"]["trace"])
+        return LinkTraces(trace.frequency_hz, trace.diffraction is not False, trace.through_walls)
+    except (ValueError, KeyError, TypeError, AttributeError, SettingsError) as error:
+        path = folder / INDEX_FILE
+        raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error

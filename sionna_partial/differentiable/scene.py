@@ -1,17 +1,17 @@
 """The predicted distribution as one differentiable function of transmitter, materials, frequency and network weights.
 
 Paths and their derivatives come from `tracing`, a `tf.custom_gradient` hands both to TensorFlow, and everything from
-there on, features and networks, is TensorFlow. At the position where links were traced the distribution is that of
-`Predictor.predict`; on a nearly complete map it is that of the networks alone.
+there on, features and networks, is TensorFlow. At the position where links were traced the distribution equals
+`Predictor.predict`; on a nearly complete map the networks alone give it.
 
-What gradients include, and what they do not:
+Limits of the gradients:
 
-- Paths are those of the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
+- Paths are taken from the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
   power in a step, which no derivative includes. Link states of the partial trace, the link states that the map leaves
-  possible, and whether the ends are in observed cells, are those of the trace too.
+  possible, and whether the ends are in observed cells, are taken from the trace, too.
 - The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
-  the length is that of the trace times s(tx) / s(tx at the trace), and s is `SmoothLengths`: so are the lengths of all
-  paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
+  the length is the traced length times s(tx) / s(tx at the trace), and s is `SmoothLengths`. The same holds for the
+  lengths of all paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
 - The outputs of the map networks are evaluated around the transmitter and 15 cm to each side, and are linear between.
   Their derivative jumps where a receiver passes the centre of one of their cells.
 - Where the map is complete the distribution is the trace itself: its probabilities are constant, and its gain is that
@@ -59,13 +59,13 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
-from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
+from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
 from sionna_partial.tracing.path_set import PARAMETERS, PathSet
 from sionna_partial.tracing.simulation import Simulation
 
 WINDOW_STEP_M = CELLS_M[0] / 2
-"""How far from the transmitter further windows are drawn [m]."""
+"""Distance from the transmitter at which further windows are drawn [m]."""
 
 STEEPEST = 4.0
 """Largest ratio of the growth of a length to the growth of its smooth surrogate, as where it hardly touches a cell."""
@@ -89,8 +89,8 @@ class LinkDistribution(LinkPrediction):
     def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
         """Return the probability (N,) that the gain exceeds a threshold above -150 dB [dB].
 
-        Where nothing is uncertain the probability is a step, which has no slope; `softness_db`, the standard deviation
-        of a further Gaussian spread of the gain [dB], makes it one.
+        Without uncertainty the probability is a step, which has no slope; `softness_db`, the standard deviation of a
+        further Gaussian spread of the gain [dB], gives it one.
         """
         covered = tf.zeros_like(self.p_los)
         for probability, mean_db, std_db in (
@@ -110,7 +110,7 @@ class DifferentiableScene:
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        What is known of the building. The predictor of a link model is loaded anew, so that its weights may change.
+        Map of the building. The predictor of a link model is loaded anew, so that its weights may change.
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default. On a complete map it is not used.
     trace_settings : TraceSettings, optional
@@ -141,6 +141,7 @@ class DifferentiableScene:
     [4.343, 0.0, 0.0]
     """
 
+    @takes_settings
     def __init__(
         self,
         scene: PartialMap | str | Path | Simulation | LinkModel,
@@ -216,7 +217,7 @@ class DifferentiableLinks:
     Attributes
     ----------
     base : PathParameters
-        Where they were traced; its fields are the arguments of a call.
+        Values at which they were traced; its fields are the arguments of a call.
     """
 
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
@@ -241,7 +242,7 @@ class DifferentiableLinks:
         tx_m : (3,) tensor, optional
             Transmitter position [m].
         relative_permittivity, conductivity_s_m, thickness_m : (M,) tensors, optional
-            Of each of the scene's materials; [S/m] and [m].
+            Value of each of the scene's materials; [S/m] and [m].
         frequency_hz : () tensor, optional
             Carrier frequency of the trace [Hz]; ITU materials follow it.
 

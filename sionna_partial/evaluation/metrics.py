@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
@@ -26,10 +25,10 @@ _NO_SPREAD_DB = 1e-6
 """A standard deviation below this is rounding [dB]."""
 
 LEAST_PROBABILITY = 1e-4
-"""Of the true link state in a likelihood: a map with errors excludes true states now and then."""
+"""Least probability of the true link state in a likelihood: a map with errors excludes true states now and then."""
 
 LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
-"""Of the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, and now and then wrong."""
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, but may be wrong."""
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
@@ -140,34 +139,19 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
-    that of an outage has, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
+    in an outage, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
     prediction returns the levels themselves.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
-    below, upto = _gain_probabilities(prediction, np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db))
+    gain_db = np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+    below, upto = (1.0 - prediction.probability_above(at_db) for at_db in (np.nextafter(gain_db, -np.inf), gain_db))
     width = np.maximum(upto - below, 1e-12)
     return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
 
 
-def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Floats, Floats]:
-    """Predicted probabilities (N,) of a smaller gain, and of a gain that is not greater."""
-    floor, none = np.full_like(gain_db, GAIN_FLOOR_DB), np.zeros_like(gain_db)
-    below, upto = none.copy(), none.copy()
-    for p, mean_db, std_db in (
-        (prediction.p_outage, floor, none),
-        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
-        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
-    ):
-        offset_db = gain_db - mean_db
-        spread = ndtr(offset_db / np.where(std_db > 0.0, std_db, 1.0))
-        below += p * np.where(std_db > 0.0, spread, offset_db > 0.0)
-        upto += p * np.where(std_db > 0.0, spread, offset_db >= 0.0)
-    return below, upto
-
-
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
-    """Of the link state, and of link state and gain."""
+    """Return the loss of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)

@@ -1,4 +1,4 @@
-"""Robot simulator: a complete home -> what a robot has seen of it after so many steps."""
+"""Robot simulator: a complete home -> the maps of a robot after so many steps."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Floats, States, read_only
 from sionna_partial.checks import Progress, are_stages, is_whole, require, require_choice, settings_or_default
 from sionna_partial.constants import CellState
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, reporting
 from sionna_partial.errors import MapError
 from sionna_partial.exploration.next_views import coverage_choice
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.progress import reporting
 from sionna_partial.settings import Policy, SensorSettings
 from sionna_partial.worlds.robot import Choice, Robot
 
 MAX_STEPS = 100_000
-"""Largest number of actions: many times what a large building takes."""
+"""Largest number of actions: many times the number for a large building."""
 
 VAIN_STEPS = 1000
 """Number of actions without progress after which a robot stops trying to observe a fraction of the free area: errors of
@@ -78,7 +77,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     def maps(self) -> list[PartialMap]:
         """Map of the robot after each of `steps`.
 
-        `interior_cells` is the number of free cells of the home. A mesh is cut to what is known, each time anew.
+        `interior_cells` is the number of free cells of the home. A mesh is cut to the known cells, each time anew.
         """
         free = int((self.home.state == _FREE).sum())
         return [cut_to_known(replace(self.home, state=state, interior_cells=free)) for state in self.states]
@@ -114,7 +113,7 @@ def explore(
     policy: Policy = "random",
     tx: ArrayLike | None = None,
 ) -> list[PartialMap]:
-    """Send a robot through a home and return what it has seen at several moments.
+    """Send a robot through a home and return its map at several moments.
 
     The robot starts at a random free position and heading. Each step it moves towards a frontier between seen and
     unseen cells, or turns, and then looks: rays run through the cells to the first wall. Range, position and wall
@@ -143,8 +142,8 @@ def explore(
     -------
     list of PartialMap
         One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Cells
-        that are known in one map are known in the next; without errors they are equal. A mesh is cut to what is
-        known.
+        that are known in one map are known in the next; without errors they are equal. A mesh is cut to
+        the known cells.
 
     Raises
     ------

@@ -17,7 +17,7 @@ from scipy.cluster.vq import kmeans2
 from scipy.spatial.distance import cdist
 from scipy.special import entr
 
-from sionna_partial.arrays import Floats, read_only
+from sionna_partial.arrays import Floats, largest_part, read_only
 from sionna_partial.checks import (
     float_array,
     require_choice,
@@ -36,10 +36,9 @@ from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets, with_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
-from sionna_partial.planar import largest_part
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
-from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls
 from sionna_partial.worlds.camera import unknown_in_view
 from sionna_partial.worlds.robot import (
@@ -167,7 +166,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         return [_pose(view) for view in self]
 
     def to_yaml(self) -> str:
-        """Return the poses as YAML: `header` and `poses` of a geometry_msgs/PoseArray, and what is expected of each.
+        """Return the poses as YAML: `header` and `poses` of a geometry_msgs/PoseArray, and the expected gains.
 
         Examples
         --------
@@ -198,6 +197,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
             stream.write(self.to_yaml())
 
 
+@takes_settings
 def next_views(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike | None = None,
@@ -224,8 +224,8 @@ def next_views(
     scene : PartialMap or path
         The map, or whatever `load_map` reads.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        One or several transmitters [m]. By default those of the measurements; where these have none, one that is
-        located by them; without measurements any position, the mean over some free cells.
+        One or several transmitters [m]. By default the transmitters of the measurements, or one located by them;
+        without measurements any position, the mean over some free cells.
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of the transmitters, as for `predict_map`.
     goal : {"coverage", "state", "area"}
@@ -312,7 +312,7 @@ def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | N
 def _gains(
     partial: PartialMap, frontiers: list[Frontier], tx_m: Floats, uncertainty: xr.DataArray, sensor: SensorSettings
 ) -> tuple[list[float], list[float]]:
-    """Return what is gained at each frontier, and the heading with the largest unknown area in view [degree].
+    """Return the gain at each frontier, and the heading with the largest unknown area in view [degree].
 
     A view that shows a part of the unobserved part of a link's direct line is taken to lower its uncertainty by that
     fraction.

@@ -23,26 +23,24 @@ from sionna_partial.checks import (
     float_array,
     no_progress,
     number_of,
+    reason_of,
     require,
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
+from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, grid_array, with_height
+from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
-COARSER = 4
-"""Distance between the receivers of the first answer, in those of the final one."""
-
 LATE_S = 30.0
-"""A map whose stamp is older than that of the last one by less is late and is dropped; by more, the robot's clock has
-started again [s]."""
+"""A map whose stamp is older than the last stamp by less is late and is dropped; by more, the robot's clock has started
+again [s]."""
 
 POSE_AGE_S = 2.0
 """Time for which the last pose of the robot counts as where it is [s]."""
@@ -61,12 +59,12 @@ _log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class LiveSettings(Checked):
-    """How live coverage is computed.
+    """Settings of live coverage.
 
     Parameters
     ----------
     frame : str
-        Frame in which the transmitters are given and maps are taken; "" is that of the first map.
+        Frame in which the transmitters are given and maps are taken; "" is the frame of the first map.
     threshold_db : float
         Path gain up to which a cell counts as not covered [dB].
     spacing_m, rx_height_m : float
@@ -106,7 +104,7 @@ class LiveGrid(NamedTuple):
     name : str
         The transmitter's.
     map_number : int
-        How many maps had been taken, with this one.
+        Number of maps that had been taken, including this one.
     is_final : bool
         False of the coarse answer, true of the fine one.
     coverage : xarray.Dataset
@@ -209,7 +207,7 @@ class _NewerMap(Exception):
 
 
 def _refusing(method: Callable[..., None]) -> Callable[..., None]:
-    """Log what a message is refused for, whatever it holds: a robot's message never ends the program."""
+    """Log the reason for which a message is refused: a robot's message never ends the program."""
 
     @functools.wraps(method)
     def take(self: "LiveCoverage", *given: Any, **named: Any) -> None:
@@ -277,11 +275,12 @@ class LiveCoverage:
         self._closed = False
         self._newest: _Grid | None = None
         self._waiting: _Grid | None = None
-        self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
+        self._answered, self._moved, self._gave_way, self._stepped_s = 0, False, False, -math.inf
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
         self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
         self._new_powers, self._views_wanted, self._views_s = False, False, -math.inf
+        self._published: dict[str, LiveGrid] = {}
         self._lines_s: dict[str, float] = {}
 
     @_refusing
@@ -332,6 +331,18 @@ class LiveCoverage:
                     del kept[oldest]
                 self._new_powers = True
 
+    @_refusing
+    def on_transmitter(self, name: str, position_m: ArrayLike | None) -> None:
+        """Add a transmitter, or move it, or remove it with None; its measured powers are forgotten."""
+        if position_m is None and name not in self.tx_m:
+            raise PositionError(f"{shown(name)} is not known: the transmitters are {', '.join(self.tx_m)}.")
+        added = {} if position_m is None else _named_positions({name: position_m})
+        with self._changed:
+            self.tx_m = {known: at_m for known, at_m in self.tx_m.items() if known != name} | added
+            self._powers = {known: self._powers.get(known, {}) if known != name else {} for known in self.tx_m}
+            self._waiting, self._moved = self._newest, True
+            self._changed.notify_all()
+
     def request_views(self) -> None:
         """Ask for the best next views, once."""
         with self._changed:
@@ -339,7 +350,7 @@ class LiveCoverage:
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Compute what comes, until `close` and nothing waits."""
+        """Compute maps as they come, until `close` and nothing waits."""
         while self.step() or not self._closed:
             with self._changed:
                 if self._waiting is None and not self._closed:
@@ -352,7 +363,7 @@ class LiveCoverage:
         return thread
 
     def close(self) -> None:
-        """End `run` after what it computes and what waits."""
+        """End `run` after the current and the waiting map."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -364,7 +375,8 @@ class LiveCoverage:
             if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
                 grid = self._newest
             self._waiting, every_s = None, self.settings.views_every_s
-            views = self._newest is not None and (self._views_wanted or 0.0 < every_s <= now_s - self._views_s)
+            wanted = self._views_wanted or 0.0 < every_s <= now_s - self._views_s
+            views = wanted and self._newest is not None and bool(self.tx_m)
         if grid is not None:
             self._new_powers = False
             self._guarded("map", self._compute, grid)
@@ -375,7 +387,7 @@ class LiveCoverage:
         return grid is not None or views
 
     def report(self, line: str) -> None:
-        """Log what was refused, the same line once a minute."""
+        """Log a refusal, the same line once a minute."""
         now_s = time.monotonic()
         if now_s - self._lines_s.get(line, -math.inf) >= REPEATED_S:
             self._lines_s.pop(line, None)
@@ -408,22 +420,29 @@ class LiveCoverage:
         except _NewerMap:
             raise
         except Exception as error:  # whatever it is, the next map may be answered
-            known = isinstance(error, SionnaPartialError | OSError | MemoryError)
-            reason = str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
             if what:
-                self.report(f"{what} not answered: {reason}")
+                self.report(f"{what} not answered: {reason_of(error)}")
 
     def _compute(self, grid: _Grid) -> None:
         if self._model is None:
             self._model = LinkModel(grid.partial, **self._model_settings)
         self._model.update(grid.partial)
-        if grid.number != self._answered:
+        if grid.number != self._answered or self._moved:
+            self._moved = False
+            self._clear_removed()
             self._each(grid, is_final=False)
         self._answered, may_give_way, self._gave_way = grid.number, not self._gave_way, False
         try:  # once a newer map comes first, and then not, so that there is a fine answer now and then
             self._each(grid, is_final=True, report=self._give_way if may_give_way else no_progress)
         except _NewerMap:
             self._gave_way = True
+
+    def _clear_removed(self) -> None:
+        """Publish a last grid, in which nothing is known, of each transmitter that was removed."""
+        for name in self._published.keys() - self.tx_m.keys():
+            last = self._published.pop(name)
+            nothing = np.full_like(last.cost, -1)
+            self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
 
     def _give_way(self, fraction: float, message: str) -> None:
         """End a final answer as soon as a newer map waits."""
@@ -441,22 +460,25 @@ class LiveCoverage:
             tx_m,
             spacing_m=spacing_m,
             rx_height_m=self.settings.rx_height_m,
-            measurements=self._measured(name),
+            measurements=self._measured(name, tx_m),
             progress=report,
         )
         cost, unknown = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
         age_s = time.monotonic() - grid.came_s
-        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s))
+        answer = LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s)
+        if self.tx_m.get(name) is tx_m:  # it was not moved meanwhile
+            self._published[name] = answer
+            self._publish(answer)
 
-    def _measured(self, name: str) -> Measurements | None:
+    def _measured(self, name: str, tx_m: Floats) -> Measurements | None:
         """Return the powers that were measured of a transmitter and can be used on the map of now."""
         with self._changed:
-            rows = np.array([*self._powers[name].values()]).reshape(-1, 3)
+            rows = np.array([*self._powers.get(name, {}).values()]).reshape(-1, 3)
         if not len(rows):
             return None
         assert self._model is not None
         rx_m = np.column_stack([rows[:, :2], np.full(len(rows), self.settings.rx_height_m)])
-        partial, tx_m = self._model.partial, self.tx_m[name]
+        partial = self._model.partial
         usable = partial.radios_can_stand(rx_m)
         frequency_hz = self._model.simulation.trace_settings.frequency_hz
         usable[usable] = can_be_used(partial, tx_m[None], rx_m[usable], frequency_hz)
@@ -467,15 +489,11 @@ class LiveCoverage:
         grid = self._newest
         assert grid is not None
         tx_m = np.stack([*self.tx_m.values()])
-        start = None if self._pose is None else _nearest_free(self._model.partial, self._pose[:2])
+        # the nearest free cell: a pose in a wall is an error of the robot's localisation
+        starts_m = [] if self._pose is None else [*nearest_free_m(self._model.partial, self._pose[:2])]
+        start = starts_m[0] if starts_m else None
         views = next_views(self._model, tx_m, start=start, threshold_db=self.settings.threshold_db)
         self._publish(LiveViews(views, grid.header))
-
-
-def _nearest_free(partial: PartialMap, at_m: tuple[float, float]) -> Floats | None:
-    """Return the middle of the nearest free cell [m]: a position in a wall is off by an error of the robot's."""
-    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
-    return free_m[np.hypot(*(free_m - at_m).T).argmin()] if len(free_m) else None
 
 
 def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:

@@ -1,30 +1,64 @@
-"""Topics of a robot: which method of a LiveCoverage takes each message, and where the robot is by its transforms."""
+"""Topics of a robot, from a recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back; no ROS is needed.
 
+rosbridge also works where DDS does not pass. Its WebSocket is opened again when it is lost.
+"""
+
+import json
+import logging
+import os
 import re
 import time
 from collections import ChainMap
 from collections.abc import Mapping, MutableMapping
+from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from sionna_partial.checks import Checked, require
+from sionna_partial.checks import Checked, require, require_whole, shown
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
+from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
+from sionna_partial.resources import optional_packages
 
 MOST_FRAMES = 1000
 """Number of frames outside the robot's chain that are kept, the newest ones of `/tf` and of `/tf_static`."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
-"""Types of what is published."""
+"""Types of published messages."""
 
 UPDATE_TYPE = "map_msgs/msg/OccupancyGridUpdate"
 UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
 """Definition of the one message that no type store has."""
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
+
+HIGHEST_DOMAIN = 232
+"""Domains that have ports."""
+
+MOST_AT_ONCE = 100
+"""Number of messages of a topic that are taken before the next topic's."""
+
+POLL_S = 0.02
+"""Time between two looks for messages [s]."""
+
+_LIMITS = (
+    "<CycloneDDS><Domain><Internal>"
+    f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+)
+
+MAX_BYTES = 100_000_000
+"""Largest message that is taken [bytes]."""
+
+RETRY_S = 1.0
+"""Time after which a server that is gone is looked for again [s]."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,7 +76,7 @@ class Topics(Checked):
     key_values : str
         Topic of `diagnostic_msgs/KeyValue` with the name of a transmitter and its power; "" for none.
     unknown : bool
-        Whether the predictions for cells that the map does not know are published, with "/unknown" behind the topic.
+        Predictions for cells that the map does not know are published, too, with "/unknown" behind the topic.
 
     Raises
     ------
@@ -71,8 +105,13 @@ class Topics(Checked):
         """Return the message type of each topic that is listened to."""
         types = {self.map: GRID_TYPE, f"{self.map}_updates": UPDATE_TYPE, "/tf": TF_TYPE, "/tf_static": TF_TYPE}
         types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32")
-        types |= {self.key_values: "diagnostic_msgs/msg/KeyValue"} if self.key_values else {}
+        types |= dict.fromkeys(filter(None, (self.key_values, self.transmitters)), "diagnostic_msgs/msg/KeyValue")
         return types | {f"{self.prefix}/request_views": "std_msgs/msg/Empty"}
+
+    @property
+    def transmitters(self) -> str:
+        """Topic of `diagnostic_msgs/KeyValue` with the name and the position of a transmitter: see `Listener`."""
+        return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
         """Return the message type of each topic that is published for transmitters of these names."""
@@ -80,13 +119,13 @@ class Topics(Checked):
         grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
         return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
 
-    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, dict[str, Any]]:
-        """Return the messages of an answer by topic."""
+    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Return the messages of an answer by topic, each with its type."""
         if isinstance(answer, LiveViews):
-            return {f"{self.prefix}/next_views": answer.message()}
+            return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
         topic = f"{self.prefix}/{answer.name}"
-        unknown = {f"{topic}/unknown": answer.message(unknown=True)} if self.unknown else {}
-        return {topic: answer.message()} | unknown
+        unknown = {f"{topic}/unknown": (GRID_TYPE, answer.message(unknown=True))} if self.unknown else {}
+        return {topic: (GRID_TYPE, answer.message())} | unknown
 
 
 class _Transform(NamedTuple):
@@ -98,7 +137,10 @@ class _Transform(NamedTuple):
 
 
 class Listener:
-    """Hands the messages of topics to a `LiveCoverage`, whatever they hold."""
+    """Hands the messages of topics to a `LiveCoverage`, whatever they hold.
+
+    The value of a transmitter is its position, "x y" or "x y z" [m]; an empty value removes it.
+    """
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
         self.live, self.topics = live, topics
@@ -122,6 +164,8 @@ class Listener:
                 live.on_power(message.data, now_s, topics.powers[topic])
             elif topic == topics.key_values:
                 live.on_power(float(message.value), now_s, message.key)
+            elif topic == topics.transmitters:
+                live.on_transmitter(message.key, [*map(float, message.value.split())] or None)
             else:
                 live.request_views()
         except Exception as error:  # messages may hold anything
@@ -147,3 +191,284 @@ class Listener:
             del frames[name]
         if frame == self.live.frame and chain & {each.child_frame_id.lstrip("/") for each in message.transforms}:
             self.live.on_pose(float(position_m[0]), float(position_m[1]), now_s)
+
+
+def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) -> None:
+    """Hand over the messages of a recording, `rate` times as fast as they came; 0 waits for each map's answer.
+
+    Raises
+    ------
+    MapError
+        If it is no rosbag or damaged, or has no topic of the map.
+    """
+    with open_recording(path, MapError) as recording:
+        recording.topic_of(listener.topics.map, (GRID,))
+        start_s = time.monotonic()
+        for message in recording.messages(*listener.topics.types()):
+            if rate:
+                time.sleep(max(0.0, start_s + message.time_s / rate - time.monotonic()))
+            listener.take(message.topic, message.content, message.time_s)
+            while not rate and listener.live.step():
+                pass
+
+
+class Dds:
+    """The topics of one DDS domain, and of no other.
+
+    `CYCLONEDDS_URI` chooses interfaces and peers, as for ROS 2 with Cyclone DDS.
+
+    Parameters
+    ----------
+    topics : Topics
+    names : mapping
+        Transmitters, by name.
+    domain : int or None
+        None is `ROS_DOMAIN_ID`, or 0.
+
+    Raises
+    ------
+    SettingsError
+        For a domain that is none, or one that cannot be joined.
+    """
+
+    def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
+        number = _domain(domain)
+        with optional_packages(SettingsError):
+            from cyclonedds.core import DDSException
+            from cyclonedds.domain import Domain, DomainParticipant
+        try:
+            config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
+            self._domain: Any = Domain(number, config)
+            self._participant: Any = DomainParticipant(number)
+        except DDSException as error:
+            remedy = "check CYCLONEDDS_URI and the network interfaces."
+            raise SettingsError(f"DDS domain {number} cannot be joined ({error.msg}): {remedy}") from error
+        self.topics, self.source = topics, f"DDS domain {number}"
+        self._readers = [
+            (topic, self._reader(topic, kind, latched))
+            for topic, kind in topics.types().items()
+            for latched in ((True, False) if topic in (topics.map, "/tf_static") else (False,))
+        ]
+        self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
+
+    def publish(self, answer: LiveGrid | LiveViews) -> None:
+        """Publish an answer, reliably; who joins later gets the last one."""
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._writers:
+                self._writers[topic] = self._writer(topic, kind)
+            self._writers[topic].write(filled(kind, message))
+
+    def listen(self, live: LiveCoverage) -> None:
+        """Hand messages to a `LiveCoverage` without end."""
+        listener = Listener(live, self.topics)
+        while True:
+            self.poll(listener)
+            time.sleep(POLL_S)
+
+    def poll(self, listener: Listener) -> None:
+        """Hand over the messages that have come."""
+        for topic, reader in self._readers:
+            for _ in range(MOST_AT_ONCE):
+                try:
+                    samples = reader.take(1)
+                except Exception as error:  # bytes that are no message of its type
+                    listener.live.report(f"a message of {topic} cannot be decoded ({type(error).__name__}: {error}).")
+                    continue
+                if not samples:
+                    break
+                if samples[0].sample_info.valid_data:
+                    listener.take(topic, samples[0])
+
+    def close(self) -> None:
+        """Leave the domain."""
+        self._readers, self._writers, self._participant, self._domain = [], {}, None, None
+
+    def _reader(self, topic: str, kind: str, latched: bool) -> Any:
+        from cyclonedds.sub import DataReader
+
+        qos = _qos(latched=latched, reliable=latched, depth=1 if topic == self.topics.map else 100)
+        return DataReader(self._participant, self._topic(topic, kind), qos=qos)
+
+    def _writer(self, topic: str, kind: str) -> Any:
+        from cyclonedds.pub import DataWriter
+
+        qos = _qos(latched=True, reliable=True, depth=1)
+        return DataWriter(self._participant, self._topic(topic, kind), qos=qos)
+
+    def _topic(self, topic: str, kind: str) -> Any:
+        from cyclonedds.topic import Topic
+
+        return Topic(self._participant, f"rt{topic}", struct(kind))
+
+
+def _domain(given: int | None) -> int:
+    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
+    if given is None and not text.isdecimal():
+        raise SettingsError(f"ROS_DOMAIN_ID = {text!r} is no number: give 0 to {HIGHEST_DOMAIN}.")
+    number = int(text) if given is None else given
+    require_whole("domain", number, 0, HIGHEST_DOMAIN)
+    return number
+
+
+def _qos(*, latched: bool, reliable: bool, depth: int) -> Any:
+    """Quality of service as nav2 has it for maps, where latched; else what matches any publisher."""
+    from cyclonedds.core import Policy, Qos
+    from cyclonedds.util import duration
+
+    return Qos(
+        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
+        Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
+        Policy.History.KeepLast(depth),
+        Policy.DataRepresentation(use_cdrv0_representation=True),
+    )
+
+
+@cache
+def _store() -> Any:
+    """Return the definitions of ROS 2's messages."""
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    store = get_typestore(Stores.LATEST)
+    store.register(get_types_from_msg(UPDATE_TEXT, UPDATE_TYPE))
+    return store
+
+
+@cache
+def struct(kind: str) -> Any:
+    """Return the DDS type of a message type such as "nav_msgs/msg/OccupancyGrid", named as ROS 2 does."""
+    from cyclonedds.idl import make_idl_struct
+
+    package, _, name = kind.split("/")
+    fields = {each: _field_type(*description) for each, description in _store().fielddefs[kind][1]}
+    return make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
+
+
+def _field_type(node: Any, description: Any) -> Any:
+    from cyclonedds.idl import types
+
+    if node.name == "NAME":
+        return struct(description)
+    if node.name == "BASE":
+        return {"string": str, "bool": bool}.get(description[0]) or getattr(types, description[0])
+    inner, count = description
+    if node.name == "SEQUENCE":
+        return types.sequence[_field_type(*inner)]  # type: ignore[misc]
+    return types.array[_field_type(*inner), count]  # type: ignore[misc]
+
+
+def filled(kind: str, values: Mapping[str, Any]) -> Any:
+    """Return a message of a type from nested mappings."""
+    given = {}
+    for name, (node, description) in _store().fielddefs[kind][1]:
+        value = values[name]
+        if node.name == "NAME":
+            value = filled(description, value)
+        elif isinstance(value, list) and description[0][0].name == "NAME":
+            value = [filled(description[0][1], each) for each in value]
+        given[name] = value
+    return struct(kind)(**given)
+
+
+class Rosbridge:
+    """The topics of a rosbridge server.
+
+    Parameters
+    ----------
+    url : str
+        Such as "ws://robot:9090".
+    topics : Topics
+    names : mapping
+        Transmitters, by name.
+
+    Raises
+    ------
+    SettingsError
+        For another kind of address.
+    """
+
+    def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
+        with optional_packages(SettingsError):
+            from websockets.uri import parse_uri
+        try:
+            good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
+        except ValueError:  # a port that is none
+            good = False
+        if not good:
+            raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
+        self.url = self.source = url
+        self.topics, self._published = topics, topics.published(names)
+        self._socket: Any = None
+        self._last: dict[str, str] = {}
+
+    def publish(self, answer: LiveGrid | LiveViews) -> None:
+        """Publish an answer; a server that starts again gets the last ones."""
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._published:
+                self._published[topic] = kind
+                self._advertise(topic)
+            self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": message})
+            self._send(self._last[topic])
+
+    def listen(self, live: LiveCoverage) -> None:
+        """Hand messages to a `LiveCoverage` without end."""
+        listener = Listener(live, self.topics)
+        while True:
+            self.connect(listener)
+            time.sleep(RETRY_S)
+
+    def connect(self, listener: Listener) -> None:
+        """Hand over messages until the connection ends, and log why."""
+        from websockets.exceptions import WebSocketException
+        from websockets.sync.client import connect
+
+        try:
+            with connect(self.url, max_size=MAX_BYTES, open_timeout=5.0) as self._socket:
+                _log.info("connected to %s", self.url)
+                self._greet()
+                for text in self._socket:
+                    self._take(listener, text)
+                reason = "it ended the connection"
+        except (OSError, WebSocketException) as error:
+            reason = str(error)
+        finally:
+            self._socket = None
+        listener.live.report(f"{self.url}: {reason}; it is tried again every {RETRY_S:g} s.")
+
+    def _greet(self) -> None:
+        for topic in [*self._published]:
+            self._advertise(topic)
+        for topic, kind in self.topics.types().items():
+            depth = 1 if topic == self.topics.map else 0
+            request = {"op": "subscribe", "topic": topic, "type": _old(kind), "queue_length": depth}
+            self._send(json.dumps(request))
+        for text in [*self._last.values()]:
+            self._send(text)
+
+    def _advertise(self, topic: str) -> None:
+        kind = _old(self._published[topic])
+        self._send(json.dumps({"op": "advertise", "topic": topic, "type": kind, "latch": True}))
+
+    def _send(self, text: str) -> None:
+        from websockets.exceptions import WebSocketException
+
+        socket = self._socket
+        if socket is not None:
+            with suppress(OSError, WebSocketException):  # the listening side logs it
+                socket.send(text)
+
+    def _take(self, listener: Listener, text: str | bytes) -> None:
+        try:
+            message = json.loads(text, object_hook=lambda fields: SimpleNamespace(**fields))
+            operation, topic = getattr(message, "op", None), getattr(message, "topic", None)
+            if operation == "publish" and topic in self.topics.types():
+                listener.take(topic, message.msg)
+            elif operation == "status":
+                listener.live.report(f"{self.url}: {shown(message.msg)}")
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
+            listener.live.report(f"{self.url}: a message is dropped ({type(error).__name__}: {error}).")
+
+
+def _old(kind: str) -> str:
+    """Return a type as rosbridge of ROS 1 and 2 takes it: without "msg"."""
+    package, _, name = kind.split("/")
+    return f"{package}/{name}"

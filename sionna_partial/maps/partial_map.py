@@ -1,8 +1,9 @@
-"""PartialMap: what has been observed of a floor plan, cell by cell."""
+"""PartialMap: the observed part of a floor plan, cell by cell."""
 
 import itertools
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -12,17 +13,15 @@ import shapely
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
+from sionna_partial.arrays import Bools, Floats, Indices, States, largest_by_area, read_only
 from sionna_partial.checks import float_array, is_whole, number_of, real_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.environment import FloorPlan, Mesh
+from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.mesh.mesh import SceneMesh, equal_fields
 from sionna_partial.maps.wall_cells import wall_cells
-from sionna_partial.planar import largest_by_area
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -32,7 +31,7 @@ MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 MAX_WALL_MATERIALS = 255
-"""Most materials of the walls of a map, and most heights of obstacles, which a byte per cell counts."""
+"""Most materials of the walls of a map, heights of obstacles, and rooms, which a byte per cell counts."""
 
 FREE_STANDING_M = 2.5
 """Extent along x and y up to which walls that stand free are furniture [m]."""
@@ -46,6 +45,9 @@ ROOM_M, BODY_M = 0.6, 0.3
 POCKET_M = 0.4
 """Edge of a square that an unknown region must hold for a robot to look into it [m]."""
 
+FAR_EXTENTS = 2.0
+"""Distance from the middle of a map, in its extents, from which a position is in another unit or of another map."""
+
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
 
@@ -56,7 +58,7 @@ _RANK = np.argsort(_FREEST)
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
+class PartialMap(Pictured, plot="plots.style:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
 
     World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.
@@ -74,20 +76,24 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     interior_cells : int or None
         Number of free cells of the complete home, where a simulation gives it.
     mesh : SceneMesh or None
-        What has been observed of the building, in place of walls extruded from the cells. Its z is the world's.
+        Observed part of the building, instead of walls extruded from the cells. Its z is the z of the world.
     material : Material or None
-        Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
-        SceneSettings.
+        Material of its walls, floor and ceiling, or of the parts of its mesh that name none; None is the
+        material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
         Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Kept read-only, and 0 where there
         is no wall. A mesh has its own. See `with_wall_material`.
     wall_materials : tuple of Material
         At most 255 materials that `wall_material` counts.
     obstacle : (ny, nx) uint8 array or None
-        Which wall cells end below the ceiling: k for those of `obstacle_heights_m[k - 1]`, 0 for walls that reach it.
+        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls.
         Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
+    room : (ny, nx) uint8 array or None
+        Room of each free cell: k for `room_names[k - 1]`, 0 for none. Kept read-only, and 0 where the cell is not free.
+    room_names : tuple of str
+        At most 255 names that `room` counts, such as those of the segments of a vacuum robot's map.
     import_source : ImportSource or None
         Facts about the file that the map was read from, for `import_report`. Maps that differ in it alone are equal.
 
@@ -115,6 +121,8 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     wall_materials: tuple[Material, ...] = ()
     obstacle: NDArray[np.uint8] | None = None
     obstacle_heights_m: tuple[float, ...] = ()
+    room: NDArray[np.uint8] | None = None
+    room_names: tuple[str, ...] = ()
     import_source: ImportSource | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -139,13 +147,15 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         object.__setattr__(self, "wall_material", self._layer("wall_material", "wall_materials"))
         object.__setattr__(self, "obstacle_heights_m", _checked_heights(self.obstacle_heights_m))
         object.__setattr__(self, "obstacle", self._layer("obstacle", "obstacle_heights_m"))
+        object.__setattr__(self, "room_names", _checked_names(self.room_names))
+        object.__setattr__(self, "room", self._layer("room", "room_names", CellState.FREE))
 
-    def _layer(self, name: str, counted: str) -> NDArray[np.uint8] | None:
-        """Return the numbers of the wall cells as a new read-only array, None where all are 0."""
+    def _layer(self, name: str, counted: str, of: CellState = CellState.WALL) -> NDArray[np.uint8] | None:
+        """Return the numbers of the cells of a state as a new read-only array, None where all are 0."""
         values = getattr(self, name)
         if values is None:
             return None
-        if self.mesh is not None:
+        if self.mesh is not None and of == CellState.WALL:
             raise MapError(f"{name} is for floor plans: a mesh has walls of its own.")
         cells, count = grid_array(name, values, "iub"), len(getattr(self, counted))
         if cells.shape != self.shape:
@@ -153,7 +163,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         if cells.min() < 0 or cells.max() > count:
             what = f"{name} has values {cells.min()} to {cells.max()}, and {counted} has {count} entries"
             raise MapError(f"{what}: give one for each value from 1 on; 0 is the default.")
-        cells = np.where(self.state == CellState.WALL, cells, 0).astype(np.uint8)
+        cells = np.where(self.state == of, cells, 0).astype(np.uint8)
         cells.setflags(write=False)
         return cells if cells.any() else None
 
@@ -174,7 +184,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
             window[inside] = cells[own]
             return window
 
-        names = "wall_material", "obstacle"
+        names = "wall_material", "obstacle", "room"
         layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
@@ -213,7 +223,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return replace(self, wall_material=cells, wall_materials=materials)
 
     def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
-        """Return the map with the walls of an area ending at a height: what a low lidar saw need not be a wall.
+        """Return the map with the walls of an area ending at a height: a low lidar also sees furniture.
 
         Paths go over such obstacles, and radios may stand above them.
 
@@ -276,16 +286,16 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         return x, y, x + nx * self.resolution_m, y + ny * self.resolution_m
 
     @property
-    def environment(self) -> FloorPlan | Mesh:
-        """What stands in it: walls extruded from its cells, or its mesh."""
-        if self.mesh is None:
-            return FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
-        return Mesh(self.mesh)
+    def environment(self) -> FloorPlan | SceneMesh:
+        """Walls extruded from its cells, or its mesh."""
+        return self.mesh or FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
 
     @property
     def height_range_m(self) -> tuple[float, float]:
         """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
-        return self.environment.height_range_m
+        range_m = self.environment.height_range_m
+        assert range_m is not None  # a mesh has it once it is built
+        return range_m
 
     @cached_property
     def import_report(self) -> ImportReport | None:
@@ -299,7 +309,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
     def is_complete(self) -> bool:
         """Return whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
 
-        What lies beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
+        The space beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
         out of a larger one. A map without free cells is not complete.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
@@ -322,7 +332,7 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:
-        """How many cells in every direction, corners included, are in the state of each cell (ny, nx)."""
+        """Number of cells in every direction, corners included, in the state of each cell (ny, nx)."""
         return uniform_cells(self.state)
 
     @property
@@ -363,9 +373,9 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
-        """Heights up to which walls reach [m], and a map with the walls of that height alone; first those of a room.
+        """Heights up to which walls reach [m], and a map with the walls of that height alone; first the walls of rooms.
 
-        The first map has free cells in place of obstacles and of what they enclose, and the infinite height.
+        The first map has the infinite height, and free cells instead of obstacles and the areas that they enclose.
         """
         if self.obstacle is None:
             return ((math.inf, self),)
@@ -387,8 +397,10 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         ]
         return np.asarray(np.any(found, axis=0))
 
-    def require_positions(self, name: str, points_m: object, *, least: int = 1) -> Floats:
-        """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
+    def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
+        """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
+
+        Messages call the argument `name`, and each position by its name in `names`, if there are any.
 
         Raises
         ------
@@ -401,9 +413,9 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
         for fault, what, remedy in self._position_faults(flat):
             if fault.any():
                 index = int(np.argmax(fault))
-                which = name if points.ndim == 1 else f"{name}[{index}]"
+                which = name if points.ndim == 1 else names[index] if names else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
-                remedy += self._turned_hint(flat)
+                remedy += self._turned_hint(flat) or self._unit_hint(flat[index])
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
 
@@ -416,12 +428,25 @@ class PartialMap(Pictured, plot="plots.map_plot:plot_map"):
                 return f" All {len(points_m)} are free on the map {name}."
         return ""
 
+    def _unit_hint(self, point_m: Floats) -> str:
+        """Ask for metres where a position (3,) far outside would be on the map in another unit."""
+        x0, y0, x1, y1 = self.bounds_m
+        if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
+            return ""
+        for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2)):
+            for scale in (np.array([factor, factor, 1.0]), np.full(3, factor)):
+                meant = point_m * scale
+                if self.radios_can_stand(meant[None])[0]:
+                    text = ", ".join(f"{value:g}" for value in meant)
+                    return f" Did you mean metres? Taken for {unit} it is at ({text}) m."
+        return ""
+
     def radios_can_stand(self, points_m: Floats) -> Bools:
         """Return whether `require_positions` takes each of the points (N, 3) [m]."""
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
     def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
-        """Which points (N, 3) [m] have each fault, what it is, and the remedy."""
+        """Return, for each fault, the points (N,) that have it, its description, and the remedy."""
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         finite = np.asarray(np.isfinite(points_m).all(axis=1))
@@ -481,6 +506,12 @@ def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
     return (np.asarray(cells, dtype=np.float64)[..., ::-1] + 0.5) * partial.resolution_m + partial.origin_m
 
 
+def nearest_free_m(partial: PartialMap, at_m: ArrayLike, count: int = 1) -> Floats:
+    """Return the centres (K, 2) of the free cells that are nearest to a position (2,) [m], at most `count`."""
+    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
+    return free_m[np.hypot(*(free_m - np.asarray(at_m, dtype=np.float64)).T).argsort(kind="stable")[:count]]
+
+
 def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
     """Return the cells in blocks of `factor` cells a side (ny, factor, nx, factor), and the blocks' lower-left corner.
 
@@ -529,7 +560,7 @@ def frontier_cells(state: States) -> Bools:
 
 
 def uniform_cells(state: States) -> NDArray[np.int32]:
-    """How many cells in every direction, corners included, are in the state of each cell."""
+    """Return the number of cells in every direction, corners included, that are in the state of each cell."""
     uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
@@ -539,7 +570,7 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
 
 
 def warn_of_odd_states(what: str, partial: PartialMap) -> None:
-    """Warn of a map, called `what`, that is probably not what was meant: without walls or free cells, or inverted."""
+    """Warn of a map, called `what`, that is probably wrong: without walls or free cells, or inverted."""
     count = np.bincount(partial.state.ravel(), minlength=len(CellState))
     free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
     if partial.state.size < ODD_CELLS or not free + wall:
@@ -621,6 +652,16 @@ def _checked_materials(values: object) -> tuple[Material, ...]:
     if len(materials) > MAX_WALL_MATERIALS:
         raise MapError(f"wall_materials has {len(materials)} materials: give at most {MAX_WALL_MATERIALS}.")
     return materials
+
+
+def _checked_names(values: object) -> tuple[str, ...]:
+    """Return names of rooms as a tuple, or raise a MapError."""
+    names = tuple(values) if isinstance(values, tuple | list) else (values,)
+    if len({*names}) < len(names) or not all(isinstance(name, str) and name and name.isprintable() for name in names):
+        raise MapError(f"room_names = {shown(values)} is not allowed: give different texts of printable characters.")
+    if len(names) > MAX_WALL_MATERIALS:
+        raise MapError(f"room_names has {len(names)} names: give at most {MAX_WALL_MATERIALS}.")
+    return names
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

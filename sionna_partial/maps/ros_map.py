@@ -21,8 +21,8 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.import_report import ImportNotes
-from sionna_partial.maps.mesh.mesh import SceneMesh
 from sionna_partial.maps.partial_map import (
     MAX_CELLS,
     MAX_INTERIOR_CELLS,
@@ -36,7 +36,7 @@ from sionna_partial.settings import Material
 logger = logging.getLogger(__name__)
 
 MODES = ("trinary", "scale", "raw")
-"""How map_server may read an image."""
+"""Modes in which map_server reads an image."""
 
 UNKNOWN_SHADE = 205
 """Shade that map savers give to unknown cells [of 255]."""
@@ -76,7 +76,7 @@ MAX_YAW_RAD = 6.2832
 
 
 class _Sheet(NamedTuple):
-    """How the image of a map YAML is to be read."""
+    """Settings of a map YAML for the reading of its image."""
 
     source: Path
     image: Path
@@ -161,7 +161,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
 
 
 def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
-    """Return what the shades of the image of a layer count."""
+    """Return the list of materials or heights that the shades of the image of a layer number."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
     other = sorted(str(key) for key in given if key not in ("image", listed))
@@ -179,7 +179,7 @@ def _layer(
     shape: tuple[int, ...],
     origin: tuple[float, float, float],
 ) -> States:
-    """Return the numbers of the wall cells, which are the shades of an image."""
+    """Return the numbers of cells, which are the shades of an image."""
     if image.mode != "L" or image.size != shape[::-1]:
         what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th listed."
         raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
@@ -204,7 +204,7 @@ def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
     """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map, or neither.
 
-    Of a mesh, the YAML has what the exported scene beside it does not.
+    The YAML of a map with a mesh completes the exported scene beside it.
     """
     sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
     if partial.interior_cells is not None:
@@ -218,6 +218,10 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         image = f"{path.stem}_obstacle.pgm"
         sheet["obstacle"] = {"image": image, "heights": [*partial.obstacle_heights_m]}
         images[path.with_name(image)] = partial.obstacle
+    if partial.room is not None:
+        image = f"{path.stem}_room.pgm"
+        sheet["room"] = {"image": image, "names": [*partial.room_names]}
+        images[path.with_name(image)] = partial.room
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
@@ -406,9 +410,16 @@ def _height_m(path: Path, field: str, value: object) -> float:
     return _number(path, {field: value}, field, 0.01, 100.0, "metres")
 
 
+def _room_name(path: Path, field: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise _refuse(path, field, value, "give names of rooms.")
+    return value
+
+
 _LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "wall_material": ("materials", "wall_materials", _material),
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
+    "room": ("names", "room_names", _room_name),
 }
 """Layers of a map by their keys in the YAML: the key of what their shades count, its field of the map, its reader."""
 
@@ -486,13 +497,21 @@ def _read_pixels(sheet: _Sheet) -> _Pixels:
 
 
 def _decode(sheet: _Sheet) -> Image.Image:
+    image = opened_image(sheet.image, f"{sheet.source}: image = {shown(str(sheet.image))}", ("PPM", "PNG", "BMP"))
+    if image.mode == "F":
+        raise _refuse(sheet.source, "image", str(sheet.image), "it holds floating-point shades; save a PGM or PNG.")
+    return image
+
+
+def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Image:
+    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`, the argument and its value."""
     try:
         with (
-            open_regular(sheet.image, f"{sheet.source}: image", MapError, MAX_IMAGE_BYTES) as stream,
+            open_regular(path, given.partition(" = ")[0], MapError, MAX_IMAGE_BYTES) as stream,
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(stream, formats=("PPM", "PNG", "BMP"))
+            image = Image.open(stream, formats=formats)
             too_large = image.width * image.height > MAX_CELLS
             if not too_large:
                 image.load()
@@ -501,18 +520,25 @@ def _decode(sheet: _Sheet) -> Image.Image:
     except Image.DecompressionBombError:
         too_large = True
     except Exception as error:  # decoders fail in many ways on damaged files
-        remedy = f"it is damaged or not a PGM, PNG or BMP ({error}); save the map again."
-        raise _refuse(sheet.source, "image", str(sheet.image), remedy) from error
+        kinds = " or ".join(", ".join(formats).replace("PPM", "PGM").rsplit(", ", 1))
+        remedy = f"it is damaged or not a {kinds} ({error}); save the map again."
+        raise MapError(f"{given} is not allowed: {remedy}") from error
     if too_large:
         remedy = f"it has more than {MAX_CELLS:,} cells; cut the map to the building or coarsen it."
-        raise _refuse(sheet.source, "image", str(sheet.image), remedy)
-    if image.mode == "F":
-        raise _refuse(sheet.source, "image", str(sheet.image), "it holds floating-point shades; save a PGM or PNG.")
+        raise MapError(f"{given} is not allowed: {remedy}")
     return image
 
 
+def bare_image(path: Path) -> MapError:
+    """Return the error for an image without resolution."""
+    remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
+    if path.suffix.lower() != ".pgm":
+        remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"
+    return MapError(f"path = '{path}' is a bare image without resolution and origin: {remedy}.")
+
+
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
-    """Read every pixel to the letter of nav2's loadMapFromFile; what lies between the thresholds is unknown."""
+    """Read every pixel to the letter of nav2's loadMapFromFile; occupancies between the thresholds are unknown."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
     if sheet.mode == "raw":

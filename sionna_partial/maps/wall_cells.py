@@ -1,13 +1,18 @@
-"""Cells of a map -> the wall cells that outlines run through: holes filled, faces smoothed, short gaps closed."""
+"""Cells of a map -> wall cells that outlines run through, and chains of such cells -> straight runs that fit them.
+
+Holes are filled, faces smoothed and short gaps closed; a run is the longest straight line within a tolerance.
+"""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
+from sionna_partial.process import njit
 
 MAX_GAP_CELLS = 2
 """Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
@@ -42,6 +47,22 @@ _DEPTH_M = 0.0125
 Simulated lidars of 1, 2, 3 and 5 cm range noise make 0.002, 0.03, 0.05 and 0.08 m, real robots 0 to 0.08 m.
 """
 
+RAGGED_FACTOR = 2.0
+"""Largest distance of a line from ragged walls, in tolerances."""
+
+_CORNERS = 64
+
+_RESIDUAL_COST = 3.0
+
+_RAGGED_TURNS = 4
+
+_RAGGED_SPACING = 10.0
+
+_LEVEL_CELLS = 1.0
+
+_ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
+"""Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
+
 
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) that bear outlines.
@@ -60,9 +81,9 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 
     Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
     UNKNOWN cells in seen walls are closed (up to `bridge_gap_m`), and short ones of FREE cells in straight walls
-    (`MAX_FREE_GAP_M`). Of walls that were seen from FREE cells, only the cells beside these are left: what is behind
-    was not seen. Of deep walls these are the cells that rays meet, and those of inner corners. Walls two cells thick
-    are thinned. Thin walls, posts and specks stay.
+    (`MAX_FREE_GAP_M`). Of walls that were seen from FREE cells, only the cells beside these are kept, since cells
+    behind were not seen; inner corners of deep walls are kept, too. Walls two cells thick are thinned. Thin walls,
+    posts and specks stay.
     """
     wall = _fill_pinholes(state == CellState.WALL)
     free = ~_fill_pinholes((state != CellState.FREE) | wall)
@@ -84,7 +105,7 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 
 
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
-    """Cells between two faces of a deep wall that no ray meets: those of inner corners, and those behind other ones.
+    """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
     Both touch a FREE cell by a corner alone. The faces end at an inner corner; behind an outer one, and behind a step
     of a tilted face, another FREE cell is beside one of them. Deep are walls without FREE cells within `DEEP_CELLS`.
@@ -259,3 +280,186 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
         gone = simple & (around.sum(axis=0) >= 2)
         left[row[gone], column[gone]] = False
     return wall & ~left
+
+
+def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
+    """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
+
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, measured along x or
+    y (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
+    lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
+    more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
+    notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
+    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
+    ragged one is parallel to an axis where that moves its ends by half a cell at most.
+
+    Returns the index of the corner where every run begins (r,), and a point x, y on and the direction x, y of its line
+    (r, 4).
+    """
+    upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
+    tolerance = tolerance + 1e-6
+    previous, along_y = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
+    _find_runs(lying, upright, tolerance, np.full(len(points), np.inf), previous, along_y)
+    starts, lines, end = [], [], len(points) - 1
+    while end > 0:
+        starts.append(int(previous[end]))
+        x, y, along, across = _line(upright if along_y[end] else lying, starts[-1], end, tolerance)
+        lines.append((y, x, across, along) if along_y[end] else (x, y, along, across))
+        end = starts[-1]
+    return np.array(starts[::-1], np.int64), np.array(lines[::-1]).reshape(-1, 4)
+
+
+@njit(cache=True)
+def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
+    """Write where the cheapest run to every corner begins, and whether it is along y, by dynamic programming."""
+    cost[0] = 0.0
+    for i in range(len(points) - 1):
+        if cost[i] + 1.0 < cost[i + 1]:
+            cost[i + 1], previous[i + 1] = cost[i] + 1.0, i
+            along_y[i + 1] = abs(points[i + 1, 1] - points[i, 1]) > abs(points[i + 1, 0] - points[i, 0])
+        _extend(points, tolerance, i, False, cost, previous, along_y)
+        _extend(swapped, tolerance, i, True, cost, previous, along_y)
+
+
+@njit(cache=True)
+def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: ignore[no-untyped-def]
+    """Lengthen the run that begins at `start` while a line fits, and note where that makes a split cheaper."""
+    near, near_size = _all_lines()
+    far, far_size = _all_lines()
+    moments = np.zeros(6)
+    sign, turn, reversals = 0.0, 0.0, 0
+    for k in range(start, len(points) - 1):
+        ahead, aside = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+        if ahead * sign < 0.0:
+            return
+        sign = ahead if sign == 0.0 else sign
+        reversals += int(aside * turn < 0.0)
+        turn = aside if aside != 0.0 else turn
+        element = _middles(points, start, k)
+        near_size = _clip_element(near, near_size, element, tolerance)
+        far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerance)
+        if far_size == 0:
+            return
+        _accumulate(moments, element)
+        length = abs(points[k + 1, 0] - points[start, 0])
+        if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(moments) / max(tolerance, 0.25) ** 2
+            if total < cost[k + 1] - 1e-12:
+                cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
+
+
+@njit(cache=True)
+def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
+    """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
+    for factor in (1.0, RAGGED_FACTOR):
+        limit, moments = factor * tolerance, np.zeros(6)
+        polygon, size = _all_lines()
+        for k in range(start, end):
+            element = _middles(points, start, k)
+            size = _clip_element(polygon, size, element, limit)
+            _accumulate(moments, element)
+        ragged = factor > 1.0
+        if size > 0:
+            break
+    mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
+    spread = moments[3] - moments[1] * mean_x
+    slope = (moments[4] - moments[1] * mean_y) / spread if spread > 1e-9 else 0.0
+    if ragged and abs(slope * (points[end, 0] - points[start, 0])) <= _LEVEL_CELLS:
+        slope = 0.0
+    offset = mean_y - slope * mean_x
+    fits = True
+    for k in range(start, end):
+        x0, y0, x1, y1, _ = _middles(points, start, k)
+        fits = fits and max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) <= limit
+    if size > 0 and not fits:
+        slope, offset = 0.0, 0.0
+        for k in range(size):
+            slope, offset = slope + polygon[k, 0], offset + polygon[k, 1]
+        slope, offset = slope / size, offset / size
+    x, y, norm = points[start, 0] + mean_x, points[start, 1] + slope * mean_x + offset, np.sqrt(1.0 + slope * slope)
+    return x, y, 1.0 / norm, slope / norm
+
+
+@njit(cache=True)
+def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
+    """Keep the lines that pass the middles of an element's first and last unit edge within the tolerance."""
+    x0, y0, x1, y1, steps = element
+    if size > 0:
+        size = _clip(polygon, size, x0, y0, tolerance)
+    if size > 0 and steps > 1:
+        size = _clip(polygon, size, x1, y1, tolerance)
+    return size
+
+
+@njit(cache=True)
+def _middles(points, origin, k):  # type: ignore[no-untyped-def]
+    """Middles of the first and last unit edge of element k, relative to a corner, and the number of edges."""
+    x, y = points[k, 0] - points[origin, 0], points[k, 1] - points[origin, 1]
+    dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
+    a, b = abs(round(dx)), abs(round(dy))
+    while b > 0:
+        a, b = b, a % b
+    steps = max(a, 1)
+    half_x, half_y = 0.5 * dx / steps, 0.5 * dy / steps
+    return x + half_x, y + half_y, x + dx - half_x, y + dy - half_y, steps
+
+
+@njit(cache=True)
+def _accumulate(moments, element):  # type: ignore[no-untyped-def]
+    """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
+    x0, y0, x1, y1, steps = element
+    x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
+    spread = (steps + 1.0) / (12.0 * (steps - 1.0)) if steps > 1 else 0.0
+    dx, dy = x1 - x0, y1 - y0
+    moments[0] += steps
+    moments[1] += steps * x
+    moments[2] += steps * y
+    moments[3] += steps * (x * x + spread * dx * dx)
+    moments[4] += steps * (x * y + spread * dx * dy)
+    moments[5] += steps * (y * y + spread * dy * dy)
+
+
+@njit(cache=True)
+def _residual_variance(moments):  # type: ignore[no-untyped-def]
+    """Mean squared distance from the best line: the smaller eigenvalue of the covariance."""
+    mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
+    xx = moments[3] / moments[0] - mean_x * mean_x
+    xy = moments[4] / moments[0] - mean_x * mean_y
+    yy = moments[5] / moments[0] - mean_y * mean_y
+    return max(0.0, 0.5 * (xx + yy - np.sqrt((xx - yy) ** 2 + 4.0 * xy * xy)))
+
+
+@njit(cache=True)
+def _all_lines():  # type: ignore[no-untyped-def]
+    """Polygon of all lines, with room to cut it, and its number of corners."""
+    polygon = np.empty((_CORNERS, 2))
+    for k in range(len(_ALL_LINES)):
+        polygon[k, 0], polygon[k, 1] = _ALL_LINES[k, 0], _ALL_LINES[k, 1]
+    return polygon, len(_ALL_LINES)
+
+
+@njit(cache=True)
+def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
+    """Keep the lines that pass (x, y) within the tolerance along y; return the number of corners left."""
+    kept = np.empty((_CORNERS, 2))
+    for side in (1.0, -1.0):
+        count = 0
+        for k in range(size):
+            slope, offset = polygon[k, 0], polygon[k, 1]
+            next_slope, next_offset = polygon[(k + 1) % size, 0], polygon[(k + 1) % size, 1]
+            inside = tolerance - side * (slope * x + offset - y)
+            next_inside = tolerance - side * (next_slope * x + next_offset - y)
+            if inside >= 0.0:
+                kept[count, 0], kept[count, 1] = slope, offset
+                count += 1
+            if inside * next_inside < 0.0:
+                fraction = inside / (inside - next_inside)
+                kept[count, 0] = slope + (next_slope - slope) * fraction
+                kept[count, 1] = offset + (next_offset - offset) * fraction
+                count += 1
+            if count > _CORNERS - 2:
+                return 0
+        size = count
+        for k in range(size):
+            polygon[k, 0], polygon[k, 1] = kept[k, 0], kept[k, 1]
+    return size

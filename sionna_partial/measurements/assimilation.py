@@ -16,14 +16,13 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr
 
-from sionna_partial.arrays import Bools, Floats, States, read_only
+from sionna_partial.arrays import Bools, Floats, States, grid_edges, read_only
 from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import FREQUENCIES_HZ

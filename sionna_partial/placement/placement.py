@@ -3,24 +3,43 @@
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, read_only
+from sionna_partial.arrays import Bools, Floats, Indices, read_only
 from sionna_partial.checks import Progress
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S
-from sionna_partial.display import Pictured
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.display import Pictured, reporting
+from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, require_height
-from sionna_partial.placement.area import PlacementArea, placement_area
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.progress import reporting
-from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import Simulation, nearest_m
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, require_height
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction, Predictor
+from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
+from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
+from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
+
+CLEARANCE_M, FINEST_M = 0.1, 0.05
+"""Least distance of a transmitter from known walls [m], and the largest cells in which it is kept [m]."""
+
+RECEIVER_SPACING_M, MAX_RECEIVERS = 0.5, 4000
+POSITION_SPACING_M, MAX_POSITIONS = 0.25, 500
+"""Grid spacings of receivers and of transmitter positions [m]; they grow where the grid would have more points."""
+
+NEGLIGIBLE = 0.02
+"""Probability of being indoors below which a receiver is left out."""
+
+_INDOOR_POSITIONS = 8
+"""Number of transmitter positions over which the probability of being indoors is averaged."""
+
+_UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
+"""Visibility falls as exp(-u / 4 m) with the unobserved length u; behind walls it is 0.8 exp(-d / 4 m) of that at the
+distance d. Fitted on made homes (others than in `benchmarks/placement.py`) to predicted coverage at -100 dB."""
 
 RECEIVERS = 120
 """Largest number of receivers during the search; the final positions are compared at all receivers."""
@@ -33,6 +52,7 @@ STEPS_M = (0.6, 0.25)
 """Distances at which the refinement tries neighbours, in turn [m]."""
 
 OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
+
 OUTAGE["p_outage"] = 1.0
 """Prediction of an outage that is certain."""
 
@@ -42,12 +62,163 @@ SIMILARITY_PENALTY = 0.6
 """Loss of score of a start that sees the same receivers as one that is chosen already."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
-"""Of the receivers, sorted by gain, the worst 5 % count in full, and linearly less up to 15 %."""
+"""The worst 5 % of the receivers, sorted by gain, count in full, and linearly less up to 15 %."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacementArea:
+    """Possible positions of a transmitter, and weighted receivers.
+
+    A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors: the mean over
+    transmitter positions all over the free cells, so that no position gains by making the building seem larger. On a
+    complete map unknown cells are outdoors.
+
+    Parameters
+    ----------
+    height_m : height of the transmitter
+    room : FREE where the transmitter may stand, UNKNOWN elsewhere
+    rx_m : (N, 3)
+    weight : (N,), above 0
+    spacing_m : distance between receivers
+    """
+
+    partial: PartialMap
+    height_m: float
+    room: PartialMap
+    rx_m: Floats
+    weight: Floats
+    spacing_m: float
+
+    @property
+    def size_m2(self) -> float:
+        """Area where the transmitter may stand [m^2]."""
+        return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
+
+    def stands(self, positions_m: Floats) -> Bools:
+        """Return whether a transmitter may stand at each of the positions (..., 3) [m]."""
+        return self.room.state_at(positions_m) == CellState.FREE
+
+    def positions(self, seed: int) -> Floats:
+        """Transmitter positions (C, 3) on a grid with a random offset [m]; cell centres where the grid meets none."""
+        rng = np.random.default_rng(seed)
+        spacing_m = max(POSITION_SPACING_M, math.sqrt(self.size_m2 / MAX_POSITIONS))
+        x0, y0, x1, y1 = self.room.bounds_m
+        start = rng.uniform(0.0, spacing_m, 2)
+        grid_m = np.round(grid_positions((x0 + start[0], x1), (y0 + start[1], y1), spacing_m, self.height_m), 3)
+        grid_m = grid_m[self.stands(grid_m)]
+        if len(grid_m):
+            return grid_m
+        cells = np.argwhere(self.room.state == CellState.FREE)
+        chosen = cells[np.sort(rng.choice(len(cells), min(len(cells), MAX_POSITIONS), replace=False))]
+        return np.column_stack([cell_centres_m(self.room, chosen), np.full(len(chosen), self.height_m)])
+
+    def thinned(self, count: int) -> "PlacementArea":
+        """Return the area with at most `count` of the receivers, drawn evenly by weight along the rows of the grid."""
+        if len(self.rx_m) <= count:
+            return self
+        order = _boustrophedon(self.rx_m)
+        fraction = np.cumsum(self.weight[order]) / self.weight.sum()
+        picks = np.searchsorted(fraction, (np.arange(count) + 0.5) / count)
+        weight = np.bincount(order[np.minimum(picks, len(order) - 1)], minlength=len(order)).astype(np.float64)
+        return replace(self, rx_m=self.rx_m[weight > 0.0], weight=weight[weight > 0.0])
+
+    def visibility(self, positions_m: Floats, range_m: float = math.inf) -> Floats:
+        """Return how well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
+        walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
+        seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
+        seen *= np.where(walled, _WALL_FACTOR * np.exp(-distance_m / _WALL_LENGTH_M), distance_m <= range_m)
+        return seen.reshape(len(positions_m), len(self.rx_m))
+
+
+def placement_area(
+    partial: PartialMap,
+    height_m: float,
+    rx_height_m: float,
+    model: AnyPredictor | None,
+    frequency_hz: float | None = None,
+) -> PlacementArea:
+    """Find where a transmitter may stand, and receivers wherever `predict_map` has valid ones.
+
+    `model` predicts which unknown cells are indoors; without one, as on a complete map, all are outdoors. A
+    PositionError is raised if there is no position for a transmitter or a receiver.
+    """
+    x0, y0, x1, y1 = partial.bounds_m
+    spacing_m = max(RECEIVER_SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS))
+    spacing_m = min(spacing_m, x1 - x0, y1 - y0)
+    rx_m = grid_positions((x0 + spacing_m / 2, x1), (y0 + spacing_m / 2, y1), spacing_m, rx_height_m)
+    rx_m = rx_m[clear_of_walls(partial, rx_m)]
+    area = PlacementArea(partial, height_m, _room(partial), rx_m, np.ones(len(rx_m)), spacing_m)
+    weight = _weights(area, model, frequency_hz)
+    kept = weight > NEGLIGIBLE
+    if not kept.any():
+        raise PositionError(
+            f"no receiver can stand anywhere: all positions of a grid of {spacing_m:g} m are in walls or outside. Give "
+            "a map with more free cells."
+        )
+    return replace(area, rx_m=rx_m[kept], weight=weight[kept])
+
+
+def _room(partial: PartialMap) -> PartialMap:
+    """Return the cells where a transmitter may stand, as a map in which all others are unknown."""
+    fine = max(1, math.ceil(partial.resolution_m / FINEST_M - 1e-9))
+    fine = max(1, min(fine, int(math.sqrt(4e6 / partial.state.size))))
+    state = partial.state.repeat(fine, axis=0).repeat(fine, axis=1)
+    cell_m = partial.resolution_m / fine
+    around = 2 * math.ceil(CLEARANCE_M / cell_m - 1e-9) + 1
+    stands = (state == CellState.FREE) & ~ndimage.maximum_filter(state == CellState.WALL, size=around)
+    if not stands.any():
+        free = int((partial.state == CellState.FREE).sum())
+        raise PositionError(
+            f"a transmitter can stand nowhere: the map has {free} free cells, and none of their area is {CLEARANCE_M:g}"
+            " m away from all walls. Give a map with more free cells, such as one of a longer exploration."
+        )
+    room = np.where(stands, CellState.FREE, CellState.UNKNOWN).astype(np.uint8)
+    return PartialMap(room, cell_m, partial.origin_m, partial.wall_height_m)
+
+
+def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: float | None) -> Floats:
+    """Weight (N,) of each receiver: 1 in free cells, else the mean P(indoor) over some transmitter positions."""
+    weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
+    if model is None or weight.all():
+        return weight
+    positions_m = area.positions(0)
+    some_m = positions_m[np.unique(np.linspace(0, len(positions_m) - 1, _INDOOR_POSITIONS).astype(np.intp))]
+    walled, unobserved_m, distance_m = _lines(area.partial, some_m, area.rx_m[weight == 0.0])
+    phi = LinkFeatures(
+        link_state=np.where(walled, LinkState.NLOS, LinkState.LOS).astype(np.uint8),
+        unobserved_distance_m=np.minimum(unobserved_m, distance_m),
+        distance_m=distance_m,
+        gain_db=np.full(len(distance_m), GAIN_FLOOR_DB),
+        frequency_hz=frequency_hz,
+    )
+    weight[weight == 0.0] = model.predict_indoor(phi).reshape(len(some_m), -1).mean(axis=0)
+    return weight
+
+
+def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, z_m: float) -> Floats:
+    """Return positions (N, 3) on a grid between two x and two y, all at one height [m]."""
+    x, y = np.meshgrid(np.arange(*x_m, spacing_m), np.arange(*y_m, spacing_m))
+    return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z_m)])
+
+
+def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
+    """Return whether lines (A B,) from A points to B others meet a wall, unobserved lengths and lengths [m]."""
+    start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
+    walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
+    return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
+
+
+def _boustrophedon(points_m: Floats) -> Indices:
+    """Order points (N, 3) along stripes of four rows, in alternating directions."""
+    x, y = points_m[:, 0], points_m[:, 1]
+    rows = np.unique(np.round(y, 6), return_inverse=True)[1]
+    stripe = rows // 4
+    return np.lexsort((rows, np.round(np.where(stripe % 2 == 0, x, -x), 6), stripe))
 
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement"):
+class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
     """A position for a transmitter, and the search that found it.
 
     Parameters
@@ -123,6 +294,7 @@ class TransmitterPlacement(Pictured, plot="plots.placement_plot:plot_placement")
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitter(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     *,
@@ -136,11 +308,11 @@ def place_transmitter(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> TransmitterPlacement:
-    """Find the transmitter position that covers a partly known building best, as predicted from what is known.
+    """Find the transmitter position that covers a partly known building best, as predicted from its known part.
 
     Positions all over the free cells are compared by visibility, without tracing. The best of them that see different
     receivers are traced and predicted, as `predict_map` does. Around the best of these, neighbours at 0.6 and 0.25 m
-    are tried; what they find is compared at all receivers. Larger maps get more of all that.
+    are tried; the results are compared at all receivers. Larger maps get more positions and steps.
 
     A transmitter stands in a free cell, at least 10 cm from known walls. Receivers are 0.5 m apart wherever
     `predict_map` has some; one in a free cell has weight 1, one in an unknown cell its probability of being indoors,
@@ -158,7 +330,7 @@ def place_transmitter(
     tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m].
     seed : int
-        Of the positions that are compared.
+        Seed of the positions that are compared.
     predictor : None, "map", "paper", path or Predictor
         As for `predict_map`.
     scene_settings : SceneSettings, optional
@@ -291,7 +463,7 @@ class Search:
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> Floats:
-    """Return what the objective counts of each link (N,): P(gain > threshold), or the mean gain [dB]."""
+    """Return the value of each link (N,) for the objective: P(gain > threshold), or the mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
     return prediction.probability_above(settings.threshold_db)
@@ -308,7 +480,7 @@ def placement_score(values: Floats, weight: Floats, settings: PlacementSettings)
 
 
 def _counted(fraction: Floats) -> Floats:
-    """Integral of what the worst receivers count, from 0 to a fraction of them."""
+    """Return the integral of the weight of the worst receivers, from 0 to a fraction of them."""
     falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
     width = LAST_FRACTION - FULL_FRACTION
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)

@@ -16,15 +16,13 @@ from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import Progress, require_whole
 from sionna_partial.constants import DEFAULT_HEIGHT_M
-from sionna_partial.display import Pictured
+from sionna_partial.display import Pictured, reporting
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.placement.area import PlacementArea
-from sionna_partial.placement.placement import RECEIVERS, Search
+from sionna_partial.placement.placement import RECEIVERS, PlacementArea, Search
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.progress import reporting
-from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation
 
 MOST_TRANSMITTERS = 16
@@ -38,7 +36,7 @@ _SWAPS = 20
 
 @read_only
 @dataclass(frozen=True, eq=False)
-class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placement"):
+class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement"):
     """Positions for several transmitters, and the search that found them.
 
     Parameters
@@ -97,6 +95,7 @@ class NetworkPlacement(Pictured, plot="plots.placement_plot:plot_network_placeme
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitters(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,

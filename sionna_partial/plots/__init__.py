@@ -1,1 +1,1 @@
-"""Every figure of the package; what a figure shows is computed elsewhere."""
+"""Figures of the package; the values that they show are computed elsewhere."""

@@ -1,4 +1,4 @@
-"""Pictures of an exploration: what the robot has seen, its trajectory and field of view, and where to drive next."""
+"""Pictures of an exploration: the map of the robot, its trajectory and field of view, and the next poses."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import extent_m
-from sionna_partial.plots.map_plot import draw_map
 from sionna_partial.plots.style import (
     BLUE,
     RED,
@@ -36,6 +35,7 @@ from sionna_partial.plots.style import (
     YELLOW,
     Figure,
     corners_m,
+    draw_map,
     figure_png,
     legend_below,
     sheet_columns,
@@ -64,7 +64,7 @@ _PREDICTED = {
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw what the robot had seen at each step, with its trajectory and its field of view.
+    """Draw the map of the robot at each step, with its trajectory and its field of view.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from scipy.special import ndtr
 from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import (
@@ -50,7 +50,6 @@ from sionna_partial.prediction.paper_networks import (
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
-from sionna_partial.progress import reporting
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 

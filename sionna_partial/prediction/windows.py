@@ -8,10 +8,9 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Floats, Indices, States
+from sionna_partial.arrays import Floats, Indices, States, grid_edges
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks
-from sionna_partial.planar import grid_edges
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)

@@ -9,8 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats
-from sionna_partial.planar import cross, span_in_strip
+from sionna_partial.arrays import Bools, Floats, cross, span_in_strip
 from sionna_partial.process import njit
 
 _SAME_LINE_M = 1e-6

@@ -11,12 +11,10 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, cross
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import wall_cells
-from sionna_partial.planar import cross
-from sionna_partial.scene.lines import fit_runs
+from sionna_partial.maps.wall_cells import fit_runs, wall_cells
 
 _KEY = 1 << 32
 _LOOK_EDGES = 6
@@ -98,7 +96,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 
     `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres. From 0.5 on,
     the staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
-    noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
+    noise made thick and rough, and again twice as much where a face turns back and forth at least once in 10 cells.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
@@ -407,7 +405,7 @@ def _extended(outlines: Outlines, state: States) -> Points:
 def cut_by_material(outlines: Outlines, partial: PartialMap) -> tuple[Outlines, Indices]:
     """Cut outlines where the material of the wall cells changes, and sort them by material (S,).
 
-    A point of an outline is of the material of the nearest wall cell; what is shorter than a cell, of its neighbour.
+    A point of an outline has the material of the nearest wall cell; a piece shorter than a cell, of its neighbour.
     """
     count = len(outlines.segments)
     if partial.wall_material is None or not count:

@@ -21,8 +21,7 @@ from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.environment import Mesh
-from sionna_partial.maps.mesh.mesh import SceneMesh
+from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.maps.wall_cells import row_runs
@@ -253,16 +252,17 @@ def export_scene(
 def write_map(
     partial: PartialMap, folder: Path, settings: SceneSettings, *, offset_m: Sequence[float], frequency_hz: float
 ) -> tuple[Path, SceneGeometry | SceneMesh]:
-    """Write the scene of a map into an existing folder; its `scene.xml`, and what the scene consists of.
+    """Write the scene of a map into an existing folder; return its `scene.xml` and its geometry.
 
     Settings come from `scene_settings_of`; `offset_m` as of `write_scene`.
     """
     environment = partial.environment
-    if isinstance(environment, Mesh):
-        mesh, default = environment.mesh, settings.material
-        return write_mesh_scene(
-            mesh, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
-        ), mesh
+    if isinstance(environment, SceneMesh):
+        default = settings.material
+        path = write_mesh_scene(
+            environment, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
+        )
+        return path, environment
     geometry = build_scene(partial, settings)
     return write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz), geometry
 
@@ -300,7 +300,7 @@ def write_mesh_scene(
 ) -> Path:
     """Write `scene.xml`, whose path is returned, and the meshes of a SceneMesh into an existing folder.
 
-    The shape `part0` has the triangles of the first of the mesh's materials, in their order, `part1` those of the
+    The shape `part0` has the triangles of the mesh's first material, in their order, `part1` the triangles of the
     second, and so on; parts without triangles are left out. Triangles of a part share their vertices. The world
     position `offset_m`, (x, y) or (x, y, z), becomes the scene's origin.
     """
@@ -441,7 +441,7 @@ def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.
 
 
 def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
-    """Triangles of an area with corners on whole numbers, in ever narrower strips where GEOS fails (docs/traps.md)."""
+    """Return triangles of an area with integer corners, cut into strips where GEOS fails (docs/development.md)."""
     strips, count = area, 1
     while True:
         try:

@@ -12,11 +12,10 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Floats, States, read_only
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.display import Shown
+from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.progress import reporting
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.links import LinkSums
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
 
@@ -82,6 +81,7 @@ class GainGradients(Shown):
     scene_settings: SceneSettings
 
 
+@takes_settings
 def gain_gradients(
     scene: PartialMap | str | Path | Simulation,
     tx: ArrayLike,

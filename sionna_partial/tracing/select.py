@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import part_of
 from sionna_partial.process import njit
-from sionna_partial.progress import part_of
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 

@@ -34,7 +34,7 @@ RANGE_DB, MOST_PATHS = 25.0, 24
 """Paths of an analogue are at most so much weaker than its strongest [dB], and at most so many."""
 
 LENGTH_M, DIRECTION, GAIN_DB = 0.3, 0.09, 4.0
-"""How near two paths of a link are that count as one: length [m], unit vectors at both ends [1], and gain [dB]."""
+"""Largest differences of two paths that count as one: length [m], unit vectors at both ends [1], gain [dB]."""
 
 HOME_STEPS, FLOOR_STEPS = (0, 50, 120, 250), (0, 200, 500)
 TRANSMITTERS, RECEIVERS, NEAREST_M = 3, 50, 0.15

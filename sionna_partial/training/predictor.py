@@ -9,14 +9,12 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.checks import Progress, require_number, settings_or_default
-from sionna_partial.datasets.dataset_links import Dataset, LinkTraces, open_links, require_like, settings_for
-from sionna_partial.display import Shown
+from sionna_partial.datasets.shards import Dataset, LinkTraces, open_links, require_like, settings_for
+from sionna_partial.display import Shown, part_of, reporting
 from sionna_partial.errors import PredictorError, PredictorWarning
-from sionna_partial.evaluation.baselines import Baselines
-from sionna_partial.evaluation.evaluate import Evaluation, evaluate
+from sionna_partial.evaluation.evaluate import Baselines, Evaluation, evaluate
 from sionna_partial.files import atomic_files, atomic_write
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.progress import part_of, reporting
 from sionna_partial.settings import PredictorSettings
 
 PREDICTOR_FILE, SPLIT_FILE = "predictor.keras", "split.json"
@@ -31,7 +29,7 @@ FEW_HOMES = 20
 class TrainingRun(Shown):
     """Result of `train`: a predictor, baselines fitted to the same links, and the evaluation on test homes, if any.
 
-    The predictor's card has what was measured on the test homes.
+    The predictor's card has the figures of the test homes.
     """
 
     predictor: Predictor
@@ -155,9 +153,9 @@ def train(
 
 
 def _card_metrics(evaluation: Evaluation) -> dict[str, Any]:
-    """Return what the card has of test homes: figures by stage and predictor, receivers indoors and anywhere.
+    """Return the figures of test homes for the card, by stage and predictor, receivers indoors and anywhere.
 
-    The shipped paper's predictor is left out, lest a card depend on what was shipped when it was written.
+    The shipped paper's predictor is left out, so that a card does not depend on the shipped predictors.
     """
     metrics: dict[str, Any] = {"held_out_homes": list(evaluation.homes["test"])}
     for receivers, name in (("indoor", "exploration_steps"), ("anywhere", "exploration_steps_receivers_anywhere")):

@@ -26,7 +26,7 @@ from sionna_partial.tracing.simulation import Simulation, nearest_m
 from sionna_partial.worlds.homes import make_home
 
 CAMERA, ROBOTS, LARGE = (500_000, 350), (530_000, 200), (520_000, 60)
-"""First seeds and numbers of homes explored by a camera, by robots of their own, and of floors and halls likewise."""
+"""First seeds and numbers of homes explored by a camera, of homes explored by robots, and of floors and halls."""
 
 STEPS, FRACTIONS = (10, 30, 60, 100, 200), (0, 0.1, 0.25, 0.5, 0.75)
 """When the map is taken: after steps of the camera, and with these fractions of the area seen by robots."""

@@ -107,7 +107,7 @@ class Camera:
 
     @property
     def map(self) -> States:
-        """The map that is handed out: a vacuum robot thins its walls, and what it takes off them is free or unknown."""
+        """The map that is handed out: a vacuum robot thins its walls, and makes the rest of their cells free or unknown."""
         if self._sensor.is_exact or self._sensor.fusion != "vacuum":
             return self.seen
         wall = self.seen == _WALL
@@ -172,7 +172,7 @@ def unknown_in_view(
 
 
 def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Floats:
-    """Corners (N, 2) [m] of what the camera sees from a pose (x, y [m], heading [degree]), the first at the camera."""
+    """Return the corners (N, 2) [m] of the view from a pose (x, y [m], heading [degree]), the first at the camera."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     range_cells = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1

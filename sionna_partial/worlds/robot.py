@@ -1,8 +1,8 @@
-"""The exploring robot: frontiers between seen and unseen cells, its goals and routes, and what stops it.
+"""The exploring robot: frontiers, goals and routes, and what stops it.
 
 It follows Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
 degrees of turn, and a long-term goal every 25 steps. Its learnt policies are replaced by frontiers between seen and
-unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over what it has seen.
+unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over the seen cells.
 """
 
 import math
@@ -14,12 +14,13 @@ from scipy import ndimage
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, grid_edges, largest_part
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import frontier_cells
-from sionna_partial.planar import grid_edges, largest_part
 from sionna_partial.settings import SensorSettings
 from sionna_partial.worlds.camera import Camera
+
+_FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 WIDE_M = 0.35
 """Length of a frontier that is about as wide as a robot [m]."""
@@ -49,15 +50,22 @@ Active Neural SLAM's global policy draws its goals from a distribution. The best
 than the robot of the paper; with this power the mean observed fractions on real homes are the paper's.
 """
 
-_FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _AHEAD_M = 0.3
+
 _BUMP_M = 0.25
+
 _ARRIVAL_M = 0.3
+
 _DECISION_STEPS = 5.0
+
 _EIGHT = np.ones((3, 3), dtype=bool)
+
 _SMALLEST_FRONTIER_CELLS = 3
+
 _COMFORT_M = 0.3
+
 _COMFORT_COST = 3.0
+
 _TIGHT_COST = 15.0
 
 
@@ -179,7 +187,7 @@ class Robot:
         return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
 
     def _draw(self, frontiers: list[Frontier]) -> int:
-        """Draw a frontier, the likelier the more it promises for few steps."""
+        """Draw a frontier with a probability that grows with its promise for each step."""
         promises = [math.sqrt(len(each.cells)) / (self.steps_to(each) + _DECISION_STEPS) for each in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
         return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
@@ -279,7 +287,7 @@ def find_frontiers(
 
 
 def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
-    """Return those of at least a robot's width, or all if none is."""
+    """Return the frontiers of at least a robot's width, or all if none is."""
     return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
 
 

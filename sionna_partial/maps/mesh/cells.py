@@ -1,4 +1,4 @@
-"""SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and what has been observed of it."""
+"""SceneMesh -> PartialMap: the cells in which a mesh has surfaces, and its observed area."""
 
 import math
 import os
@@ -11,17 +11,15 @@ import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, largest_by_area, span_in_strip
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import Mesh
+from sionna_partial.maps.environment import SceneMesh, height_pair
 from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
-from sionna_partial.maps.mesh.mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
-from sionna_partial.planar import largest_by_area, span_in_strip
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
@@ -63,9 +61,7 @@ class MeshReading:
     def __post_init__(self) -> None:
         if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
             raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
-        if self.unit_m is not None and not 1e-6 <= number_of(self.unit_m) <= 1e6:
-            remedy = "give the length of a unit in metres, such as 0.3048 for feet."
-            raise MapError(f"unit_m = {shown(self.unit_m)} is not allowed: {remedy}")
+        require_unit(self.unit_m)
 
     def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
         """Return the notes of a file that is read."""
@@ -74,6 +70,13 @@ class MeshReading:
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
         """Return a map with its report; its extent is checked where all of the file is observed."""
         return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.")
+
+
+def require_unit(unit_m: object) -> None:
+    """Raise a MapError unless a length of a unit [m] is None or a plausible number."""
+    if unit_m is not None and not 1e-6 <= number_of(unit_m) <= 1e6:
+        remedy = "give the length of a unit in metres, such as 0.3048 for feet or 0.001 for millimetres."
+        raise MapError(f"unit_m = {shown(unit_m)} is not allowed: {remedy}")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
@@ -143,8 +146,7 @@ def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
     """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
-    environment = partial.environment
-    if not isinstance(environment, Mesh):
+    if partial.mesh is None:
         return partial
     row, start, end = row_runs(partial.state != CellState.UNKNOWN)
     cells = shapely.union_all(shapely.box(start, row, end, row + 1))
@@ -154,7 +156,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
         area = shapely.transform(cells, lambda corners: (corners + first) * partial.resolution_m)
     else:
         area = shapely.transform(cells, lambda corners: corners * partial.resolution_m + partial.origin_m)
-    return replace(partial, mesh=environment.mesh.within(area))
+    return replace(partial, mesh=partial.mesh.within(area))
 
 
 def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bools:
@@ -240,11 +242,19 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
     return cells
 
 
+def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools:
+    """Return the cells (ny, nx) that lines (N, 2, 2) [cells] cross by more than a margin."""
+    corners, cells = np.zeros((len(lines), 5, 2)), np.zeros(shape, dtype=np.bool_)
+    corners[:, :2] = lines
+    mark_cells(corners, np.full(len(lines), 2), cells, margin, True)
+    return cells
+
+
 @njit(cache=True)
 def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
-    What runs along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
+    A surface along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
     """
     ny, nx = cells.shape
     for index in range(len(polygons)):

@@ -9,8 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.planar import cross
+from sionna_partial.arrays import Bools, Floats, Indices, cross
 from sionna_partial.process import njit
 
 BORDER_M = 1e-5
@@ -23,7 +22,7 @@ MERGE_M = 1e-6
 """Distance within which two points are one [m]."""
 
 SEAM_M = 1e-4
-"""Distance within which a cut point lies on a vertex or an edge beside it [m]: as far as `UPRIGHT_M` moves it."""
+"""Distance within which a cut point lies on a vertex or an edge beside it [m]: `UPRIGHT_M` moves it that far."""
 
 Triangles = Floats
 """Corners (F, 3, 3) of triangles [m]."""

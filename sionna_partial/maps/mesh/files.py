@@ -25,9 +25,9 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, lies_in, read_bytes
+from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import looks_y_up
-from sionna_partial.maps.mesh.mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
 
@@ -124,7 +124,7 @@ def _read_triangles(path: Path, kind: str, notes: ImportNotes) -> Triangles:
 
 
 def _require_whole(kind: str, content: bytes, triangles: int) -> None:
-    """Raise a ValueError if a file ends before, or after, what it announces: trimesh takes what is there."""
+    """Raise a ValueError if a file is shorter or longer than it announces: trimesh would read a part of it."""
     is_text = kind == "stl" and content[:5].lower() == b"solid" and b"facet" in content[:1000]
     if is_text and not content.rstrip().splitlines()[-1].strip().startswith(b"endsolid"):
         raise ValueError("it ends before its endsolid")
@@ -178,7 +178,7 @@ def _joined(
 
 
 def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
-    """Return whether the mesh lies on its side; see `looks_y_up`."""
+    """Return whether y points up in the mesh; see `looks_y_up`."""
     corners = vertices_m[triangles]
     if not np.isfinite(corners).all() or not len(corners):
         return False

@@ -23,6 +23,7 @@ from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, open_regular
+from sionna_partial.maps.environment import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,
@@ -35,7 +36,6 @@ from sionna_partial.maps.mesh.cells import (
     require_metres,
     warn_of_feet,
 )
-from sionna_partial.maps.mesh.mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.process import njit
 
@@ -66,7 +66,7 @@ LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
 """Height from which a layer may be the ceiling; heights below the floor and above the ceiling that count [m]."""
 
 WALL_FRACTION = 0.25
-"""Of the layers of the height band that its fuller cells (90 %) have, the fraction that makes a wall."""
+"""Fraction of the layers of the height band that makes a wall, relative to the layers of fuller cells (90 %)."""
 
 THIN_FRACTION = 0.5
 """Cells with certainly less than this fraction of the points of a cell beside them hold the noise of its wall."""
@@ -107,12 +107,12 @@ def map_from_points(
     points : (N, 3) array-like or path-like
         x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are left out.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
-        Where the sensor was, in the axes of the cloud [m]: what lies between it and a point is free as well.
+        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free as well.
     height_band_m : (float, float) or None
         z of the cloud between which points are walls [m], which also selects a storey. By default `DEFAULT_BAND_M`
         above the lowest floor.
     observed : (M, 2) array-like, PartialMap or None
-        What has been observed, as for the meshes of `load_map`. By default the cells that are free or wall as above.
+        The observed area, as for the meshes of `load_map`. By default the cells that are free or wall as above.
     resolution_m : float or None
         Edge of the cells [m], 0.05 by default.
     up : {"z", "y"} or None
@@ -394,7 +394,7 @@ def _occupied_voxels(
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge sorted keys with the counts of each."""
+    """Merge sorted keys with their counts."""
     keys, inverse = np.unique(np.concatenate([keys for keys, _ in pending]), return_inverse=True)
     return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
 
@@ -479,7 +479,7 @@ def _beside(cells: Bools) -> Bools:
 
 @njit(cache=True)
 def _see_through(wall, targets, sensors, free):  # type: ignore[no-untyped-def]
-    """Mark what lies between a sensor and the cells that it sees (row, column) as free."""
+    """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):
         x0, y0 = sensors[sensor]
