@@ -61,6 +61,9 @@ NetworkKind = Literal["paper", "paths", "map"]
 Objective = Literal["coverage", "percentile"]
 """Objective of a placement: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
+Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
+"""Mappers whose rule makes a robot's map of noisy readings."""
+
 Policy = Literal["random", "coverage"]
 """Policy by which an exploring robot chooses frontiers."""
 
@@ -308,19 +311,27 @@ class SensorSettings(Checked):
     Parameters
     ----------
     range_noise_m : float
-        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It blurs walls:
-        the map weighs the readings of each cell, as an occupancy grid does.
+        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It makes walls
+        ragged: see `fusion`.
     drift_m_per_m : float
         Odometry drift per metre travelled [1], at most 1, in a direction that is drawn once. What is seen later is
         mapped off its true position, and walls that are seen again may appear twice.
     missed_wall_fraction : float
         Fraction of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces
-        do. Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+        do. Rays to them are dropped: their cells stay unknown, and nothing is seen through them.
     field_of_view_deg : float
         Horizontal angle [degree], in (0, 360], centred on the heading of the robot. The default is the camera of Active
         Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
         Largest range [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
+    heading_noise_deg : float
+        Standard deviation of the heading that the map assumes for a picture [degree], independent from picture to
+        picture, at most 180.
+    missed_return_fraction : float
+        Fraction of rays that return no reading [1], at random. With any error, those that graze a wall return none.
+    fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
+        Mapper whose rule and default parameters decide from the readings which cells are walls (`FUSIONS`); "vacuum"
+        thins walls, too. Without errors all agree, and the map is true.
 
     Raises
     ------
@@ -339,11 +350,15 @@ class SensorSettings(Checked):
     missed_wall_fraction: Fraction = 0.0
     field_of_view_deg: Annotated[float, Within(0.0, 360.0, open_low=True)] = 90.0
     range_m: Annotated[float, Within(0.0, 100.0, open_low=True)] = 3.2
+    heading_noise_deg: Annotated[float, Within(0.0, 180.0)] = 0.0
+    missed_return_fraction: Fraction = 0.0
+    fusion: Fusion = "slam_toolbox"
 
     @property
     def is_exact(self) -> bool:
         """Return whether it makes no errors."""
-        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_fraction == 0.0
+        errors = (self.range_noise_m, self.drift_m_per_m, self.heading_noise_deg)
+        return not any((*errors, self.missed_wall_fraction, self.missed_return_fraction))
 
 
 SHORT_LINK_M = 25.0
@@ -355,11 +370,13 @@ MIXED_SENSORS = {
     "range_noise_m": (0.0, 0.05),
     "drift_m_per_m": (0.0, 0.02),
     "missed_wall_fraction": (0.0, 0.1),
+    "heading_noise_deg": (0.0, 0.5),
+    "missed_return_fraction": (0.0, 0.1),
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
-The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
-than large (the square of a uniform number).
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras and the mapper uniformly, and errors
+more often small than large (the square of a uniform number).
 """
 
 

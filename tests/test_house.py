@@ -40,7 +40,7 @@ ROOMS = {
         ),
         *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "pictures", "map_files"),
     ),
-    "worlds": ("buildings", "homes", "robot"),
+    "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "floor_plan", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),

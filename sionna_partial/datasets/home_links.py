@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -20,7 +21,15 @@ from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import HOME_KINDS, MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, HomeKind, SensorSettings
+from sionna_partial.settings import (
+    HOME_KINDS,
+    MIXED_SENSORS,
+    SHORT_LINK_M,
+    DatasetSettings,
+    Fusion,
+    HomeKind,
+    SensorSettings,
+)
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home
@@ -202,7 +211,8 @@ def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
     values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
     if rng.random() < _LIDAR_FRACTION:
         values["field_of_view_deg"] = 360.0
-    return SensorSettings(**values)
+    fusions = get_args(Fusion)
+    return SensorSettings(**values, fusion=fusions[rng.integers(len(fusions))])
 
 
 def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
