@@ -23,7 +23,7 @@ from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collecte
 from sionna_partial.app.uploads import uploaded_map
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Checked, Progress, Within, reason_of, require, require_choice
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
@@ -48,9 +48,6 @@ from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
-
-COARSER = 4
-"""Receiver spacing of the first picture, as a multiple of the spacing of the final one."""
 
 MOST_TRANSMITTERS = 10
 """Number of transmitters of one window."""
