@@ -299,7 +299,7 @@ def _visible_pieces(plan, beam, own, scratch, view, view_wall):  # type: ignore[
     line, low, found, order, walls = plan.line, plan.low, scratch.found, scratch.order, scratch.wall
     active, edge = scratch.active, scratch.edge
     _sort_edges(found, edge, count)
-    pieces = begun = number = 0
+    pieces = begun = number = np.int64(0)
     for i in range(2 * count + 1):
         t0, t1 = edge[i], edge[i + 1]
         if t1 - t0 < _THINNEST:
@@ -330,7 +330,7 @@ def _walls_in(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
     ax, ay, bx, by = beam[2] - sx, beam[3] - sy, beam[4] - sx, beam[5] - sy
     length, width = 0.5 * (np.hypot(ax, ay) + np.hypot(bx, by)), np.hypot(ax - bx, ay - by)
     corner = np.empty((4, 2))
-    near, count = 1.0 if own >= 0 else 0.0, 0
+    near, count = 1.0 if own >= 0 else 0.0, np.int64(0)
     scratch.visit[-1] += 1
     while True:
         far = near + max(_STRIP_CELLS * edge, near * width) / length
@@ -644,7 +644,7 @@ def _clip_walls(plan, beam, own, layers):  # type: ignore[no-untyped-def]
     scratch, grid = layers.clipped, plan.cells.grid
     corner = _cone(beam, own >= 0, grid, int(grid[4]))
     scratch.visit[-1] += 1
-    count = _clip_cells(plan, beam, own, corner, 0, scratch)
+    count = _clip_cells(plan, beam, own, corner, np.int64(0), scratch)
     for c in range(count):
         slope = (scratch.found[c, 3] - scratch.found[c, 1]) / (scratch.found[c, 2] - scratch.found[c, 0])
         layers.slope[c] = slope
@@ -685,7 +685,7 @@ def _lay(beam, count, task, layers, windows):  # type: ignore[no-untyped-def]
     Windows are (t from, t to, power after reflections, power after walls), (clipped wall, walls crossed), and their
     number.
     """
-    scratch, begun, active = layers.clipped, 0, 0
+    scratch, begun, active = layers.clipped, np.int64(0), np.int64(0)
     for i in range(2 * count + 1):
         layers.depth[i] = 0
         t0, t1 = scratch.edge[i], scratch.edge[i + 1]

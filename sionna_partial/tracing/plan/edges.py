@@ -134,7 +134,7 @@ class _Edges(NamedTuple):
         return cls(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), constants, material)
 
 
-class _Task(NamedTuple):
+class _EdgeTask(NamedTuple):
     """Beams from a group of edges, their pairs with receivers, all edges, arrivals there, and the building.
 
     `reflections` is the largest number of reflections of a path.
@@ -257,14 +257,14 @@ class DiffractionCandidates(_EdgeCandidates):
             fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
             onward = np.minimum(self._walls_a_side, self._reflections - fewest)
             tree, pairs = trace_beams(plan, receivers, edges.position_m[group], onward)
-            task = _Task(tree, pairs, group, edges, arrivals, self._building, self._reflections)
+            task = _EdgeTask(tree, pairs, group, edges, arrivals, self._building, self._reflections)
             pair, joined, bound, unlisted = _list_joined(task, _NEGLIGIBLE * found, trail_of(plan))
             write = partial(self._written, task, pair, joined)
             return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
 
         yield from in_order(of_group, range(len(groups)))
 
-    def _written(self, task: _Task, pair: Indices, joined: NDArray[np.int32], rows: Indices) -> Candidates:
+    def _written(self, task: _EdgeTask, pair: Indices, joined: NDArray[np.int32], rows: Indices) -> Candidates:
         size, (node, rx) = task.reflections + 1, task.pairs[pair[rows]].T.copy()
         arrival, variant = np.divmod(joined[rows], 2 * size)
         return self._candidates(task.tree, task.arrivals, (node, rx, arrival, variant), size)
@@ -286,7 +286,7 @@ class CrossedEdgeCandidates(_EdgeCandidates):
             return
         edges, building, needed = self._edges, self._building, self._building.limits.min_power(found)
         pairs = np.stack([np.zeros(count, np.int32), np.arange(count, dtype=np.int32)], axis=1)
-        arrivals = self._arrivals(_straight(building.room.tx_m[None, :2].copy()), pairs, 0)
+        arrivals = self._arrivals(_straight_lines(building.room.tx_m[None, :2].copy()), pairs, 0)
 
         def of_edges(first: int) -> tuple[NDArray[np.int32], Floats]:
             some = np.arange(first, min(first + _EDGES_AT_ONCE, count))
@@ -299,13 +299,13 @@ class CrossedEdgeCandidates(_EdgeCandidates):
     def _written(self, arrivals: _Arrivals, columns: NDArray[np.int32], rows: Indices) -> Candidates:
         edge, rx, arrival, variant = columns[rows].T.copy()
         size = len(trail_of(self._building.plan).surface) + 2
-        tree = _straight(self._edges.position_m)
+        tree = _straight_lines(self._edges.position_m)
         candidates = self._candidates(tree, arrivals, (edge, rx, arrival, variant), size)
         possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
         return self._lowered(candidates.rows(np.flatnonzero(possible)))
 
 
-def _straight(sources_m: Floats) -> BeamTree:
+def _straight_lines(sources_m: Floats) -> BeamTree:
     """Return the straight lines from sources (E, 2) as beams without reflections."""
     none = np.full(len(sources_m), -1, np.int32)
     return BeamTree(none, none, sources_m)
@@ -611,18 +611,18 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):  # type: ign
 def _write_joined(tree, edges, arrivals, chosen, building, trail, size):  # type: ignore[no-untyped-def]
     """Write chosen beams from edges, receivers, arrivals and variants (C,); paths with too short legs stay empty."""
     node, rx, arrival, variant = chosen
-    paths = empty_paths(len(rx), size)
+    paths, room, owner = empty_paths(len(rx), size), building.room, building.plan.owner
     for c in range(len(rx)):
-        j, target = arrival[c], building.room.rx_m[rx[c]]
+        j, target = arrival[c], room.rx_m[rx[c]]
         origin = edges.position_m[arrivals.edge[j]]
         after, onward = unfold(tree, node[c], building.plan.pieces_m, target, trail.walls, trail.bounce)
         count = _join(arrivals, j, origin, target, after, onward, building, trail)
         if count >= 0:
-            write_path(trail, count, building, target, np.int64(variant[c]), paths, c)
+            write_path(trail, count, room, owner, target, np.int64(variant[c]), paths, c)
     return paths
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _join(arrivals, j, origin, target, after, onward, building, trail):  # type: ignore[no-untyped-def]
     """Write all that a whole path meets in the plan; return the number of entries, -1 if Sionna RT drops the path."""
     length, count, through_walls = arrivals.length_m[j], np.int64(0), building.limits.walls > 0

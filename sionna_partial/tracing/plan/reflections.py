@@ -108,7 +108,7 @@ def _departure(k, building, target, trail):  # type: ignore[no-untyped-def]
     return x - building.room.tx_m[0], y - building.room.tx_m[1]
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _meet(k, building, target, trail):  # type: ignore[no-untyped-def]
     """Write all that a path with `k` reflections at walls meets in the plan.
 
@@ -136,12 +136,12 @@ def _meet(k, building, target, trail):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _write_paths(tree, pairs, variants, building, trail, size):  # type: ignore[no-untyped-def]
     """Write variants of pairs of a beam and a receiver, with `size` columns of interactions."""
-    paths = empty_paths(len(pairs), size)
+    paths, room, owner = empty_paths(len(pairs), size), building.room, building.plan.owner
     for c in range(len(pairs)):
-        target = building.room.rx_m[pairs[c, 1]]
+        target = room.rx_m[pairs[c, 1]]
         k, _ = unfold(tree, pairs[c, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
         count, _ = _meet(k, building, target, trail)
-        write_path(trail, count, building, target, np.int64(variants[c]), paths, c)
+        write_path(trail, count, room, owner, target, np.int64(variants[c]), paths, c)
     return paths
 
 

@@ -370,12 +370,12 @@ def empty_paths(count, size):  # type: ignore[no-untyped-def]
     return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
 
 
-@njit(cache=True)
-def write_path(trail, count, building, target, variant, paths, row):  # type: ignore[no-untyped-def]
+@njit(cache=True, forceinline=True)  # copying the arguments of a call would take longer than the function
+def write_path(trail, count, room, owner, target, variant, paths, row):  # type: ignore[no-untyped-def]
     """Write a variant of the path of a trail as one of `empty_paths`."""
     surface, kind, vertices, same_wall = paths
-    rise = rise_of(variant, building.room, target)
-    merge_heights(trail, count, building.room, target, rise, surface, vertices, row)
+    rise = rise_of(variant, room, target)
+    merge_heights(trail, count, room, target, rise, surface, vertices, row)
     for d in range(count + rise.bounces):
         entry = surface[row, d] - WALLS
         if entry < 0:
@@ -383,7 +383,7 @@ def write_path(trail, count, building, target, variant, paths, row):  # type: ig
             continue
         kind[row, d], same_wall[row, d] = trail.kind[entry], trail.same_wall[entry]
         is_edge = trail.kind[entry] == DIFFRACTION
-        surface[row, d] = EDGE if is_edge else WALLS + building.plan.owner[trail.surface[entry]]
+        surface[row, d] = EDGE if is_edge else WALLS + owner[trail.surface[entry]]
 
 
 def candidates_of(
