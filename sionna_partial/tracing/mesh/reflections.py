@@ -7,8 +7,8 @@ receiver that lies there, or a little beside, is a candidate if the line to it, 
 Where walls let power through, every leg of a candidate is then cast through the mesh, the faces on it are grouped to
 walls, and the power of the path follows. Where no wall may be crossed, Sionna RT finds the faces in its way.
 
-Plans fold lines with `unfold` of `plan/reflections.py`. It works in two dimensions, with walls instead of planes, and gives
-fractions of the length in the plan, from which heights follow: both functions have one line in common.
+Plans fold lines with `unfold` of `plan/reflections.py`. It works in two dimensions, with walls instead of planes, and
+gives fractions of the length in the plan, from which heights follow: both functions have one line in common.
 """
 
 import itertools
