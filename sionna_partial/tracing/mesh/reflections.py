@@ -179,7 +179,7 @@ class MeshReflections:
             sequences = split_rays(links, self._rays, by_distance)
         return Traced(sequences, view_sequences(sequences, links.mesh.planes, links.tx_m, _MARGIN))
 
-    def _written(self, traced: Traced, node: Indices, rx: NDArray[np.int32], rows: Indices) -> Candidates:
+    def _written(self, traced: Traced, node: NDArray[np.int32], rx: NDArray[np.int32], rows: Indices) -> Candidates:
         depth = max(1, self._links.limits.depth)
         kind, face, vertices_m, same_wall = _write(
             node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES
