@@ -248,7 +248,7 @@ class Candidates:
         return same and (self.same_wall is None) == (other.same_wall is None)
 
     @property
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, Any]:
         """The arrays that it has, by name, each with a row for every candidate."""
         arrays = {name: value for name, value in vars(self).items() if name != "wedges"}
         return {name: array for name, array in arrays.items() if array is not None}
