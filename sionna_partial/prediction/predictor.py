@@ -101,9 +101,6 @@ NOISY = TraceErrors(0.35, 25.0, 16.0, 0.02, -12.0, 7.0, 0.75, 0.16, 0.5, 3.5, 0.
 
 MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 
-NOISY_TRUST = 0.5
-"""Weight of the trace against the networks on nearly complete maps of full noise; it is 1 on exact ones."""
-
 
 @read_only
 @dataclass(frozen=True, eq=False)
@@ -548,9 +545,7 @@ class Predictor(Shown):
         )
         if context.nearly_complete.any() and not self.settings.through_walls:
             traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
-            trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)
-            mixed = LinkPrediction.mixture([traced, prediction], np.stack([trust, 1.0 - trust]))
-            prediction = prediction.where(context.nearly_complete, mixed)
+            prediction = prediction.where(context.nearly_complete, traced)
         return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
