@@ -50,15 +50,8 @@ ROOMS = {
     ),
     "prediction": (
         *("unobserved", "windows", "features", "inputs"),
-        *(
-            "paper_networks",
-            "map_networks",
-            "predictor_files",
-            "unseen_walls",
-            "predictor",
-            "path_model",
-            "wall_materials",
-        ),
+        *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
+        "wall_materials",
     ),
     "measurements": ("measurements", "recordings", "wall_evidence", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job", "coverage.predict"),
