@@ -107,7 +107,7 @@ class Camera:
 
     @property
     def map(self) -> States:
-        """The map that is handed out: a vacuum robot thins its walls, and makes the rest of their cells free or unknown."""
+        """The map that is handed out: a vacuum robot thins its walls, whose other cells become free or unknown."""
         if self._sensor.is_exact or self._sensor.fusion != "vacuum":
             return self.seen
         wall = self.seen == _WALL
