@@ -1,9 +1,12 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
+import functools
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, get_args
 
-from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number
+from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number, shown
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -12,6 +15,7 @@ from sionna_partial.constants import (
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
 )
+from sionna_partial.errors import ArgumentError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "vacuum": ((0.001, 100.0),),
@@ -57,6 +61,9 @@ NetworkKind = Literal["paper", "paths", "map"]
 Objective = Literal["coverage", "percentile"]
 """Objective of a placement: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
+Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
+"""Mappers whose rule makes a robot's map of noisy readings."""
+
 Policy = Literal["random", "coverage"]
 """Policy by which an exploring robot chooses frontiers."""
 
@@ -66,8 +73,15 @@ Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]
 Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
 
-@dataclass(frozen=True)
+
+_BY_CONDUCTIVITY = float("nan")
+"""Default of the exponent of a conductivity, which depends on that conductivity."""
+
+
+@dataclass(frozen=True, repr=False)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
@@ -85,8 +99,9 @@ class Material(Checked):
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
     conductivity_exponent : float
-        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. Ignored
-        for an ITU material.
+        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. By default
+        it is 0.94 with the conductivity of drywall, so that `Material()` is the default drywall, and 0 with any other.
+        Ignored for an ITU material.
 
     Raises
     ------
@@ -106,12 +121,20 @@ class Material(Checked):
     conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
-    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = 0.0
+    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = _BY_CONDUCTIVITY
 
     def __post_init__(self) -> None:
+        if self.conductivity_exponent is _BY_CONDUCTIVITY:
+            is_drywall = self.itu is None and self.conductivity_s_m == DRYWALL_CONDUCTIVITY_S_M
+            object.__setattr__(self, "conductivity_exponent", DRYWALL_CONDUCTIVITY_EXPONENT if is_drywall else 0.0)
         super().__post_init__()
         if self.itu is not None:
             require_choice("itu", self.itu, ITU_BANDS_GHZ)
+
+    def __repr__(self) -> str:
+        names = ["relative_permittivity", "conductivity_s_m"] if self.itu is None else ["itu"]
+        names += ["thickness_m", *(["conductivity_exponent"] if self.itu is None else [])]
+        return f"Material({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     @classmethod
     def named(cls, name: str) -> "Material":
@@ -143,7 +166,7 @@ class Material(Checked):
 
 
 WALL_MATERIALS = {
-    "drywall": Material(conductivity_exponent=DRYWALL_CONDUCTIVITY_EXPONENT),
+    "drywall": Material(),
     "brick": Material(itu="brick", thickness_m=0.11),
     "concrete": Material(itu="concrete", thickness_m=0.2),
     "reinforced concrete": Material(itu="concrete", thickness_m=0.25),
@@ -288,19 +311,27 @@ class SensorSettings(Checked):
     Parameters
     ----------
     range_noise_m : float
-        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It blurs walls:
-        the map weighs the readings of each cell, as an occupancy grid does.
+        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It makes walls
+        ragged: see `fusion`.
     drift_m_per_m : float
         Odometry drift per metre travelled [1], at most 1, in a direction that is drawn once. What is seen later is
         mapped off its true position, and walls that are seen again may appear twice.
     missed_wall_fraction : float
         Fraction of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces
-        do. Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+        do. Rays to them are dropped: their cells stay unknown, and nothing is seen through them.
     field_of_view_deg : float
         Horizontal angle [degree], in (0, 360], centred on the heading of the robot. The default is the camera of Active
         Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
         Largest range [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
+    heading_noise_deg : float
+        Standard deviation of the heading that the map assumes for a picture [degree], independent from picture to
+        picture, at most 180.
+    missed_return_fraction : float
+        Fraction of rays that return no reading [1], at random. With any error, those that graze a wall return none.
+    fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
+        Mapper whose rule and default parameters decide from the readings which cells are walls (`FUSIONS`); "vacuum"
+        thins walls, too. Without errors all agree, and the map is true.
 
     Raises
     ------
@@ -319,11 +350,15 @@ class SensorSettings(Checked):
     missed_wall_fraction: Fraction = 0.0
     field_of_view_deg: Annotated[float, Within(0.0, 360.0, open_low=True)] = 90.0
     range_m: Annotated[float, Within(0.0, 100.0, open_low=True)] = 3.2
+    heading_noise_deg: Annotated[float, Within(0.0, 180.0)] = 0.0
+    missed_return_fraction: Fraction = 0.0
+    fusion: Fusion = "slam_toolbox"
 
     @property
     def is_exact(self) -> bool:
         """Return whether it makes no errors."""
-        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_fraction == 0.0
+        errors = (self.range_noise_m, self.drift_m_per_m, self.heading_noise_deg)
+        return not any((*errors, self.missed_wall_fraction, self.missed_return_fraction))
 
 
 SHORT_LINK_M = 25.0
@@ -335,11 +370,13 @@ MIXED_SENSORS = {
     "range_noise_m": (0.0, 0.05),
     "drift_m_per_m": (0.0, 0.02),
     "missed_wall_fraction": (0.0, 0.1),
+    "heading_noise_deg": (0.0, 0.5),
+    "missed_return_fraction": (0.0, 0.1),
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
-The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
-than large (the square of a uniform number).
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras and the mapper uniformly, and errors
+more often small than large (the square of a uniform number).
 """
 
 
@@ -502,3 +539,24 @@ class PlacementSettings(Checked):
     tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
+
+
+def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Let a function answer a setting that was given as an argument with the settings that hold it."""
+    parameters = inspect.signature(function).parameters
+    kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
+    holders = {
+        name: f"{argument}={kind.__name__}({name}=...)"
+        for argument, kind in kinds.items()
+        if argument in parameters
+        for name in kind.__dataclass_fields__
+    }
+
+    @functools.wraps(function)
+    def call(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        name = next((name for name in kwargs if name not in parameters and name in holders), None)
+        if name is not None:
+            raise ArgumentError(f"{name} = {shown(kwargs[name])} is a setting: give {holders[name]}.")
+        return function(*args, **kwargs)
+
+    return call

@@ -5,13 +5,15 @@ import html
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
+from sionna_partial.app.files import FILES
+from sionna_partial.app.session import MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
@@ -52,73 +54,7 @@ _LOST = (
     "message.text = 'The connection has ended: start sionna-partial app again, and open the address that it prints.'"
 )
 
-TEMPLATE = """\
-{% block title %}Radio coverage{% endblock %}
-{% block postamble %}
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="referrer" content="no-referrer">
-<style>
-  body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
-  main { display: grid; grid-template: "title title" auto "map status" auto "map controls" 1fr / minmax(0, 1fr) 21rem;
-    gap: 0 1rem; max-width: 90rem; margin: auto; padding: 0.8rem; box-sizing: border-box }
-  #status { grid-area: status } #picture { grid-area: map } #controls { grid-area: controls }
-  h1 { font-size: 1.15rem; margin: 0 0 1rem; grid-area: title }
-  h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
-  section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.7rem; margin-bottom: 0.8rem }
-  @media (max-width: 52rem) { main { padding: 0.4rem;
-    grid-template: "title" auto "status" auto "map" auto "controls" auto / minmax(0, 1fr) } }
-</style>
-{% endblock %}
-{% block contents %}
-<main>
-  <h1>Radio coverage of a partly known building</h1>
-  <section id="status" aria-label="Status">{{ embed(roots.status) }}</section>
-  <div id="picture">
-    <section aria-label="Map with transmitters and coverage">{{ embed(roots.choices) }}
-      {{ embed(roots.picture) }}{{ embed(roots.summary) }}</section>
-    <section aria-labelledby="files"><h2 id="files">Download and repeat</h2>{{ embed(roots.files) }}</section>
-  </div>
-  <div id="controls">
-    <section aria-labelledby="map"><h2 id="map">Map</h2>{{ embed(roots.map) }}</section>
-    <section aria-labelledby="tx"><h2 id="tx">Transmitters</h2>{{ embed(roots.transmitters) }}</section>
-    <section aria-labelledby="radio"><h2 id="radio">Radio</h2>{{ embed(roots.radio) }}</section>
-    <section aria-labelledby="robot"><h2 id="robot">Robot and measurements</h2>{{ embed(roots.robot) }}</section>
-  </div>
-</main>
-<input type="file" id="map-file" multiple hidden accept="{{ map_suffixes }}" aria-label="Map files">
-<input type="file" id="csv-file" hidden accept=".csv" aria-label="Measurements">
-<script>
-  try { // a pause before a drag is no long press, which no tool here takes
-    Bokeh.require("core/ui_gestures").UIGestures.press_threshold = 2 ** 30
-  } catch { console.info("A drag begins within 0.3 s.") }
-  const labels = {
-    "noUi-handle": "Threshold [dBm]", "bk-spin-btn-up": "more", "bk-spin-btn-down": "less",
-    "bk-events": "Map; the fields x and y move its transmitters",
-  }
-  document.addEventListener("focusin", event => {
-    const node = event.composedPath()[0]
-    const name = Object.keys(labels).find(each => node.classList?.contains(each))
-    if (name || node.title) node.setAttribute("aria-label", labels[name] ?? node.title)
-    if (name == "bk-events") node.setAttribute("role", "img")
-    else if (node.tagName == "DIV" && node.title) node.setAttribute("role", "button")
-  })
-  for (const [id, kind] of [["map-file", "map"], ["csv-file", "measurements"]]) {
-    const input = document.getElementById(id)
-    input.onchange = async () => {
-      const form = new FormData()
-      let size = 0
-      for (const file of input.files) { form.append("file", file); size += file.size }
-      input.value = ""
-      if (size > {{ most_bytes }}) return alert("Too large: start sionna-partial app with the map's path.")
-      try {
-        const answer = await fetch("{{ files_url }}/" + kind, { method: "POST", body: form })
-        if (!answer.ok) alert(await answer.text())
-      } catch { alert("The file was not sent: start sionna-partial app again, and open the address that it prints.") }
-    }
-  }
-</script>
-{% endblock %}
-"""
+TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 
 
 class Page:

@@ -7,6 +7,7 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -20,7 +21,15 @@ from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import HOME_KINDS, MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, HomeKind, SensorSettings
+from sionna_partial.settings import (
+    HOME_KINDS,
+    MIXED_SENSORS,
+    SHORT_LINK_M,
+    DatasetSettings,
+    Fusion,
+    HomeKind,
+    SensorSettings,
+)
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home
@@ -33,6 +42,19 @@ MAP_SUFFIXES = (".yaml", ".yml", ".npz")
 
 COMMON_STEMS = ("map", "scene")
 """Names of map files that do not name the home: it has the name of the folder."""
+
+NEAREST_M = 0.1
+"""Shortest distance of transmitter and receiver [m]."""
+
+FROM_BORDER_CELLS = 0.25
+"""Distance of transmitters and receivers from the borders of their cells [cells]."""
+
+_LIDAR_FRACTION = 2 / 3
+
+MAX_DRAWS = 1000
+"""Number of times that positions which cannot be used are drawn again."""
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -114,20 +136,6 @@ def _scene_file(folder: Path) -> Path | None:
     return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)
 
 
-NEAREST_M = 0.1
-"""Shortest distance of transmitter and receiver [m]."""
-
-FROM_BORDER_CELLS = 0.25
-"""Distance of transmitters and receivers from the borders of their cells [cells]."""
-
-_LIDAR_FRACTION = 2 / 3
-
-MAX_DRAWS = 1000
-"""Number of times that positions which cannot be used are drawn again."""
-
-_log = logging.getLogger(__name__)
-
-
 @dataclass(frozen=True)
 class _Positions:
     """T transmitters (3,) of a home, and for each its N receivers (N, 3), and whether they were drawn anywhere (N,)."""
@@ -203,7 +211,8 @@ def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
     values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
     if rng.random() < _LIDAR_FRACTION:
         values["field_of_view_deg"] = 360.0
-    return SensorSettings(**values)
+    fusions = get_args(Fusion)
+    return SensorSettings(**values, fusion=fusions[rng.integers(len(fusions))])
 
 
 def _home_seed(name: str, settings: DatasetSettings) -> list[int]:

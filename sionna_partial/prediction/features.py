@@ -43,8 +43,8 @@ _PATHS_AT_ONCE = 100_000
 SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
 
-LEAST_NOISE = 0.1
-"""Noise of walls up to which a map counts as exact: the edges of what a robot has seen are rough, too."""
+LEAST_NOISE = 0.05
+"""Noise of walls up to which a map counts as exact: those that were cut out of meshes have as much."""
 
 _ASIDE_CELLS = 1.5
 """Distance to both sides within which a line must meet a known wall to cross it: the uncertainty of a map [cells]."""
@@ -469,8 +469,8 @@ def context_of(phi: LinkFeatures) -> LinkContext:
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
-    """Return the excess of the noise of walls over exact maps, 0 to 1."""
-    return np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE)
+    """Return the weight, 0 to 1, of the errors of maps with full noise: a little noise causes most of them."""
+    return np.sqrt(np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE))
 
 
 def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:

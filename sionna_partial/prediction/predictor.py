@@ -51,7 +51,7 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import PredictorSettings
+from sionna_partial.settings import PredictorSettings, TraceSettings
 
 if TYPE_CHECKING:
     import keras
@@ -100,9 +100,6 @@ NOISY = TraceErrors(0.35, 25.0, 16.0, 0.02, -12.0, 7.0, 0.75, 0.16, 0.5, 3.5, 0.
 """On maps without and with full noise, measured on procedural homes."""
 
 MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
-
-NOISY_TRUST = 0.5
-"""Weight of the trace against the networks on nearly complete maps of full noise; it is 1 on exact ones."""
 
 
 @read_only
@@ -188,12 +185,14 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
     @classmethod
-    def of_mean_losses(cls, phi: LinkFeatures, walls: Floats) -> LinkPrediction:
-        """Return what the mean loss of walls predicts of links through walls, which have a context.
+    def of_mean_losses(
+        cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
+    ) -> LinkPrediction:
+        """Return the prediction by the mean loss of walls, for links through walls, which have a context.
 
-        `walls` (N,) are the expected numbers of unseen walls on their direct lines.
+        `walls` (N,) are the expected numbers of unseen walls on their direct lines, `max_walls` is that of the trace.
         """
-        return cls.of_parts(*by_mean_losses(phi, walls))
+        return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
@@ -500,9 +499,7 @@ class Predictor(Shown):
         )
         if context.nearly_complete.any() and not self.settings.through_walls:
             traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
-            trust = 1.0 - (1.0 - NOISY_TRUST) * excess_noise(context.wall_noise)
-            mixed = LinkPrediction.mixture([traced, prediction], np.stack([trust, 1.0 - trust]))
-            prediction = prediction.where(context.nearly_complete, mixed)
+            prediction = prediction.where(context.nearly_complete, traced)
         return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
@@ -648,8 +645,8 @@ class MeanLosses:
 
     name = WALL_LOSSES
 
-    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap) -> None:
-        self._networks, self._partial = networks, partial
+    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap, max_walls: int) -> None:
+        self._networks, self._partial, self._max_walls = networks, partial, max_walls
         self.settings, self.fingerprint = networks.settings, networks.fingerprint
         self.predict_indoor = networks.predict_indoor
 
@@ -659,7 +656,7 @@ class MeanLosses:
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links (N,)."""
-        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi))
+        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi), self._max_walls)
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses
