@@ -252,7 +252,7 @@ for name in ("", *typer.main.get_command(app).commands):
         finally:
             sys.setprofile(None)
         files = {code.co_filename for code in codes if code.co_name != "<module>"}
-        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 43
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 41
 
 
 class TestPublicNames:
