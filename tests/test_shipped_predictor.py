@@ -56,8 +56,8 @@ def test_map_is_worth_more_than_the_distance_alone(evaluation: Evaluation) -> No
 
 @pytest.mark.parametrize(("range_noise_m", "low", "high"), [(0.0, 0.0, LEAST_NOISE), (0.03, 0.5, 1.0)])
 def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float, low: float, high: float) -> None:
-    sensor = sp.SensorSettings(range_noise_m=range_noise_m)
-    settings = replace(SETTINGS, links_per_home=100, stages=(200,), sensor=sensor)
+    sensor = sp.SensorSettings(range_noise_m=range_noise_m, field_of_view_deg=360.0, range_m=5.0)
+    settings = replace(SETTINGS, links_per_home=100, stages=(100,), sensor=sensor)
     links = home_links(sp.make_home(3, "apartment"), "home", settings)
     wall_noise = links.context.wall_noise[0]
     assert low <= wall_noise <= high
