@@ -69,7 +69,7 @@ ROOMS = {
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("jobs", "uploads", "session", "page", "server"),
+    "app": ("jobs", "uploads", "radio", "project", "answer", "session", "template", "picture", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }
