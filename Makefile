@@ -32,7 +32,8 @@ docs: $(READY) ## Build the site, with its pages, notebooks and examples run (bu
 	@echo "the site is build/docs/index.html"
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
-	@$(ONE_THREAD) $(BIN)/python tests/hostile/attack.py --minutes 60 --table docs/hostile.md
+	@mkdir -p build
+	@$(ONE_THREAD) $(BIN)/python tests/hostile/attack.py --minutes 60 --table build/hostile.md
 
 lint: $(READY) ## Check style and types
 	@$(BIN)/ruff check .
@@ -45,7 +46,7 @@ format: $(READY) ## Format the code
 
 lock: $(READY) ## Lock the newest allowed dependencies from PyPI in requirements.lock
 	@env -u PIP_FIND_LINKS -u PIP_EXTRA_INDEX_URL PIP_CONFIG_FILE=/dev/null CUSTOM_COMPILE_COMMAND="make lock" \
-		$(BIN)/pip-compile --upgrade --extra dev --extra ifc --extra live --generate-hashes --allow-unsafe --strip-extras --quiet \
+		$(BIN)/pip-compile --upgrade --extra dev --extra all --generate-hashes --allow-unsafe --strip-extras --quiet \
 		--constraint constraints.txt --no-emit-index-url --no-emit-find-links --no-emit-trusted-host --output-file requirements.lock pyproject.toml
 
 scenes: $(READY) ## Make the demo scenes again (scenes/)

@@ -1,4 +1,4 @@
-"""Loss of walls at normal incidence, of the materials that `Material.named` has, as in docs/through_walls.md."""
+"""Loss of walls at normal incidence, of the materials that `Material.named` has, as in docs/walls.md."""
 
 import numpy as np
 

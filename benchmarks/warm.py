@@ -31,7 +31,7 @@ def seconds(call, *arguments):
 
 
 def main():
-    """Print the table of docs/usage.md."""
+    """Print the table of docs/predict.md."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=5, help="repetitions, of which the median is printed")
     runs = parser.parse_args().runs

@@ -19,29 +19,21 @@ API = ROOT / "build" / "api"
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 SECTIONS = {
-    "Start": ["docs/install", "docs/usage"],
+    "Get started": [
+        *("docs/install", "docs/five_minutes", "docs/researchers", "docs/robots", "docs/vacuum", "docs/planners"),
+    ],
     "Guides": [
-        *("docs/ros_map", "docs/scan", "docs/sionna", "docs/robots", "docs/channels", "docs/transmitters"),
-        *(
-            "docs/measured_powers",
-            "docs/calibration",
-            "docs/placement",
-            "docs/next_views",
-            "docs/live",
-            "docs/app",
-            "docs/differentiable",
-        ),
-        *("docs/training", "docs/cluster"),
+        *("docs/maps", "docs/predict", "docs/walls", "docs/measured_powers", "docs/transmitters", "docs/channels"),
+        *("docs/live", "docs/app", "docs/calibration", "docs/training"),
+        *(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS),
+        "build/gallery/index",
     ],
-    "Examples": [*(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS), "build/gallery/index"],
-    "Reference": ["build/api/index", "docs/conventions", "docs/glossary"],
-    "Method and results": [
-        *("docs/method", "docs/predictor", "docs/results", "docs/speed", "docs/limits", "docs/through_walls"),
-        *("docs/wireless_insite", "docs/homes", "docs/buildings", "docs/experiments"),
+    "Reference": [
+        *("docs/method", "docs/results", "docs/model_card", "build/api/index"),
+        *("docs/development", "docs/experiments", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
     ],
-    "Development": ["CONTRIBUTING", "docs/development", "docs/traps", "SECURITY", "CHANGELOG"],
 }
-"""Pages of the sidebar; pages of `docs/` that are not among them follow under "More"."""
+"""Pages of the sidebar, if they exist; other pages of `docs/` follow under "More"."""
 
 ROOMS = {
     "maps": "Maps",

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from sionna_partial.llvm import choose_llvm as _choose_llvm
 from sionna_partial.process import signals_held as _signals_held
+from sionna_partial.resources import optional_packages as _optional_packages
 
 __version__ = "0.1.0"
 
@@ -33,7 +34,7 @@ __all__ = sorted([*_MODULE_OF, "__version__"])
 def __getattr__(name: str) -> object:
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    with _signals_held():
+    with _signals_held(), _optional_packages():
         value: object = getattr(import_module(_MODULE_OF[name]), name)
     globals()[name] = value
     return value

@@ -11,6 +11,7 @@ from pkgutil import resolve_name
 from typing import Any, ClassVar
 
 from sionna_partial.checks import CountProgress, Progress, require, shown
+from sionna_partial.resources import optional_packages
 
 LONGEST = 240
 """Length of the longest line [characters]."""
@@ -23,7 +24,8 @@ _FEW = 4
 
 def later(name: str) -> Any:
     """Return a function of a later room, as "plots.style:plot_map", whose module is imported by no result."""
-    return resolve_name(f"sionna_partial.{name}")
+    with optional_packages():
+        return resolve_name(f"sionna_partial.{name}")
 
 
 def picture_html(line: str, plot: str, value: object) -> str:

@@ -9,8 +9,6 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import yaml
-from rasterio import Affine
-from rasterio.io import MemoryFile
 
 from sionna_partial.constants import MAX_COST, NO_RECEIVER
 from sionna_partial.coverage.dataset import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
@@ -21,6 +19,7 @@ from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
 from sionna_partial.plots.style import figure_png
+from sionna_partial.resources import optional_packages
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """Variables in CSV and GeoTIFF; `wall_parts` is for pictures alone."""
@@ -178,6 +177,9 @@ def _encode_netcdf(coverage: xr.Dataset) -> bytes:
 
 
 def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES) -> bytes:
+    with optional_packages():
+        from rasterio import Affine
+        from rasterio.io import MemoryFile
     bands = _bands(coverage, names)
     step = float(coverage.attrs["spacing_m"])
     left, top = float(coverage["x"][0]) - step / 2, float(coverage["y"][-1]) + step / 2

@@ -16,6 +16,7 @@ from typing import IO, TYPE_CHECKING, Any
 from sionna_partial.checks import require, shown
 from sionna_partial.errors import OutputError, SionnaPartialError
 from sionna_partial.process import own_folder, signals_held
+from sionna_partial.resources import optional_packages
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -201,6 +202,8 @@ class _Sink(io.RawIOBase):
 
 def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
     """Compute dask's arrays, of as many blocks each, block by block; `dask.array.store` has another order each time."""
+    if not sources:
+        return
     import dask
     from dask.array.core import slices_from_chunks
 
@@ -271,7 +274,8 @@ def decoding(
 ) -> Iterator[None]:
     """Turn whatever decoders raise on damaged files, which is of many types, into an `error`; our own errors pass."""
     try:
-        yield
+        with optional_packages(error):
+            yield
     except (SionnaPartialError, Warning):
         raise
     except Exception as cause:

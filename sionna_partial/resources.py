@@ -1,10 +1,23 @@
-"""Demo scenes that ship with the package."""
+"""Files that ship with the package, and libraries that only some of its functions need."""
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sionna_partial.errors import SceneError
+from sionna_partial.errors import BackendError, SceneError, SionnaPartialError
+
+EXTRAS = {
+    "app": ("bokeh", "tornado"),
+    "channels": ("dask", "zarr"),
+    "datasets": ("dask", "distributed", "pyarrow", "rasterio"),
+    "geo": ("rasterio",),
+    "ifc": ("ifcopenshell",),
+    "live": ("cyclonedds", "rosbags", "websockets"),
+    "maps": ("ezdxf", "laspy", "lazrs", "pypcd4", "rosbags"),
+}
+"""Optional packages by the extra of pyproject.toml that installs them; `all` installs every one."""
 
 HOMES_FILE = "homes.json"
 """File in the scenes folder with the origin of each home and its transmitter position."""
@@ -13,6 +26,20 @@ _PACKAGE = Path(__file__).resolve().parent
 
 PREDICTORS_FOLDER = _PACKAGE / "predictors"
 """Trained predictors that come with the package."""
+
+
+@contextmanager
+def optional_packages(error: type[SionnaPartialError] = BackendError) -> Iterator[None]:
+    """Turn a failed import of an optional package into an `error` with the command that installs it."""
+    try:
+        yield
+    except ImportError as cause:
+        package = (cause.name or "").partition(".")[0]
+        extras = [extra for extra, packages in EXTRAS.items() if package in packages]
+        if not extras:
+            raise
+        remedy = " or ".join(f"pip install '.[{extra}]'" for extra in extras)
+        raise error(f"{package} is not installed: {remedy} in the repository, or '.[all]'.") from cause
 
 
 def scenes_folder() -> Path:

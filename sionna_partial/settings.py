@@ -119,7 +119,7 @@ class Material(Checked):
 
         The names are the keys of `WALL_MATERIALS`, such as "drywall", the default, and the materials of ITU-R P.2040-3,
         with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
-        such walls: `docs/through_walls.md`.
+        such walls: `docs/walls.md`.
 
         Examples
         --------
@@ -154,7 +154,7 @@ WALL_MATERIALS = {
     "metal": Material(itu="metal", thickness_m=0.005),
 }
 """Materials that walls have, with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less
-below; coated glass is glass whose conductivity stands for its film of metal."""
+below; coated glass is glass with the conductivity of its metal film."""
 
 DRYWALL = WALL_MATERIALS["drywall"]
 """The default material."""
@@ -175,7 +175,7 @@ class SceneSettings(Checked):
     floor_extent : {"observed", "none"}
         Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or no floor and ceiling.
     ceiling : bool
-        Whether there is a ceiling above the floor.
+        True for a ceiling above the floor.
     outline : {"lines", "cells"}
         Position of the walls: few straight lines fitted to the wall cells, or the staircase through the centres of
         the wall cells as they are, for which `bridge_gap_m` does not count.
@@ -216,14 +216,14 @@ class TraceSettings(Checked):
     diffraction_walls : int
         Largest number of reflections at walls of a floor plan before the diffraction, and after it: 0, 1 or 2.
     open_ends : bool
-        Whether a wall of a floor plan diffracts also where it ends because observation did.
+        True if a wall of a floor plan diffracts also at an end where observation stopped.
     power_tolerance_db : float or None
         By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
-        every path. The power of all candidates is computed before any is verified, and is at least what Sionna RT finds
-        but for rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir` and the like),
-        which are sums of fields: links that were traced with None are traced again for them.
+        every path. The power of all candidates is computed before any is verified, and is at least the power that
+        Sionna RT finds, up to rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir`
+        and the like), which are sums of fields: links that were traced with None are traced again for them.
     refraction : bool or None
-        Whether paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
+        True if paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
         below.
     max_walls : int
         Largest number of walls that a path goes through, 1 to 16. `max_depth` does not count them.
@@ -421,13 +421,13 @@ class PredictorSettings(Checked):
     Parameters
     ----------
     networks : {"paper", "paths", "map"}
-        "paper" has the networks of the paper alone. "paths" adds one that sees what each path crosses, "map" adds two,
+        "paper" has the networks of the paper alone. "paths" adds one that sees the crossings of paths, "map" adds two,
         of which one sees the map around the transmitter; both need features with a context, as `link_features`
         returns them.
     frequency_hz : float
         Carrier frequency of the links [Hz]; it sets the gain of free space.
     diffraction : bool
-        Whether the links were traced with diffraction.
+        True if the links were traced with diffraction.
     passes : int
         Number of passes of the added networks over the training links.
     steps : int
@@ -442,7 +442,7 @@ class PredictorSettings(Checked):
     seed : int
         Seed of first weights and batches.
     through_walls : bool
-        Whether the links were traced through walls.
+        True if the links were traced through walls.
 
     Raises
     ------

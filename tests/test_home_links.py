@@ -2,19 +2,22 @@
 
 import itertools
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.home_links import NEAREST_M, home_links, home_sensor, map_area
+from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
 from sionna_partial.datasets.link_table import LinkTable, stage_name
-from sionna_partial.errors import MapError, PositionError, PredictorError
+from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
 from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.worlds.homes import make_home
 
 SETTINGS = DatasetSettings(
     links_per_home=31, transmitters_per_home=3, stages=(0, 3, 40), trace=TraceSettings(max_depth=2)
@@ -250,3 +253,66 @@ class TestRefused:
                 replace(table, **change)
         with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
             LinkTable.concatenate([])
+
+
+@pytest.fixture
+def maps(tmp_path: Path) -> Path:
+    """Two maps in a folder, a map in a folder of its own, an exported scene, and other files."""
+    (tmp_path / "house").mkdir()
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "empty").mkdir()
+    for name in ("one.yaml", "two.npz", "picture.png", "house/map.yaml", "scene/map.yaml", "scene/scene.xml"):
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def test_seeds() -> None:
+    assert home_sources(range(3, 5)) == [HomeSource("make_home(3)", 3), HomeSource("make_home(4)", 4)]
+    assert home_sources([3])[0].record == {"name": "make_home(3)", "seed": 3}
+    assert home_sources([3])[0].load() == make_home(3)
+
+
+def test_seeds_of_a_kind() -> None:
+    (hall,) = home_sources([(3, "hall")])
+    assert hall == HomeSource("make_home(3, hall)", 3, "hall")
+    assert hall.record == {"name": "make_home(3, hall)", "seed": 3, "kind": "hall"}
+    assert hall.load() == make_home(3, "hall")
+    assert home_sources([(3, None)]) == home_sources([3])
+
+
+def test_folder_of_maps(maps: Path) -> None:
+    found = {source.name: source.origin for source in home_sources([maps])}
+    expected = {"house": "house/map.yaml", "one": "one.yaml", "scene": "scene/scene.xml", "two": "two.npz"}
+    assert found == {name: str(maps / file) for name, file in expected.items()}
+
+
+def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    source = HomeSource("house", str(maps / "house" / "map.yaml"))
+    monkeypatch.chdir(maps)
+    assert home_sources(["house"]) == home_sources([maps / "house" / "map.yaml"]) == [source]
+    assert source.record == {"name": "house", "path": str(maps / "house" / "map.yaml")}
+    assert home_sources(["picture.png"])[0].name == "picture"
+
+
+@pytest.mark.parametrize("twice", [[3, 3], ["house", "house/map.yaml"]])
+def test_one_name_twice(maps: Path, monkeypatch: pytest.MonkeyPatch, twice: list[int | str]) -> None:
+    monkeypatch.chdir(maps)
+    with pytest.raises(MapError, match=r"two homes are called '.*', .* and .*: leave one out, or rename"):
+        home_sources(twice)
+
+
+@pytest.mark.parametrize(
+    ("homes", "message"),
+    [
+        ([], "homes is empty: give seeds of make_home, or paths of complete maps"),
+        ([(-1, "hall")], "seed = -1 is not allowed"),
+        ([(3, "castle")], "kind = 'castle' is not allowed"),
+        (["empty"], r"empty' holds no map: give a folder with maps \(\.yaml, \.yml, \.npz\), or with"),
+        (["nowhere"], "nowhere' is not there: give complete maps"),
+        *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5, None)),
+    ],
+)
+def test_refused(maps: Path, monkeypatch: pytest.MonkeyPatch, homes: list[Any], message: str) -> None:
+    monkeypatch.chdir(maps)
+    with pytest.raises((MapError, SettingsError), match=message):
+        home_sources(homes)

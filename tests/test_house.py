@@ -17,13 +17,14 @@ from types import CodeType, ModuleType
 import pytest
 
 import sionna_partial
+from sionna_partial.resources import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
 
 ROOMS = {
     "foundations": (
-        *("process", "arrays", "constants", "errors", "checks", "display", "settings", "resources", "files", "llvm"),
+        *("process", "arrays", "constants", "errors", "resources", "checks", "display", "settings", "files", "llvm"),
     ),
     "maps": (
         *(
@@ -125,6 +126,9 @@ NOT_IMPORTED = {
 }
 """Declared dependencies that no module imports, and why they are needed."""
 
+COME_WITH = {"drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
+"""Imported packages that a declared one cannot do without, and which it therefore installs in a version that fits."""
+
 
 @cache
 def tree_of(module: str) -> ast.Module:
@@ -160,7 +164,7 @@ def own_imports(module: str) -> set[str]:
 def declared(kind: str) -> set[str]:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    lines = [*project["dependencies"], *extras["ifc"], *extras["live"]] if kind == "run" else extras[kind]
+    lines = extras["dev"] if kind == "dev" else sum((extras[name] for name in EXTRAS), project["dependencies"])
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
@@ -282,7 +286,15 @@ class TestDependencies:
         names = {name.partition(".")[0] for module in MODULES for name in imported(tree_of(module))} - own
         distributions = metadata.packages_distributions()
         used = {distributions[name][0].lower().replace("_", "-") for name in names}
-        assert declared("run") == used | NOT_IMPORTED.keys()
+        assert COME_WITH.keys() < used
+        assert declared("run") == used - COME_WITH.keys() | NOT_IMPORTED.keys()
+
+    def test_packages_of_extras_are_known_to_the_error_that_names_them(self) -> None:
+        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+        extras = {name: lines for name, lines in project["optional-dependencies"].items() if name not in ("all", "dev")}
+        packages = {name: {*re.findall(r"\w+(?=[]>[])", " ".join(lines))} for name, lines in extras.items()}
+        assert packages == {name: {*known} for name, known in EXTRAS.items()}
+        assert project["optional-dependencies"]["all"] == [f"sionna-partial[{','.join(sorted(extras))}]"]
 
     def test_what_is_declared_is_locked(self) -> None:
         lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")

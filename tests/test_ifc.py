@@ -213,5 +213,5 @@ def test_arguments(path: Path, given: dict[str, Any], message: str) -> None:
 
 def test_without_the_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(__import__("sys").modules, "ifcopenshell", None)
-    with pytest.raises(MapError, match=r"needs ifcopenshell: pip install '\.\[ifc\]'"):
+    with pytest.raises(MapError, match=r"ifcopenshell is not installed: pip install '\.\[ifc\]' in the repository"):
         sp.load_map(path, storey="Level 0")

@@ -2,6 +2,7 @@
 
 import logging
 import math
+import re
 from pathlib import Path
 from types import SimpleNamespace as Fields
 from typing import Any
@@ -11,8 +12,10 @@ import pytest
 import yaml
 from numpy.typing import NDArray
 from rosbag_files import Messages, write_bag
+from typer.testing import CliRunner
 
 import sionna_partial as sp
+from sionna_partial import cli
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
 from sionna_partial.live.coverage import LiveGrid, LiveViews
@@ -271,16 +274,62 @@ def half_seen() -> Heard:
     return heard
 
 
+NAV2 = Path(__file__).parents[1] / "examples" / "nav2"
+
+COSTMAP_PARAMETERS = """
+always_send_full_costmap clearable_layers enabled filters footprint footprint_padding global_frame height
+initial_transform_timeout lethal_cost_threshold map_topic map_vis_z observation_sources origin_x origin_y
+plugins publish_frequency resolution robot_base_frame robot_radius rolling_window
+subscribe_to_stamped_footprint track_unknown_space transform_tolerance trinary_costmap unknown_cost_value
+update_frequency use_maximum width
+"""
+LAYER_PARAMETERS = {
+    "StaticLayer": """enabled footprint_clearing_enabled map_subscribe_transient_local map_topic
+restore_cleared_footprint subscribe_to_updates transform_tolerance""",
+    "ObstacleLayer": """combination_method enabled footprint_clearing_enabled max_obstacle_height min_obstacle_height
+observation_sources tf_filter_tolerance""",
+    "InflationLayer": "cost_scaling_factor enabled inflate_around_unknown inflate_unknown inflation_radius",
+}
+SOURCE_PARAMETERS = """
+clearing data_type expected_update_rate inf_is_valid marking max_obstacle_height min_obstacle_height
+observation_persistence obstacle_max_range obstacle_min_range raytrace_max_range raytrace_min_range
+sensor_frame topic transport_type
+"""
+"""Names of parameters by the configuration guide of nav2 (docs.nav2.org, Costmap 2D)."""
+
+
 @pytest.fixture(scope="module")
 def parameters() -> dict[str, Any]:
-    """Return the parameters of the page, where nav2 reads them: those of the costmap."""
-    page = (Path(__file__).parents[1] / "docs" / "live.md").read_text("utf-8")
-    costmap = yaml.safe_load(page.partition("```yaml")[2].partition("```")[0])["global_costmap"]["global_costmap"]
-    assert costmap["ros__parameters"]["use_maximum"]
-    return dict(costmap["ros__parameters"])
+    """Return the parameters of the example, where nav2 reads them: in the costmap."""
+    content = yaml.safe_load((NAV2 / "nav2_params.yaml").read_text("utf-8"))
+    costmap = content["global_costmap"]["global_costmap"]["ros__parameters"]
+    assert costmap["use_maximum"]
+    return dict(costmap)
 
 
 class TestNav2:
+    def test_every_parameter_is_one_of_nav2(self, parameters: dict[str, Any]) -> None:
+        layers = {name: dict(parameters[name]) for name in parameters["plugins"]}
+        assert {*parameters} - {*layers} <= {*COSTMAP_PARAMETERS.split()}
+        for layer in layers.values():
+            package, _, kind = layer.pop("plugin").partition("::")
+            assert package == "nav2_costmap_2d"
+            sources = {name: layer.pop(name) for name in layer.get("observation_sources", "").split()}
+            assert {*layer} <= {*LAYER_PARAMETERS[kind].split()}
+            assert all({*source} <= {*SOURCE_PARAMETERS.split()} for source in sources.values())
+
+    def test_files_name_what_is_published(self, parameters: dict[str, Any]) -> None:
+        displays = yaml.safe_load((NAV2 / "radio.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
+        shown = {display["Topic"]["Value"] for display in displays}
+        assert {*Topics().published({"tx": None}), "/map"} <= shown
+        assert parameters["radio_layer"]["map_topic"] in shown
+        launch = (NAV2 / "radio.launch.py").read_text("utf-8")
+        options = CliRunner().invoke(cli.app, ["live", "--help"]).output
+        named = re.findall(r'"(--[a-z-]+)"', launch)
+        assert named
+        assert [option for option in named if option not in options] == []
+        assert sp.TraceSettings(float(re.findall(r'"frequency": \("(\w+)"', launch)[0])) == sp.TraceSettings()
+
     @pytest.mark.parametrize(
         ("rule", "keeps_walls"),
         [(update_with_max, True), (update_with_overwrite, True), (update_with_true_overwrite, False)],
@@ -312,6 +361,48 @@ class TestNav2:
         assert list(Topics(unknown=True).messages(grid)) == ["/radio/tx", "/radio/tx/unknown"]
         assert list(Topics().messages(grid)) == ["/radio/tx"]
         assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
+
+
+class TestChangedTransmitters:
+    def test_added_moved_and_removed(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        listener = Listener(heard.live, Topics())
+        listener.take("/map", message(grown()))
+        heard.step()
+        for key, value in [("door", "3.5 2.5"), ("tx", "2.5 1.5 1.5"), ("", "1 1"), ("door", "1 2 3 4"), ("wall", "")]:
+            listener.take("/radio/transmitters", Fields(key=key, value=value))
+        for line in ("tx has the name ''", "tx door = [1.0, 2.0, 3.0, 4.0] is no position", "'wall' is not known"):
+            assert line in caplog.text
+        assert heard.step() == [(1, False)] * 2 + [(1, True)] * 2
+        final = {each.name: each.coverage for each in heard if each.is_final}
+        assert final["tx"].attrs["transmitter_m"].tolist() == [2.5, 1.5, 1.5]
+        assert final["door"].attrs["transmitter_m"].tolist() == [3.5, 2.5, 1.5]
+        heard.live.on_pose(1.5, 2.5, 0.0)
+        heard.live.on_power(-50.0, 0.1, "tx")
+        listener.take("/radio/transmitters", Fields(key="tx", value=""))
+        heard.step()
+        assert [(each.name, each.is_final) for each in heard] == [("tx", True), ("door", False), ("door", True)]
+        assert (heard[0].cost == -1).all()
+        assert heard.live._powers == {"door": {}}
+        listener.take("/radio/transmitters", Fields(key="door", value=""))
+        heard.live.request_views()
+        heard.step()
+        assert [each.name for each in heard] == ["door"]
+
+    def test_an_answer_for_the_old_position_is_not_published(self) -> None:
+        heard = Heard()
+        heard.live.on_map(message())
+        published = heard.live._publish
+
+        def publish(answer: LiveGrid) -> None:
+            published(answer)
+            if len(heard) == 1:
+                heard.live.on_transmitter("tx", (2.5, 2.5, 1.5))
+
+        heard.live._publish = publish  # type: ignore[assignment]
+        assert heard.step() == [(1, False)]
+        assert heard.step() == [(1, False), (1, True)]
+        assert heard[-1].coverage.attrs["transmitter_m"].tolist() == [2.5, 2.5, 1.5]
 
 
 class TestListener:

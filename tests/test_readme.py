@@ -113,6 +113,16 @@ def test_every_page_and_picture_is_linked() -> None:
         assert README in {target for target, _ in links(page)}, f"{page.name} does not lead back"
 
 
+def test_readers_find_their_words_in_titles() -> None:
+    titles = "".join(page.read_text("utf-8").partition("\n")[0] for page in PAGES)
+    assert [word for word in ("Wi-Fi", "RSSI", "nav2") if word not in titles] == []
+
+
+def test_dates_and_commits_are_on_one_page() -> None:
+    for page in set((ROOT / "docs").glob("*.md")) - {ROOT / "docs" / "experiments.md"}:
+        assert not re.search(r"\b20\d\d-\d\d-\d\d\b|\bcommit [0-9a-f]{7}", page.read_text("utf-8")), page.name
+
+
 def test_notebooks_are_stored_without_outputs() -> None:
     for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
@@ -120,7 +130,7 @@ def test_notebooks_are_stored_without_outputs() -> None:
 
 
 def test_every_command_is_in_the_table() -> None:
-    table = (ROOT / "docs" / "usage.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
+    table = (ROOT / "docs" / "five_minutes.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
     rows = re.findall(r"^\| (`[^|]*) \|", table, flags=re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`([a-z-]+)", row)}
     assert named == typer.main.get_command(app).commands.keys()  # type: ignore[attr-defined]
@@ -155,7 +165,8 @@ def test_files_named_in_code_exist() -> None:
     for page in PAGES:
         if page.name == "experiments.md":  # scripts of earlier commits
             continue
-        for name in re.findall(r"\b(?:benchmarks|examples|scenes|sionna_partial)/[\w/]+\.\w+", page.read_text("utf-8")):
+        folders = r"\b(?:benchmarks|examples|scenes|sionna_partial)"
+        for name in re.findall(rf"{folders}/[\w/]+(?:\.\w+)+", page.read_text("utf-8")):
             assert (ROOT / name).exists(), f"{page.name} names {name}"
 
 

@@ -72,21 +72,28 @@ def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
     assert not [name for name in names if name.startswith(("build/", ".venv/")) or "__pycache__" in name]
 
 
+def published_in(folder: Path, packages: list[str | Path]) -> tuple[Path, dict[str, str]]:
+    """Install into a new environment; return its Python, and variables that hide the environment of the tests."""
+    venv.create(folder, with_pip=True)
+    python = folder / "bin" / "python"
+    subprocess.run([python, *INSTALL, *packages], check=True, timeout=1800)
+    hidden = ("PYTHON", "DRJIT", "VIRTUAL")
+    return python, {name: value for name, value in os.environ.items() if not name.startswith(hidden)}
+
+
+INSTALL = ("-m", "pip", "install", "--quiet", "--disable-pip-version-check")
+LOCK = ROOT / "requirements.lock"
+
+
 @pytest.mark.slow
 def test_demo_runs_from_what_is_published_alone(wheel: Path, archive: Path, tmp_path: Path) -> None:
     """Install the lock, then wheel and source archive, in a new environment; run the demo in an empty folder."""
-    venv.create(tmp_path / "venv", with_pip=True)
-    python = tmp_path / "venv" / "bin" / "python"
-    install = [python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "--no-deps"]
-    lock = ["--only-binary", ":all:", "--require-hashes", "-r", ROOT / "requirements.lock"]
-    subprocess.run([*install, *lock], check=True, timeout=1800)
+    lock: list[str | Path] = ["--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", LOCK]
+    python, environment = published_in(tmp_path / "venv", lock)
     (tmp_path / "empty").mkdir()
-    environment = {
-        name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "DRJIT", "VIRTUAL"))
-    }
     for published in (archive, wheel):
-        again = [*install, "--no-build-isolation", "--force-reinstall", published]
-        subprocess.run(again, check=True, timeout=300)
+        again = [*INSTALL, "--no-deps", "--no-build-isolation", "--force-reinstall", published]
+        subprocess.run([python, *again], check=True, timeout=300)
         command = [python.parent / "sionna-partial", "demo", "--out", f"demo{published.suffix}"]
         result = subprocess.run(
             command, cwd=tmp_path / "empty", env=environment, capture_output=True, text=True, timeout=600
@@ -95,3 +102,22 @@ def test_demo_runs_from_what_is_published_alone(wheel: Path, archive: Path, tmp_
         lines = [line.removeprefix("wrote ") for line in result.stdout.splitlines() if "wrote" in line]
         assert lines
         assert all((tmp_path / "empty" / line).stat().st_size for line in lines)
+
+
+@pytest.mark.slow
+def test_base_predicts_without_any_extra(wheel: Path, tmp_path: Path) -> None:
+    """Install the wheel without extras, in locked versions; predict, and write all formats that need no extra."""
+    versions = re.findall(r"^[\w.-]+==[^\s\\]+", LOCK.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    (tmp_path / "versions.txt").write_text("\n".join(versions), encoding="utf-8")
+    python, environment = published_in(tmp_path / "venv", ["-c", tmp_path / "versions.txt", wheel])
+    code = """
+import sionna_partial as sp
+from importlib.util import find_spec
+from sionna_partial.resources import EXTRAS, scenes_folder
+assert not any(map(find_spec, {package for packages in EXTRAS.values() for package in packages}))
+coverage = sp.predict_map(scenes_folder() / "apartment" / "step100", (7.0, 9.8, 1.5), spacing_m=1.0)
+for suffix in ("nc", "csv", "png", "yaml"):
+    coverage.radio.save(f"coverage.{suffix}")
+"""
+    subprocess.run([python, "-c", code], cwd=tmp_path, env=environment, check=True, timeout=600)
+    assert {path.suffix for path in tmp_path.glob("coverage.*")} == {".nc", ".csv", ".png", ".yaml", ".pgm"}

@@ -104,7 +104,7 @@ class Page:
         self.fields = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[00]"),
-                functools.partial(self._change_field, name),
+                functools.partial(lambda name, value: self._change(**{name: float(value)}), name),
                 "value_throttled",
             )
             for name, title, step, low, high in (
@@ -267,9 +267,6 @@ class Page:
         if name in self.session.transmitters:
             self.session.chosen = name
         self.show()
-
-    def _change_field(self, name: str, value: float) -> None:
-        self._change(**{name: float(value)})
 
     def _change_antenna(self, name: str, value: Any) -> None:
         antenna = self.session.transmitters[self.session.chosen].antenna

@@ -84,11 +84,14 @@ class Picture:
         known = plot.image(image="cells", source=self.ground, color_mapper=colours, **where)
         plot.x_range.renderers = plot.y_range.renderers = [known]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self.values, **where}
+        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
         self.parts = {
-            name: add_layer(plot, geometry, name, layer, _words(name), "below") for name, layer in LAYERS.items()
+            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below") for name, layer in LAYERS.items()
         }
-        for name in LEVELS:
-            self.parts[name][1].ticker = FixedTicker()
+        for name, (_, bar) in self.parts.items():
+            bar.title = bar.title or LAYERS[name].title  # one height of all bars: the map stays where it is
+            if name in LEVELS:
+                bar.ticker = FixedTicker()
         plot.image(image="cells", source=self.ground, color_mapper=walls, **where)
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
@@ -171,10 +174,6 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
     row, column = np.indices(cells.shape)
     stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
     return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
-
-
-def _words(name: str) -> list[str]:
-    return {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}.get(name, [])
 
 
 def _state_words() -> Any:

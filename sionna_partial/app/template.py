@@ -19,9 +19,9 @@ TEMPLATE = """\
   html, body { height: 100%; margin: 0 }
   body { font: 15px/1.45 system-ui, sans-serif; color: #1a1a1a; background: #f6f7f8 }
   main { display: grid; grid-template:
-    "title status status" 3.6rem "map map controls" minmax(0, 1fr) / 10rem minmax(0, 1fr) 21rem;
+    "title status status" 3.6rem "map map controls" minmax(0, 1fr) / 10.5rem minmax(0, 1fr) 21rem;
     gap: 0.6rem 0.8rem; height: 100%; max-width: 120rem; margin: auto; padding: 0.6rem; box-sizing: border-box }
-  h1 { font-size: 1.15rem; margin: 0; grid-area: title; align-self: center }
+  h1 { font-size: 1.15rem; white-space: nowrap; margin: 0; grid-area: title; align-self: center }
   h2 { font-size: 0.95rem; margin: 0 0 0.4rem }
   section { background: white; border: 1px solid #d5d9de; border-radius: 8px; padding: 0.6rem; box-sizing: border-box }
   #status { grid-area: status; overflow-y: auto; padding: 0.3rem 0.6rem }

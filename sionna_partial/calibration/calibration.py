@@ -60,8 +60,8 @@ _NUMBERS = (
 class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
     """Materials that explain measured gains, and their uncertainty.
 
-    Of a scene of one material the parameters are numbers. Of a map with M materials they are arrays (M,): that of
-    floor, ceiling and all other walls and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
+    The parameters of a scene of one material are numbers. On a map with M materials they are arrays (M,): the material
+    of floor, ceiling and all other walls, and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
 
     Parameters
     ----------

@@ -2,6 +2,7 @@
 
 import math
 import os
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -26,6 +27,7 @@ from sionna_partial.files import (
     require_plain_hdf5,
     write_netcdf,
 )
+from sionna_partial.resources import optional_packages
 from sionna_partial.tracing.links import TracedLinks
 
 Layout = Literal["sionna", "deepmimo"]
@@ -51,7 +53,7 @@ CHUNK_BYTES = 50_000_000
 """Size of the coefficients that are written together, which bounds the memory."""
 
 MAX_BYTES = 2**44
-"""Largest file that is opened [bytes]; it is read as far as it is used."""
+"""Largest file that is opened [bytes]; only the used parts are read."""
 
 
 def save_channels(
@@ -133,9 +135,17 @@ def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
     target = output_path(path)
     if target.suffix not in SUFFIXES:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(SUFFIXES)}.")
+    _require_zarr(target)
     if target.suffix == ".zarr" and os.path.lexists(target):
         raise OutputError(f"path = '{target}' is there already: remove it, or choose another name.")
     return target
+
+
+def _require_zarr(path: Path) -> None:
+    """Raise an error where a `.zarr` folder needs a package that is not installed."""
+    if path.suffix == ".zarr":
+        with optional_packages():
+            import_module("zarr")
 
 
 def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
@@ -166,6 +176,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     remedy = "give a file of save_channels."
     source = input_path(path, "path", SettingsError, remedy)
     require(source.suffix in SUFFIXES, "path", str(path), remedy)
+    _require_zarr(source)
     try:
         if source.suffix == ".zarr":
             if not source.is_dir():

@@ -18,6 +18,7 @@ from sionna_partial.cli.planning import calibrate, next_views, place
 from sionna_partial.cli.prediction import channels, demo, explore, export_scene, info, network, predict
 from sionna_partial.errors import SionnaPartialError, one_line
 from sionna_partial.process import end_at_signals, end_process
+from sionna_partial.resources import optional_packages
 
 
 class _ErrorLineGroup(TyperGroup):
@@ -26,7 +27,8 @@ class _ErrorLineGroup(TyperGroup):
     def invoke(self, ctx: Any) -> Any:
         """Run the subcommand."""
         try:
-            return super().invoke(ctx)
+            with optional_packages():
+                return super().invoke(ctx)
         except SionnaPartialError as error:
             typer.echo(f"error: {error}", err=True)
         except BrokenPipeError:

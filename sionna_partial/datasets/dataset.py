@@ -291,7 +291,7 @@ def _remote_client(scheduler: str) -> Client:
     if by_file and not Path(scheduler).is_file():
         raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
     try:
-        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/traps.md)
+        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/development.md)
             written = json.loads(read_bytes(Path(scheduler), "scheduler", BackendError, MAX_SCHEDULER_BYTES))
             parse_host_port(parse_address(written["address"])[1])
         return Client(**where, timeout=CONNECT_S, set_as_default=False)

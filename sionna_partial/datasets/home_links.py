@@ -148,8 +148,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     receiver is nearer than `NEAREST_M` to its transmitter.
 
     The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
-    Estimation"); that of the others is their trace on the complete home. Positions and robot depend on `name` and the
-    settings, and not on other homes. The table is ordered by stage, in each by transmitter.
+    Estimation"); the truth of other receivers is their trace on the complete home. Positions and robot depend on
+    `name` and the settings, and not on other homes. The table is ordered by stage, in each by transmitter.
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)

@@ -34,8 +34,7 @@ class LinkTable(Shown):
         LinkState and omnidirectional path gain [dB] on the complete map; a receiver that is not inside is in outage
         (paper, "Indoor-Outdoor Estimation").
     inside, anywhere : (N,) bool arrays
-        Whether the receiver is in a free cell of the complete map, and whether it was drawn from the whole map area
-        rather than from those.
+        True for a receiver in a free cell of the complete map, and for one that was drawn from the whole map area.
     observed_fraction : (N,) float64 array
         Fraction of the home's free area that the robot has seen.
     complete_maps : mapping of str to PartialMap

@@ -10,8 +10,8 @@ Limits of the gradients:
   power in a step, which no derivative includes. Link states of the partial trace, the link states that the map leaves
   possible, and whether the ends are in observed cells, are taken from the trace, too.
 - The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
-  the length is that of the trace times s(tx) / s(tx at the trace), and s is `SmoothLengths`: so are the lengths of all
-  paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
+  the length is the traced length times s(tx) / s(tx at the trace), and s is `SmoothLengths`. The same holds for the
+  lengths of all paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
 - The outputs of the map networks are evaluated around the transmitter and 15 cm to each side, and are linear between.
   Their derivative jumps where a receiver passes the centre of one of their cells.
 - Where the map is complete the distribution is the trace itself: its probabilities are constant, and its gain is that
@@ -89,8 +89,8 @@ class LinkDistribution(LinkPrediction):
     def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
         """Return the probability (N,) that the gain exceeds a threshold above -150 dB [dB].
 
-        Where nothing is uncertain the probability is a step, which has no slope; `softness_db`, the standard deviation
-        of a further Gaussian spread of the gain [dB], makes it one.
+        Without uncertainty the probability is a step, which has no slope; `softness_db`, the standard deviation of a
+        further Gaussian spread of the gain [dB], gives it one.
         """
         covered = tf.zeros_like(self.p_los)
         for probability, mean_db, std_db in (

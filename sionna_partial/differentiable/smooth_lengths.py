@@ -21,7 +21,7 @@ class SmoothLengths:
     the corner of a cell. Here the mask of the cells, 1 in cells of the kind and 0 in others, is interpolated bilinearly
     between the centres of cells before it is integrated along the segment. Edges become ramps that are one cell wide.
 
-    Where a segment crosses a straight edge along the axes from side to side, the length is the same. It differs by a
+    For a segment that crosses a straight edge along the axes from side to side, the length is the same. It differs by a
     fraction of a cell where a segment passes a corner or ends within a cell of an edge, and by up to half of the length
     on which it runs along an edge. The first derivatives are continuous, and exact to rounding, except for segments
     that run along a line through the centres of cells, or are upright above one: there they are the mean of both sides.

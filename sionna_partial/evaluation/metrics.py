@@ -140,7 +140,7 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
     """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
 
     The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
-    that of an outage has, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
+    in an outage, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
     prediction returns the levels themselves.
     """
     if len(link_state) == 0:
@@ -167,7 +167,7 @@ def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Fl
 
 
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
-    """Of the link state, and of link state and gain."""
+    """Return the loss of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)

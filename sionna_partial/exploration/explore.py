@@ -77,7 +77,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     def maps(self) -> list[PartialMap]:
         """Map of the robot after each of `steps`.
 
-        `interior_cells` is the number of free cells of the home. A mesh is cut to what is known, each time anew.
+        `interior_cells` is the number of free cells of the home. A mesh is cut to the known cells, each time anew.
         """
         free = int((self.home.state == _FREE).sum())
         return [cut_to_known(replace(self.home, state=state, interior_cells=free)) for state in self.states]
@@ -142,8 +142,8 @@ def explore(
     -------
     list of PartialMap
         One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Cells
-        that are known in one map are known in the next; without errors they are equal. A mesh is cut to what is
-        known.
+        that are known in one map are known in the next; without errors they are equal. A mesh is cut to
+        the known cells.
 
     Raises
     ------

@@ -278,11 +278,12 @@ class LiveCoverage:
         self._closed = False
         self._newest: _Grid | None = None
         self._waiting: _Grid | None = None
-        self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
+        self._answered, self._moved, self._gave_way, self._stepped_s = 0, False, False, -math.inf
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
         self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
         self._new_powers, self._views_wanted, self._views_s = False, False, -math.inf
+        self._published: dict[str, LiveGrid] = {}
         self._lines_s: dict[str, float] = {}
 
     @_refusing
@@ -333,6 +334,18 @@ class LiveCoverage:
                     del kept[oldest]
                 self._new_powers = True
 
+    @_refusing
+    def on_transmitter(self, name: str, position_m: ArrayLike | None) -> None:
+        """Add a transmitter, or move it, or remove it with None; its measured powers are forgotten."""
+        if position_m is None and name not in self.tx_m:
+            raise PositionError(f"{shown(name)} is not known: the transmitters are {', '.join(self.tx_m)}.")
+        added = {} if position_m is None else _named_positions({name: position_m})
+        with self._changed:
+            self.tx_m = {known: at_m for known, at_m in self.tx_m.items() if known != name} | added
+            self._powers = {known: self._powers.get(known, {}) if known != name else {} for known in self.tx_m}
+            self._waiting, self._moved = self._newest, True
+            self._changed.notify_all()
+
     def request_views(self) -> None:
         """Ask for the best next views, once."""
         with self._changed:
@@ -365,7 +378,8 @@ class LiveCoverage:
             if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
                 grid = self._newest
             self._waiting, every_s = None, self.settings.views_every_s
-            views = self._newest is not None and (self._views_wanted or 0.0 < every_s <= now_s - self._views_s)
+            wanted = self._views_wanted or 0.0 < every_s <= now_s - self._views_s
+            views = wanted and self._newest is not None and bool(self.tx_m)
         if grid is not None:
             self._new_powers = False
             self._guarded("map", self._compute, grid)
@@ -416,13 +430,22 @@ class LiveCoverage:
         if self._model is None:
             self._model = LinkModel(grid.partial, **self._model_settings)
         self._model.update(grid.partial)
-        if grid.number != self._answered:
+        if grid.number != self._answered or self._moved:
+            self._moved = False
+            self._clear_removed()
             self._each(grid, is_final=False)
         self._answered, may_give_way, self._gave_way = grid.number, not self._gave_way, False
         try:  # once a newer map comes first, and then not, so that there is a fine answer now and then
             self._each(grid, is_final=True, report=self._give_way if may_give_way else no_progress)
         except _NewerMap:
             self._gave_way = True
+
+    def _clear_removed(self) -> None:
+        """Publish a last grid, in which nothing is known, of each transmitter that was removed."""
+        for name in self._published.keys() - self.tx_m.keys():
+            last = self._published.pop(name)
+            nothing = np.full_like(last.cost, -1)
+            self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
 
     def _give_way(self, fraction: float, message: str) -> None:
         """End a final answer as soon as a newer map waits."""
@@ -440,22 +463,25 @@ class LiveCoverage:
             tx_m,
             spacing_m=spacing_m,
             rx_height_m=self.settings.rx_height_m,
-            measurements=self._measured(name),
+            measurements=self._measured(name, tx_m),
             progress=report,
         )
         cost, unknown = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
         age_s = time.monotonic() - grid.came_s
-        self._publish(LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s))
+        answer = LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s)
+        if self.tx_m.get(name) is tx_m:  # it was not moved meanwhile
+            self._published[name] = answer
+            self._publish(answer)
 
-    def _measured(self, name: str) -> Measurements | None:
+    def _measured(self, name: str, tx_m: Floats) -> Measurements | None:
         """Return the powers that were measured of a transmitter and can be used on the map of now."""
         with self._changed:
-            rows = np.array([*self._powers[name].values()]).reshape(-1, 3)
+            rows = np.array([*self._powers.get(name, {}).values()]).reshape(-1, 3)
         if not len(rows):
             return None
         assert self._model is not None
         rx_m = np.column_stack([rows[:, :2], np.full(len(rows), self.settings.rx_height_m)])
-        partial, tx_m = self._model.partial, self.tx_m[name]
+        partial = self._model.partial
         usable = partial.radios_can_stand(rx_m)
         frequency_hz = self._model.simulation.trace_settings.frequency_hz
         usable[usable] = can_be_used(partial, tx_m[None], rx_m[usable], frequency_hz)

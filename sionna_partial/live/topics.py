@@ -24,6 +24,7 @@ from sionna_partial.checks import Checked, require, require_whole, shown
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
 from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
+from sionna_partial.resources import optional_packages
 
 MOST_FRAMES = 1000
 """Number of frames outside the robot's chain that are kept, the newest ones of `/tf` and of `/tf_static`."""
@@ -82,8 +83,13 @@ class Topics(Checked):
         """Return the message type of each topic that is listened to."""
         types = {self.map: GRID_TYPE, f"{self.map}_updates": UPDATE_TYPE, "/tf": TF_TYPE, "/tf_static": TF_TYPE}
         types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32")
-        types |= {self.key_values: "diagnostic_msgs/msg/KeyValue"} if self.key_values else {}
+        types |= dict.fromkeys(filter(None, (self.key_values, self.transmitters)), "diagnostic_msgs/msg/KeyValue")
         return types | {f"{self.prefix}/request_views": "std_msgs/msg/Empty"}
+
+    @property
+    def transmitters(self) -> str:
+        """Topic of `diagnostic_msgs/KeyValue` with the name and the position of a transmitter: see `Listener`."""
+        return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
         """Return the message type of each topic that is published for transmitters of these names."""
@@ -91,13 +97,13 @@ class Topics(Checked):
         grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
         return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
 
-    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, dict[str, Any]]:
-        """Return the messages of an answer by topic."""
+    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Return the messages of an answer by topic, each with its type."""
         if isinstance(answer, LiveViews):
-            return {f"{self.prefix}/next_views": answer.message()}
+            return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
         topic = f"{self.prefix}/{answer.name}"
-        unknown = {f"{topic}/unknown": answer.message(unknown=True)} if self.unknown else {}
-        return {topic: answer.message()} | unknown
+        unknown = {f"{topic}/unknown": (GRID_TYPE, answer.message(unknown=True))} if self.unknown else {}
+        return {topic: (GRID_TYPE, answer.message())} | unknown
 
 
 class _Transform(NamedTuple):
@@ -109,7 +115,10 @@ class _Transform(NamedTuple):
 
 
 class Listener:
-    """Hands the messages of topics to a `LiveCoverage`, whatever they hold."""
+    """Hands the messages of topics to a `LiveCoverage`, whatever they hold.
+
+    The value of a transmitter is its position, "x y" or "x y z" [m]; an empty value removes it.
+    """
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
         self.live, self.topics = live, topics
@@ -133,6 +142,8 @@ class Listener:
                 live.on_power(message.data, now_s, topics.powers[topic])
             elif topic == topics.key_values:
                 live.on_power(float(message.value), now_s, message.key)
+            elif topic == topics.transmitters:
+                live.on_transmitter(message.key, [*map(float, message.value.split())] or None)
             else:
                 live.request_views()
         except Exception as error:  # messages may hold anything
@@ -215,11 +226,9 @@ class Dds:
 
     def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
         number = _domain(domain)
-        try:
+        with optional_packages(SettingsError):
             from cyclonedds.core import DDSException
             from cyclonedds.domain import Domain, DomainParticipant
-        except ImportError as error:
-            raise SettingsError("DDS needs cyclonedds: pip install '.[live]' in the repository.") from error
         try:
             config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
             self._domain: Any = Domain(number, config)
@@ -233,16 +242,17 @@ class Dds:
             for topic, kind in topics.types().items()
             for latched in ((True, False) if topic in (topics.map, "/tf_static") else (False,))
         ]
-        self._writers = {topic: (kind, self._writer(topic, kind)) for topic, kind in topics.published(names).items()}
+        self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer, reliably; who joins later gets the last one."""
-        for topic, message in self.topics.messages(answer).items():
-            kind, writer = self._writers[topic]
-            writer.write(filled(kind, message))
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._writers:
+                self._writers[topic] = self._writer(topic, kind)
+            self._writers[topic].write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage`, for ever."""
+        """Hand messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.poll(listener)
@@ -379,10 +389,8 @@ class Rosbridge:
     """
 
     def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
-        try:
+        with optional_packages(SettingsError):
             from websockets.uri import parse_uri
-        except ImportError as error:
-            raise SettingsError("rosbridge needs websockets: pip install '.[live]' in the repository.") from error
         try:
             good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
         except ValueError:  # a port that is none
@@ -390,18 +398,21 @@ class Rosbridge:
         if not good:
             raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
         self.url = self.source = url
-        self.topics, self._names = topics, names
+        self.topics, self._published = topics, topics.published(names)
         self._socket: Any = None
         self._last: dict[str, str] = {}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
         """Publish an answer; a server that starts again gets the last ones."""
-        for topic, message in self.topics.messages(answer).items():
+        for topic, (kind, message) in self.topics.messages(answer).items():
+            if topic not in self._published:
+                self._published[topic] = kind
+                self._advertise(topic)
             self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": message})
             self._send(self._last[topic])
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage`, for ever."""
+        """Hand messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.connect(listener)
@@ -426,14 +437,18 @@ class Rosbridge:
         listener.live.report(f"{self.url}: {reason}; it is tried again every {RETRY_S:g} s.")
 
     def _greet(self) -> None:
-        for topic, kind in self.topics.published(self._names).items():
-            self._send(json.dumps({"op": "advertise", "topic": topic, "type": _old(kind), "latch": True}))
+        for topic in [*self._published]:
+            self._advertise(topic)
         for topic, kind in self.topics.types().items():
             depth = 1 if topic == self.topics.map else 0
             request = {"op": "subscribe", "topic": topic, "type": _old(kind), "queue_length": depth}
             self._send(json.dumps(request))
         for text in [*self._last.values()]:
             self._send(text)
+
+    def _advertise(self, topic: str) -> None:
+        kind = _old(self._published[topic])
+        self._send(json.dumps({"op": "advertise", "topic": topic, "type": kind, "latch": True}))
 
     def _send(self, text: str) -> None:
         from websockets.exceptions import WebSocketException

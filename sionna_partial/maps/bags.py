@@ -21,6 +21,7 @@ from sionna_partial.files import decoding, input_path, open_regular
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array
 from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, turn_grid
+from sionna_partial.resources import optional_packages
 
 MAX_BAG_BYTES = 10**12
 """Largest file of a recording [bytes]; only the messages that are asked for are read."""
@@ -139,9 +140,9 @@ def _require_plain_mcap(stream: IO[bytes]) -> None:
 @contextmanager
 def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
     """Open a rosbag; whatever its reader raises while it is open becomes an `error`."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
+    with optional_packages(error):
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
     source = input_path(path, "path", error, f"give a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder).")
     files = [*source.iterdir()] if os.path.isdir(source) else [source]
     for file in files:

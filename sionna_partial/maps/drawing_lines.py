@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.errors import MapError
 from sionna_partial.maps.import_report import MapWarning, rooms_of
-from sionna_partial.maps.mesh.cells import mark_cells
+from sionna_partial.maps.mesh.cells import crossed_cells
 
 MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 2_000_000, 16
 """Most pieces of lines, most blocks and entities in them, and most blocks within blocks."""
@@ -28,7 +28,7 @@ LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPL
 """Types of entities that are read."""
 
 XREF = "external reference"
-"""Type of the elements that stand for a block in another file."""
+"""Type of elements that refer to a block in another file."""
 
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
@@ -377,12 +377,9 @@ def _described(lengths: dict[str, float], unit_m: float) -> str:
 def _raster(segments: Floats) -> tuple[Bools, float]:
     """Return the cells without lines (ny, nx), with a margin, and their size; the longer side of the plan is 1."""
     cell, margin = 1.0 / RASTER_CELLS, RASTER_CELLS // 10
-    corners = np.zeros((len(segments), 5, 2))
-    corners[:, :2] = segments / cell + margin
-    nx, ny = (int(size) for size in np.ceil(corners[:, :2].max(axis=(0, 1))) + margin)
-    cells = np.zeros((ny, nx), dtype=np.bool_)
-    mark_cells(corners, np.full(len(segments), 2), cells, 1e-6, True)
-    return ~cells, cell
+    lines = segments / cell + margin
+    nx, ny = (int(size) for size in np.ceil(lines.max(axis=(0, 1))) + margin)
+    return ~crossed_cells(lines, (ny, nx), 1e-6), cell
 
 
 def _longest(segments: Floats) -> tuple[Floats, Floats, Floats, Floats]:

@@ -32,7 +32,7 @@ from sionna_partial.maps.drawing_lines import (
     wall_thickness,
 )
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
-from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, mark_cells
+from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, crossed_cells, fitted_grid, require_unit
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
@@ -63,8 +63,8 @@ def map_from_drawing(
     """Make a map of a DXF floor plan.
 
     Lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space are walls, also those
-    in blocks. So is what they enclose if it is nowhere wider than 0.5 m: walls that are drawn by both faces are solid.
-    What else they enclose is free, doors included; openings of up to 2 m in the outer walls are closed for that, not
+    in blocks. So are areas within that are nowhere wider than 0.5 m: walls that are drawn by both faces are solid.
+    Other areas within are free, doors included; openings of up to 2 m in the outer walls are closed for that, not
     on the map. All other cells are unknown.
 
     Parameters
@@ -112,7 +112,8 @@ def map_from_drawing(
     [0, 1, 2]
     """
     source = input_path(path, "path", MapError, f"give a drawing ({', '.join(DRAWING_SUFFIXES)}).")
-    unit = _given_unit(unit_m)
+    require_unit(unit_m)
+    unit = None if unit_m is None else number_of(unit_m)
     names = _given_layers(wall_layers)
     content = read_bytes(source, "path", MapError, MAX_DRAWING_BYTES, "purge it, or delete what is no wall.")
     with decoding(source, "no DXF", MapError):
@@ -337,19 +338,10 @@ def _owners(
     lines = (segments - partial.origin_m) / partial.resolution_m
     drawn = np.zeros(partial.shape, dtype=np.uint8)
     for number, layers in enumerate([set(on_layer.tolist()), *groups]):
-        chosen, cells = np.isin(on_layer, sorted(layers)), np.zeros(partial.shape, dtype=np.bool_)
-        corners = np.zeros((int(chosen.sum()), 5, 2))
-        corners[:, :2] = lines[chosen]
-        mark_cells(corners, np.full(len(corners), 2), cells, BORDER_M / partial.resolution_m, True)
-        drawn[cells] = number + 1
+        chosen = np.isin(on_layer, sorted(layers))
+        drawn[crossed_cells(lines[chosen], partial.shape, BORDER_M / partial.resolution_m)] = number + 1
     nearest = ndimage.distance_transform_edt(drawn == 0, return_distances=False, return_indices=True)
     return np.asarray(drawn[tuple(nearest)] - 1)
-
-
-def _given_unit(unit_m: float | None) -> float | None:
-    if unit_m is not None and not 1e-6 <= number_of(unit_m) <= 1e6:
-        raise MapError(f"unit_m = {shown(unit_m)} is not allowed: give the length of a unit in metres, such as 0.001.")
-    return None if unit_m is None else number_of(unit_m)
 
 
 def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
@@ -362,11 +354,8 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
 def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
     """Return the cell states (ny, nx): walls with the cells of `solid`, the area within, and unknown cells."""
     cell_m = empty.resolution_m
-    corners = np.zeros((len(segments), 5, 2))
-    corners[:, :2] = (segments - empty.origin_m) / cell_m
+    cells = crossed_cells((segments - empty.origin_m) / cell_m, empty.shape, BORDER_M / cell_m)
     margin = math.ceil(OPENING_M / cell_m)
-    cells = np.zeros(empty.shape, dtype=np.bool_)
-    mark_cells(corners, np.full(len(segments), 2), cells, BORDER_M / cell_m, True)
     wall = np.pad(cells if solid is None else cells | solid, margin)
     # A disc of half the opening's width that rolls along the outer walls does not enter the building.
     radius = OPENING_M / 2 / cell_m

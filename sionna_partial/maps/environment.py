@@ -299,7 +299,7 @@ class FloorPlan:
         return 0.0, self.wall_height_m
 
     def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials that it may need, also of floor and ceiling; `default` stands for unnamed ones."""
+        """Return the materials that it may need, also of floor and ceiling; `default` for unnamed ones."""
         return {default, *self.wall_materials}
 
     def scene_materials(self, default: Material) -> dict[str, Material]:

@@ -23,6 +23,7 @@ from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.process import core_count
+from sionna_partial.resources import optional_packages
 from sionna_partial.settings import Material
 
 MAX_IFC_BYTES = 500_000_000
@@ -99,12 +100,10 @@ def map_from_ifc(
     the bodies of its parts. The enclosed area is free, as on a drawing. Doors are open, unless `layer_materials` has a
     material for "IfcDoor".
     """
-    try:
+    with optional_packages(MapError):
         import ifcopenshell
         import ifcopenshell.geom
         from ifcopenshell.util.unit import calculate_unit_scale
-    except ImportError as error:
-        raise MapError(f"path = '{path}' needs ifcopenshell: pip install '.[ifc]' in the repository.") from error
     content = read_bytes(path, "path", MapError, MAX_IFC_BYTES, "export the storey alone.")
     if not content.lstrip().startswith(b"ISO-10303-21;") or b"END-ISO-10303-21;" not in content[-1000:]:
         raise MapError(f"path = '{path}' is damaged or no IFC (it is no whole STEP file): export it again as .ifc.")

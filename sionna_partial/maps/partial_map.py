@@ -74,8 +74,8 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     mesh : SceneMesh or None
         Observed part of the building, instead of walls extruded from the cells. Its z is the z of the world.
     material : Material or None
-        Material of its walls, floor and ceiling, or of those parts of its mesh that name none; None is that of
-        SceneSettings.
+        Material of its walls, floor and ceiling, or of the parts of its mesh that name none; None is the
+        material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
         Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Kept read-only, and 0 where there
         is no wall. A mesh has its own. See `with_wall_material`.

@@ -186,7 +186,7 @@ def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, 
 
 
 def _boustrophedon(points_m: Floats) -> Indices:
-    """Order points (N, 3) along stripes of four rows, to and fro."""
+    """Order points (N, 3) along stripes of four rows, in alternating directions."""
     x, y = points_m[:, 0], points_m[:, 1]
     rows = np.unique(np.round(y, 6), return_inverse=True)[1]
     stripe = rows // 4
@@ -311,7 +311,7 @@ def place_transmitter(
 
     Positions all over the free cells are compared by visibility, without tracing. The best of them that see different
     receivers are traced and predicted, as `predict_map` does. Around the best of these, neighbours at 0.6 and 0.25 m
-    are tried; what they find is compared at all receivers. Larger maps get more of all that.
+    are tried; the results are compared at all receivers. Larger maps get more positions and steps.
 
     A transmitter stands in a free cell, at least 10 cm from known walls. Receivers are 0.5 m apart wherever
     `predict_map` has some; one in a free cell has weight 1, one in an unknown cell its probability of being indoors,

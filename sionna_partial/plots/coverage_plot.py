@@ -244,14 +244,11 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
-        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=_beyond(layer))
+        extend = "neither" if layer.label == "probability" else "max"
+        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=extend)
         bar.set_label(layer.label.replace("; ", ";\n"))
     elif layer.norm is None:
         _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
-
-
-def _beyond(layer: Layer) -> str:
-    return "neither" if layer.label == "probability" else "max"
 
 
 def _draw_triangle(key: Axes) -> None:

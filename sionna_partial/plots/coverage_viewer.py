@@ -24,6 +24,7 @@ from sionna_partial.plots.coverage_plot import (
     wall_cells,
 )
 from sionna_partial.plots.style import server_colours
+from sionna_partial.resources import optional_packages
 
 THRESHOLD_DB = -100.0
 """Threshold of P(gain > threshold) before the slider is moved [dB]."""
@@ -97,9 +98,9 @@ standard deviation of the path gain, an outage counts &minus;150 dB. {several} P
 
 def coverage_page(coverage: xr.Dataset) -> bytes:
     """Return the HTML page of a coverage map, which needs no other file. Equal maps give equal pages."""
-    from bokeh.embed import json_item
-    from bokeh.resources import Resources
-
+    with optional_packages():
+        from bokeh.embed import json_item
+        from bokeh.resources import Resources
     maps = transmitters_of(coverage)
     item = json.dumps(json_item(_viewer(maps))).replace("<", "\\u003c")
     numbers: dict[str, str] = {}

@@ -96,7 +96,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 
     `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres. From 0.5 on,
     the staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
-    noise made thick and rough, and again twice as much where a face turns to and fro at least once in 10 cells.
+    noise made thick and rough, and again twice as much where a face turns back and forth at least once in 10 cells.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))

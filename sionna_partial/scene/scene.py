@@ -441,7 +441,7 @@ def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.
 
 
 def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
-    """Triangles of an area with corners on whole numbers, in ever narrower strips where GEOS fails (docs/traps.md)."""
+    """Return triangles of an area with integer corners, cut into strips where GEOS fails (docs/development.md)."""
     strips, count = area, 1
     while True:
         try:

@@ -2,7 +2,8 @@
 
 A plan is drawn as polygons in metres: an outline, rooms, openings along a spanning tree of the rooms (so that every
 room can be reached) and a few more, and furniture that leaves room to walk. Then it is turned and put onto cells, where
-walls and furniture swell a little, as on maps of robots and scanners. `docs/homes.md` compares them with real homes.
+walls and furniture swell a little, as on maps of robots and scanners.
+`docs/researchers.md` compares them with real homes.
 """
 
 import math
@@ -12,8 +13,6 @@ from itertools import pairwise
 
 import numpy as np
 import shapely
-from rasterio.features import rasterize
-from rasterio.transform import Affine
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import minimum_spanning_tree
@@ -24,6 +23,7 @@ from sionna_partial.arrays import Bools, Floats, States, largest_part
 from sionna_partial.checks import is_whole, require, require_bool, require_choice, require_number
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.resources import optional_packages
 from sionna_partial.settings import HomeKind
 from sionna_partial.worlds.buildings import (
     GRID_M,
@@ -45,7 +45,7 @@ RESOLUTION_M = 0.05
 LARGE_RESOLUTION_M = 0.1
 """Edge of a cell of the large kinds (floor, hall, warehouse) where none is given [m].
 
-That of the real floors in `docs/homes.md`; a building of 100 x 60 m has four times as many cells of 0.05 m."""
+The real floors of `docs/results.md` have it; a building of 100 x 60 m has four times as many cells of 0.05 m."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""
@@ -140,7 +140,7 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
     locked_rooms : bool
-        Whether the home may have free rooms that cannot be reached, behind closed doors too; the rest of it does not
+        True if the home may have free rooms that cannot be reached, also behind closed doors; the other rooms do not
         depend on it.
 
     Returns
@@ -387,6 +387,9 @@ def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineSt
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> States:
     """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
+    with optional_packages():
+        from rasterio.features import rasterize
+        from rasterio.transform import Affine
     x0, y0, x1, y1 = shapely.total_bounds([plan.free, plan.shut])
     margin = _MARGIN_M + wall_cells * resolution_m
     x, y = x0 - margin, y0 - margin

@@ -1,6 +1,6 @@
 """Attack the package: run hostile inputs in processes with limits, and count how they end.
 
-    python tests/hostile/attack.py --minutes 60 --table docs/hostile.md
+    python tests/hostile/attack.py --minutes 60 --table build/hostile.md
 
 A case may end in two ways: the call works, or it is refused with a `SionnaPartialError` (on the command line, exit code
 2 and one line that begins with "error: "). Everything else is a defect: a wrong result that the case itself detects,
@@ -154,26 +154,6 @@ def table(outcomes: Sequence[Outcome]) -> str:
     return "\n".join([f"| inputs | cases | {' | '.join(ENDINGS)} |", "|---" * (len(ENDINGS) + 2) + "|", *rows])
 
 
-PAGE = """# Hostile inputs
-
-[README](../README.md) · [Security](../SECURITY.md) · [Development](development.md)
-
-`make hostile` makes inputs by rules (`tests/hostile/`) and runs each of them in a process with limits: {seconds:.0f} s
-of processor time, and {gigabytes:g} GB of memory beyond what the process had before. "works" and "refused" (one line
-that names the field, the value and the remedy) are right; everything else is a defect. This table is of {minutes:.0f}
-minutes with one worker, at commit {commit}.
-
-{table}
-"""
-
-
-def page(table: str, minutes: float) -> str:
-    """Return the page of the documentation that holds the table."""
-    words = ["git", "-C", str(Path(__file__).parent), "rev-parse", "--short=10", "HEAD"]
-    commit = subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip() or "unknown"
-    return PAGE.format(seconds=SECONDS, gigabytes=GIGABYTES, minutes=minutes, commit=commit, table=table)
-
-
 def main() -> None:
     """Run the fixed cases once, in a random order, and then random ones, until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -200,7 +180,7 @@ def main() -> None:
     text = table(outcomes)
     print(text)
     if given.table:
-        given.table.write_text(page(text, (time.monotonic() - began) / 60.0), encoding="utf-8")
+        given.table.write_text(f"{(time.monotonic() - began) / 60.0:.0f} minutes\n\n{text}\n", encoding="utf-8")
     sys.exit(any(outcome.is_defect for outcome in outcomes))
 
 

@@ -61,9 +61,7 @@ class MeshReading:
     def __post_init__(self) -> None:
         if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
             raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
-        if self.unit_m is not None and not 1e-6 <= number_of(self.unit_m) <= 1e6:
-            remedy = "give the length of a unit in metres, such as 0.3048 for feet."
-            raise MapError(f"unit_m = {shown(self.unit_m)} is not allowed: {remedy}")
+        require_unit(self.unit_m)
 
     def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
         """Return the notes of a file that is read."""
@@ -72,6 +70,13 @@ class MeshReading:
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
         """Return a map with its report; its extent is checked where all of the file is observed."""
         return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.")
+
+
+def require_unit(unit_m: object) -> None:
+    """Raise a MapError unless a length of a unit [m] is None or a plausible number."""
+    if unit_m is not None and not 1e-6 <= number_of(unit_m) <= 1e6:
+        remedy = "give the length of a unit in metres, such as 0.3048 for feet or 0.001 for millimetres."
+        raise MapError(f"unit_m = {shown(unit_m)} is not allowed: {remedy}")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
@@ -234,6 +239,14 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
     flat = (polygons[..., :2] - empty.origin_m) / empty.resolution_m
     cells = np.zeros(empty.shape, dtype=np.bool_)
     mark_cells(flat, sizes, cells, BORDER_M / empty.resolution_m, upper)
+    return cells
+
+
+def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools:
+    """Return the cells (ny, nx) that lines (N, 2, 2) [cells] cross by more than a margin."""
+    corners, cells = np.zeros((len(lines), 5, 2)), np.zeros(shape, dtype=np.bool_)
+    corners[:, :2] = lines
+    mark_cells(corners, np.full(len(lines), 2), cells, margin, True)
     return cells
 
 

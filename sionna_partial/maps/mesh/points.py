@@ -394,7 +394,7 @@ def _occupied_voxels(
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge sorted keys with the counts of each."""
+    """Merge sorted keys with their counts."""
     keys, inverse = np.unique(np.concatenate([keys for keys, _ in pending]), return_inverse=True)
     return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
 
