@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bokeh.document import Document
 from browser import CHROMIUM, Tab, chromium
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -27,6 +28,9 @@ from websockets.typing import Origin
 
 import sionna_partial as sp
 from sionna_partial.app import session as app_session
+from sionna_partial.app.jobs import Status
+from sionna_partial.app.page import Page
+from sionna_partial.app.picture import Picture
 from sionna_partial.app.radio import PRESETS, RadioSettings, Transmitter
 from sionna_partial.app.session import FILES, Session
 from sionna_partial.app.uploads import stored_map
@@ -268,9 +272,37 @@ class TestPresets:
         session.change("tx2", eirp_dbm=10.0)
         assert session.preset == ""
 
+    def test_scales_follow_the_threshold_and_servers_have_names(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.change("tx2", new_name="hall")
+        window.settle()
+        picture = Picture()
+        picture.show_answer(window.session.answer, "", -67.0, truth=False)
+        power, server = (picture.parts[name][1] for name in ("power_mean_dbm", "best_server"))
+        assert power.ticker.ticks == [-97.0, -87.0, -77.0, -67.0, -57.0, -47.0, -37.0, -27.0]
+        assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
+        assert server.major_label_overrides == {0: "tx1", 1: "hall"}
+        assert (len(server.color_mapper.palette), server.color_mapper.high) == (2, 1.5)
+
     @pytest.mark.parametrize("name", PRESETS)
     def test_each_is_a_setting_and_names_itself(self, name: str) -> None:
         assert RadioSettings(**PRESETS[name]._asdict()).preset == name
+
+    def test_the_page_shows_the_material_that_was_found(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        answer = window.session.answer
+        assert answer is not None
+        page = Page(Document(), "/files/key")
+        page.session.open_map(PARTIAL, "room.yaml")
+        page.session.set(material="brick", threshold_dbm=-67.0)
+        page.session.answer = replace(answer, coverage=answer.coverage.assign_attrs(wall_material="brick .69"))
+        page.session.status = Status("Ready.")
+        page.show()
+        assert "Ready. Walls: brick .69." in page.message.text
+        assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
+        assert page.links.text.count("<a ") == len(FILES)
+        page.session.close()
 
     def test_materials(self) -> None:
         assert RadioSettings().scene_settings == sp.SceneSettings()

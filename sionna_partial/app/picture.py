@@ -26,7 +26,7 @@ _STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
 
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
-    ("likeliest state", "@link_state{custom}"),
+    ("most probable state", "@link_state{custom}"),
     ("LOS, NLOS, outage", "@p_los{0.00}, @p_nlos{0.00}, @p_outage{0.00}"),
     ("path gain", "@gain_mean_db{0.0} ± @gain_std_db{0.0} dB"),
     ("received power", "@power_mean_dbm{0.0} dBm"),

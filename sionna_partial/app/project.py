@@ -53,14 +53,17 @@ def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
     Raises
     ------
     SionnaPartialError
-        If it is damaged, or has values that are not allowed.
+        If it was not saved by the app, or has values that are not allowed.
     """
     if len(files) != 1 or PurePath(files[0][0]).suffix.lower() != ".zip":
         return None
-    with decoding(Path("project.zip"), "was not saved by the app", MapError, "save it again."):
+    try:
         contents = unzipped(files[0][1], MOST_BYTES)
-        if _TEXT not in contents:
-            return None
+    except ValueError:  # `uploaded_map` raises an error with the reason
+        return None
+    if _TEXT not in contents:
+        return None
+    with decoding(Path("project.zip"), "was not saved by the app", MapError, "save it again."):
         require(len(contents[_TEXT]) <= _MOST_TEXT, _TEXT, len(contents[_TEXT]), f"give up to {_MOST_TEXT:,} bytes.")
         record = json.loads(contents[_TEXT])
         require(record["version"] == _VERSION, "version", record["version"], f"this version reads {_VERSION}.")
