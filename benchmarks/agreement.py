@@ -11,7 +11,7 @@ from stock import Paths, is_bent
 import sionna_partial as sp
 from sionna_partial.scene.scene import SceneGeometry, build_scene
 from sionna_partial.tracing.interactions import DIFFRACTION
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
+from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, find_wedges
 
 SAME_DELAY_S = 1e-11
 """Paths to one receiver whose delays differ by less are the same [s]: 3 mm."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
+from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS
 from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]

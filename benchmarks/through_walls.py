@@ -11,9 +11,9 @@ import argparse
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
@@ -24,7 +24,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.plan import crossings
+from sionna_partial.tracing.select import Limits
 from sionna_partial.tracing.simulation import resolved_settings
 from sionna_partial.tracing.stock import stock_paths
 
@@ -209,15 +209,20 @@ def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace)
 
 def left_out(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
     """Print what links of 200 receivers lack of their gain with the limits of weak paths, against much lower ones."""
+    usual = Limits.of
     print("\n| map | case | paths | paths with low limits | missing [dB]: 50, 90, 99 %, most |")
     print("|---|---|---|---|---|")
     for name, partial in maps.items():
         tx_m, rx_m = ends(partial, 200, arguments.seed)
         for material, frequency_hz in (*CASES.items(), ("drywall", 2.4e9)):
             links = []
-            for limits, tolerance_db in (({}, 0.1), ({"_WEAKEST": 1e-5, "RARER": 1.0}, 0.01)):
+            for changes, tolerance_db in (({}, 0.1), ({"weakest": 1e-5, "discount": 1.0}, 0.01)):
                 settings = sp.TraceSettings(frequency_hz, refraction=True, power_tolerance_db=tolerance_db)
-                with patch.multiple(crossings, **limits) if limits else nullcontext():
+
+                def limits(*given: Any, changes: dict[str, float] = changes, **options: bool) -> Limits:
+                    return usual(*given, **options)._replace(**changes)
+
+                with patch.object(Limits, "of", limits):
                     simulation = sp.Simulation(partial, settings, sp.SceneSettings(material=material))
                     links.append(simulation.links(tx_m, rx_m))
             missing_db = np.percentile(links[1].gain_db - links[0].gain_db, [50, 90, 99, 100])

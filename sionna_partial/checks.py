@@ -92,6 +92,11 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
     require(isinstance(value, str) and value in words, name, value, f"choose one of {', '.join(words)}.")
 
 
+def transmitter_names(count: int) -> list[str]:
+    """Return the names of several transmitters that were given without: "tx1", "tx2" and so on."""
+    return [f"tx{number}" for number in range(1, count + 1)]
+
+
 def plain(value: Any) -> Any:
     """Return a scalar of NumPy as a number of Python, times as texts, and anything else as it is."""
     if getattr(getattr(value, "dtype", None), "kind", "") in tuple("mM"):

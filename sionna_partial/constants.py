@@ -17,6 +17,9 @@ NO_RECEIVER = 255
 DEFAULT_HEIGHT_M = 1.5
 """Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
 
+COARSER = 4
+"""Receiver spacing of a first, quick coverage map, as a multiple of the spacing of the final one."""
+
 MEMORY_GB = 2.0
 """Memory that a job may take where no other limit is given [GB]."""
 
@@ -52,6 +55,13 @@ IFC_SUFFIXES = (".ifc",)
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
 """File formats of rosbags; one of ROS 2 may also be a folder with a metadata.yaml."""
+
+
+VACUUM_SUFFIXES = (".json", ".vwm")
+"""File formats of maps of vacuum robots: Valetudo, and recordings of Valeronoi."""
+
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
+"""File formats of floor plans as pictures."""
 
 
 class LinkState(IntEnum):

@@ -21,6 +21,9 @@ THUMBNAIL_PX = 640
 
 _FEW = 4
 
+WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
+"""Time until a bar of a call appears, of a command, and between two lines of a command without a terminal [s]."""
+
 
 def later(name: str) -> Any:
     """Return a function of a later room, as "plots.style:plot_map", whose module is imported by no result."""
@@ -74,10 +77,6 @@ class Pictured(Shown):
 
     def _repr_html_(self) -> str:
         return picture_html(repr(self), self._plot, self)
-
-
-WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
-"""Time until a bar of a call appears, of a command, and between two lines of a command without a terminal [s]."""
 
 
 @contextmanager

@@ -39,6 +39,10 @@ class SettingsError(SionnaPartialError, ValueError):
     """A setting outside its allowed range."""
 
 
+class ArgumentError(SettingsError, TypeError):
+    """A setting that was given as an argument of a function, which takes it within its settings."""
+
+
 class MemoryLimitError(SionnaPartialError, MemoryError):
     """A job that cannot be done within its limit of memory; it was not begun."""
 

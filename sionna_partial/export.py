@@ -171,6 +171,9 @@ def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Pat
 def _encode_netcdf(coverage: xr.Dataset) -> bytes:
     encoding: dict[str, dict[str, Any]] = {name: {"_FillValue": None} for name in ("x", "y")}
     encoding |= {str(name): {"zlib": True, "complevel": 4, "shuffle": True} for name in coverage.data_vars}
+    for name in LINK_STATES:
+        if name in coverage:
+            encoding[name] |= {"dtype": "uint8", "_FillValue": NO_RECEIVER}
     stream = io.BytesIO()
     write_netcdf(coverage.compute(), encoding, stream)
     return stream.getvalue()

@@ -19,6 +19,7 @@ from sionna_partial.checks import (
     Progress,
     no_progress,
     require,
+    shown,
 )
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later
@@ -35,7 +36,7 @@ from sionna_partial.prediction.predictor import (
 )
 from sionna_partial.prediction.unobserved import is_enclosed
 from sionna_partial.prediction.windows import map_windows
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
@@ -108,6 +109,7 @@ class LinkModel:
     1
     """
 
+    @takes_settings
     def __init__(
         self,
         scene: PartialMap | str | Path | Simulation,
@@ -121,6 +123,9 @@ class LinkModel:
         self._windows: dict[bytes, NDArray[np.uint8]] = {}
         if predictor is not None:
             warm_predictor(predictor)
+
+    def __repr__(self) -> str:
+        return f"LinkModel({self.simulation!r}, predictor={shown(self.asked)})"
 
     @property
     def partial(self) -> PartialMap:

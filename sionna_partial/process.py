@@ -166,8 +166,13 @@ def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> It
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return numba's decorator; code is cached where that can be, at last in a temporary folder."""
+    """Return numba's decorator; code is cached where that can be, at last in a temporary folder.
+
+    Division by zero gives infinity or NaN as in NumPy: the checks that Python has take time in every loop.
+    """
     import numba
+
+    options = {"error_model": "numpy"} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:

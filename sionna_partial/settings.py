@@ -1,9 +1,12 @@
 """One frozen dataclass of settings for each stage, checked when it is built."""
 
+import functools
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Any, Literal, ParamSpec, TypeVar, get_args
 
-from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number
+from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number, shown
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     DEFAULT_HEIGHT_M,
@@ -12,6 +15,7 @@ from sionna_partial.constants import (
     DRYWALL_PERMITTIVITY,
     WALL_THICKNESS_M,
 )
+from sionna_partial.errors import ArgumentError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "vacuum": ((0.001, 100.0),),
@@ -66,8 +70,15 @@ Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]
 Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
+_Parameters = ParamSpec("_Parameters")
+_Result = TypeVar("_Result")
 
-@dataclass(frozen=True)
+
+_BY_CONDUCTIVITY = float("nan")
+"""Default of the exponent of a conductivity, which depends on that conductivity."""
+
+
+@dataclass(frozen=True, repr=False)
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
@@ -85,8 +96,9 @@ class Material(Checked):
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
     conductivity_exponent : float
-        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. Ignored
-        for an ITU material.
+        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. By default
+        it is 0.94 with the conductivity of drywall, so that `Material()` is the default drywall, and 0 with any other.
+        Ignored for an ITU material.
 
     Raises
     ------
@@ -106,12 +118,20 @@ class Material(Checked):
     conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
-    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = 0.0
+    conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = _BY_CONDUCTIVITY
 
     def __post_init__(self) -> None:
+        if self.conductivity_exponent is _BY_CONDUCTIVITY:
+            is_drywall = self.itu is None and self.conductivity_s_m == DRYWALL_CONDUCTIVITY_S_M
+            object.__setattr__(self, "conductivity_exponent", DRYWALL_CONDUCTIVITY_EXPONENT if is_drywall else 0.0)
         super().__post_init__()
         if self.itu is not None:
             require_choice("itu", self.itu, ITU_BANDS_GHZ)
+
+    def __repr__(self) -> str:
+        names = ["relative_permittivity", "conductivity_s_m"] if self.itu is None else ["itu"]
+        names += ["thickness_m", *(["conductivity_exponent"] if self.itu is None else [])]
+        return f"Material({', '.join(f'{name}={getattr(self, name)!r}' for name in names)})"
 
     @classmethod
     def named(cls, name: str) -> "Material":
@@ -143,7 +163,7 @@ class Material(Checked):
 
 
 WALL_MATERIALS = {
-    "drywall": Material(conductivity_exponent=DRYWALL_CONDUCTIVITY_EXPONENT),
+    "drywall": Material(),
     "brick": Material(itu="brick", thickness_m=0.11),
     "concrete": Material(itu="concrete", thickness_m=0.2),
     "reinforced concrete": Material(itu="concrete", thickness_m=0.25),
@@ -502,3 +522,24 @@ class PlacementSettings(Checked):
     tx_height_m: float = DEFAULT_HEIGHT_M
     rx_height_m: float = DEFAULT_HEIGHT_M
     seed: Annotated[int, Within(0, 2**63 - 1)] = 0
+
+
+def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
+    """Let a function answer a setting that was given as an argument with the settings that hold it."""
+    parameters = inspect.signature(function).parameters
+    kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
+    holders = {
+        name: f"{argument}={kind.__name__}({name}=...)"
+        for argument, kind in kinds.items()
+        if argument in parameters
+        for name in kind.__dataclass_fields__
+    }
+
+    @functools.wraps(function)
+    def call(*args: _Parameters.args, **kwargs: _Parameters.kwargs) -> _Result:
+        name = next((name for name in kwargs if name not in parameters and name in holders), None)
+        if name is not None:
+            raise ArgumentError(f"{name} = {shown(kwargs[name])} is a setting: give {holders[name]}.")
+        return function(*args, **kwargs)
+
+    return call

@@ -11,8 +11,9 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, DiffractionCandidates
-from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, DiffractionCandidates
+from sionna_partial.tracing.plan.reflections import SpecularCandidates
+from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import Materials, materials_of
 from sionna_partial.tracing.select import Listed
 

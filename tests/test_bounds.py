@@ -105,8 +105,8 @@ def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, 
 
     from sionna_partial.scene.scene import write_scene
     from sionna_partial.tracing.engine import SceneSolver
-    from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
-    from sionna_partial.tracing.plan.specular import SpecularCandidates
+    from sionna_partial.tracing.plan.edges import DiffractionCandidates, find_wedges
+    from sionna_partial.tracing.plan.reflections import SpecularCandidates
 
     geometry = extrude(walls)
     tx, rx = np.array([1.07, 1.93, 1.2]), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4], [2.2, 3.4, 1.2]])

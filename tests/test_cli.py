@@ -20,6 +20,7 @@ from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
 from sionna_partial import __version__, cli
+from sionna_partial.cli.options import parse_frequency
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -62,6 +63,36 @@ class TestPredict:
         assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "coverage.pgm"}
         coverage = sp.load_coverage(tmp_path / "out" / "coverage.nc")
         xr.testing.assert_identical(coverage, sp.predict_map(map_of(PICTURE), TX, predictor=shipped()))
+
+    def test_answer(self, tmp_path: Path) -> None:
+        save_map(map_of(PICTURE), tmp_path / "map.yaml")
+        options = "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz --format png --format nc"
+        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", tmp_path / "out", *options.split())
+        assert result.exit_code == 0, result.output
+        coverage = sp.load_coverage(tmp_path / "out" / "coverage.nc")
+        assert coverage.attrs["frequency_hz"] == 5.2e9
+        observed, every = coverage.radio.area(-67.0, eirp_dbm=15.0).fraction.values
+        text = f"{100 * observed:.0f} % of the observed floor, {100 * every:.0f} % of all, above -67 dBm"
+        picture = tmp_path / "out" / "coverage.png"
+        assert result.stdout.splitlines()[-1] == f"{text} with probability 0.9, at 15 dBm; open {picture}"
+
+    def test_options_in_groups(self) -> None:
+        text = run("predict", "--help").stdout
+        titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
+        assert titles == ["Transmitter:", "Radio:", "Walls:", "Map:", "Output:", "Options:"]
+        assert text.index("Transmitter:") < text.index("--power") < text.index("Radio:") < text.index("--frequency")
+
+    @pytest.mark.parametrize(
+        ("text", "frequency_hz"),
+        [("5.2GHz", 5.2e9), ("2400 MHz", 2.4e9), ("28e9", 28e9), ("60e9hz", 60e9), ("900000kHz", 9e8)],
+    )
+    def test_frequencies(self, text: str, frequency_hz: float) -> None:
+        assert parse_frequency(text) == pytest.approx(frequency_hz)
+
+    @pytest.mark.parametrize("text", ["5.2G", "GHz", "", "5,2GHz", "wifi", "5.2 GHz GHz"])
+    def test_what_is_no_frequency(self, text: str) -> None:
+        with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
+            parse_frequency(text)
 
     def test_every_option(self, tmp_path: Path) -> None:
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
@@ -122,6 +153,8 @@ class TestPredict:
             (["--frequency", "1"], "error: frequency_hz = 1.0 is not allowed"),
             (["--max-depth", "11"], "error: max_depth = 11 is not allowed"),
             (["--memory", "0.1"], "error: memory_gb = 0.1 is too little"),
+            (["--power", "1e9"], "error: --power = 1000000000.0 is not allowed: give a number in [-200, 200]."),
+            (["--threshold", "nan"], "error: --threshold = nan is not allowed"),
         ],
     )
     def test_wrong_option(self, map_path: Path, tmp_path: Path, words: list[str], message: str) -> None:
@@ -183,7 +216,9 @@ class TestMap:
         result = run("export-scene", map_path, "--out", tmp_path / "scene", *["--strict"] * strict)
         assert result.exit_code == 0, result.output
         assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
-        words = ["cells of shade 205 would read as free"] * (not strict) + ["origin yaw 0.5 rad: the map is turned"]
+        words = ["Pass --strict to read the file to the letter."] * (not strict) + [
+            "origin yaw 0.5 rad: the map is turned"
+        ]
         for line, word in zip(result.stderr.splitlines(), words, strict=True):
             assert line.startswith("warning: ")
             assert word in line

@@ -65,7 +65,7 @@ def test_the_likeliest_state_has_its_colour(coverage):
     assert panel.get_title() == "Likeliest link state"
     drawn = panel.images[0].to_rgba(at_receivers(panel, coverage))[..., :3]
     state = coverage["link_state"].to_numpy()[coverage["valid"].to_numpy()]
-    np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state])
+    np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state.astype(int)])
 
 
 def test_other_panels_show_their_variable_with_fixed_scales(coverage):
@@ -94,7 +94,7 @@ def test_the_probability_of_more_than_a_threshold(coverage):
 def test_legend_and_colour_bars_name_what_is_drawn(coverage):
     figure = plot_coverage(coverage)
     labels = {axis.get_ylabel() for axis in figure.axes}
-    assert {"dB;\nan outage counts \N{MINUS SIGN}150 dB", "dB;\nwith outages", "probability"} <= labels
+    assert {"dB", "probability"} <= labels
     assert legend(figure) == ["transmitter", "LOS", "NLOS", "outage", "wall", "not observed"]
     seen = coverage.assign(observed=coverage["observed"] | True, wall_parts=0 * coverage["wall_parts"])
     assert legend(plot_coverage(seen, layers=("p_los",))) == ["transmitter"]
@@ -158,7 +158,7 @@ def test_several_transmitters_have_a_row_each(coverage, several):
         np.testing.assert_array_equal(at_receivers(row[1], one), expected)
         assert [star.get_xdata()[0] for star in row[1].lines] == [one["tx_x"]]
         assert row[1].images[0].get_clim() == (-150, -60)
-    assert figure.get_suptitle() == "Coverage if indoors: 2 transmitters, 28 GHz, opaque walls"
+    assert figure.get_suptitle() == "Coverage for receivers that are indoors\n2 transmitters, 28 GHz, opaque walls"
     assert legend(figure) == legend(plot_coverage(coverage))
 
 

@@ -1,26 +1,25 @@
-"""Paths through walls: their loss is that of the walls between, counted once, and none that matters is missing."""
+"""Paths through walls of plans and meshes: each wall between has its loss once, and no path that matters is missing."""
 
+import functools
 import subprocess
 import sys
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
+from meshes import box, scene_mesh
 
 import sionna_partial as sp
-from sionna_partial.scene.scene import build_scene
-from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.plan.diffraction import find_wedges
+from sionna_partial.files import temporary_folder
 from sionna_partial.tracing.power import transmission_coefficients
-from sionna_partial.tracing.simulation import resolved_settings
-from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 
 BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
 STRAIGHT = sp.TraceSettings(frequency_hz=5e9, max_depth=0, power_tolerance_db=0.0)
-REFRACTION, DIFFRACTION = 4, 8
+REFRACTION = 4
 BOWLUS = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson" / "Bowlus" / "map.yaml"
 BLEFLAT = Path(__file__).resolve().parents[1] / ".." / "shared" / "measured" / "bleflat" / "map.yaml"
 
@@ -44,6 +43,21 @@ def loss_db(partial: sp.PartialMap, tx: tuple[float, ...], rx: tuple[float, ...]
     links = sp.trace_links(partial, tx, [rx], trace_settings=replace(STRAIGHT, **changes), scene_settings=LONELY)  # type: ignore[arg-type]
     free_db = 20.0 * np.log10(299792458.0 / 5e9 / (4.0 * np.pi * np.linalg.norm(np.subtract(rx, tx))))
     return float(free_db - links.gain_db[0])
+
+
+def sheet(x: float) -> trimesh.Trimesh:
+    """A wall without thickness."""
+    return trimesh.Trimesh([(x, 0, 0), (x, 6, 0), (x, 6, 3), (x, 0, 3)], [(0, 1, 2), (0, 2, 3)], process=False)
+
+
+WALL, BEHIND = box((4.2, 0, 0), (4.5, 6, 3)), box((4.8, 0, 0), (4.9, 6, 3))
+
+
+def field(*solids: trimesh.Trimesh | None) -> sp.PartialMap:
+    """Bodies in a field of free cells; with a None among them, its cells from 4.2 to 4.6 m are unknown."""
+    state = np.zeros((60, 80), dtype=np.uint8)
+    state[:, 42:46] = 2 * (None in solids)
+    return sp.PartialMap(state, 0.1, mesh=scene_mesh(*(solid for solid in solids if solid is not None)))
 
 
 class TestOneWall:
@@ -77,13 +91,34 @@ class TestOneWall:
         twice = 2 * slab_loss_db(1.0)
         assert loss_db(sp.PartialMap(state, 0.1), (2.5, 2.97, 1.5), (6.5, 2.97, 1.5)) == pytest.approx(twice, abs=0.02)
 
-    def test_more_walls_than_allowed(self) -> None:
+    @pytest.mark.parametrize(
+        ("solids", "slabs", "changes"),
+        [
+            ([WALL], 1, {}),
+            ([WALL], 2, {"wall_depth_m": 0.0}),
+            ([trimesh.Trimesh(WALL.vertices, WALL.faces[:, ::-1], process=False)], 1, {}),
+            ([box((4, 0, 0), (5, 6, 3))], 2, {}),
+            ([WALL, BEHIND], 2, {}),
+            ([sheet(4.2)], 1, {}),
+            ([sheet(4.2), sheet(4.6)], 2, {}),
+            ([sheet(4.2), sheet(4.6), None], 1, {}),
+        ],
+        ids=["body", "slabs", "inside out", "deep body", "two bodies", "sheet", "sheets", "nothing free between"],
+    )
+    def test_of_a_mesh(self, solids: list[trimesh.Trimesh | None], slabs: int, changes: dict[str, float]) -> None:
+        """A closed body is one wall, and so are faces without a free cell between; None hides what is between them."""
+        partial, expected_db = field(*solids), slabs * slab_loss_db(3.0 / np.hypot(3.0, 0.44))
+        ends = (3.0, 2.97, 1.5), (6.0, 3.41, 1.5)
+        for tx, rx in (ends, ends[::-1]):
+            assert loss_db(partial, tx, rx, **changes) == pytest.approx(expected_db, abs=0.02)
+
+    @pytest.mark.parametrize("kind", ["plan", "mesh"])
+    def test_more_walls_than_allowed(self, kind: str) -> None:
         state = walled(1).state.copy()
         state[:, 44] = 1
-        ends = (2.5, 2.97, 1.5), (6.5, 2.97, 1.5)
-        links = sp.trace_links(
-            sp.PartialMap(state, 0.1), ends[0], [ends[1]], trace_settings=replace(STRAIGHT, max_walls=1)
-        )
+        partial = sp.PartialMap(state, 0.1) if kind == "plan" else field(WALL, BEHIND)
+        settings, ends = replace(STRAIGHT, max_walls=1), ((2.5, 2.97, 1.5), [(6.5, 2.97, 1.5)])
+        links = sp.trace_links(partial, *ends, trace_settings=settings, scene_settings=LONELY)
         assert links.link_state.tolist() == [sp.LinkState.OUTAGE]
 
 
@@ -97,7 +132,7 @@ def rooms() -> sp.PartialMap:
     return sp.PartialMap(state, 0.1, (-2.0, 3.0))
 
 
-TX = (-0.52, 4.13, 1.5)
+TX = np.array([-0.52, 4.13, 1.5])
 RX = np.array([[2.51, 7.23, 1.3], [5.3, 6.04, 1.5], [1.93, 3.81, 1.7], [6.6, 3.92, 1.5], [0.61, 7.7, 1.1]])
 EVERY = sp.TraceSettings(
     frequency_hz=5e9, max_depth=4, max_walls=4, power_tolerance_db=0.0, wall_depth_m=0.0, diffraction=False
@@ -111,56 +146,13 @@ def of_several_materials() -> sp.PartialMap:
     return partial.with_wall_material("metal", [(-2.0, 2.9), (2.03, 2.9), (2.03, 3.1), (-2.0, 3.1)])
 
 
-def same_path(
-    ours: sp.TracedLinks, rx: int, paths: SolvedPaths, path: int, shift: np.ndarray
-) -> tuple[np.ndarray, int]:
-    """Return the interactions of a path of stock, and which of ours is the same, at the same points."""
-    kinds = paths.interactions[path][paths.interactions[path] > 0]
-    at_m = paths.vertices_m[path, : len(kinds)] + shift
-    (same,) = (
-        k
-        for k in np.flatnonzero(ours.path_rx == rx)
-        if np.array_equal(ours.interactions[k][ours.interactions[k] > 0], kinds)
-        and np.allclose(ours.vertices_m[k, : len(kinds)], at_m, atol=0.01)
-    )
-    return kinds, int(same)
-
-
-@pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
-def test_stock_finds_no_other_paths(partial: sp.PartialMap, tmp_path: Path) -> None:
-    """With each face a slab, all strong paths of the public solver, at the same points, as strong."""
-    settings, scene_settings = resolved_settings(partial, EVERY, sp.SceneSettings(material=BRICK))
-    ours = sp.trace_links(partial, TX, RX, trace_settings=settings, scene_settings=scene_settings)
-    folder = sp.export_scene(replace(partial, origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
-    scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
-    found = 0
-    for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
-        for path in np.flatnonzero(paths.power > 1e-3 * paths.power.sum()):
-            kinds, same = same_path(ours, rx, paths, path, shift)
-            assert abs(ours.a[same]) ** 2 == pytest.approx(paths.power[path], rel=2e-3)
-            found += REFRACTION in kinds
-    assert found > 30
-
-
-def test_stock_is_diffracted_at_no_other_edges(tmp_path: Path) -> None:
-    """Paths over an edge and through walls; those with the most interactions have the power that stock gives them."""
-    every = replace(EVERY, diffraction=True, max_depth=3)
-    wedges = find_wedges(build_scene(rooms()), open_ends=True)
-    settings, scene_settings = resolved_settings(rooms(), every, sp.SceneSettings(material=BRICK))
-    ours = sp.trace_links(rooms(), TX, RX, trace_settings=settings, scene_settings=scene_settings)
-    folder = sp.export_scene(replace(rooms(), origin_m=(0.0, 0.0)), tmp_path / "scene", scene_settings)
-    scene, shift = open_scene(folder / "scene.xml", 5e9), np.array([-2.0, 3.0, 0.0])
-    found = 0
-    for rx, paths in enumerate(stock_paths(scene, settings, np.array(TX) - shift, RX - shift)):
-        at_edges = diffracted_as_exact(wedges, paths, 2)  # Sionna RT has junctions of walls and rims as well
-        for path in np.flatnonzero(at_edges & (paths.power > 1e-4 * paths.power.sum())):
-            if {*paths.interactions[path].tolist()} - {0} != {REFRACTION, DIFFRACTION}:
-                continue
-            kinds, same = same_path(ours, rx, paths, path, shift)
-            if len(kinds) == settings.max_depth:
-                assert abs(ours.a[same]) ** 2 == pytest.approx(paths.power[path], rel=5e-3)
-                found += 1
-    assert found > 2
+@functools.cache
+def meshed() -> sp.PartialMap:
+    """The rooms as a mesh: the scene of the plan, without its map."""
+    with temporary_folder() as folder:
+        scene = sp.export_scene(rooms(), folder / "scene", sp.SceneSettings(material=BRICK))
+        (scene / "map.yaml").unlink()
+        return sp.load_map(scene / "scene.xml")
 
 
 @pytest.mark.parametrize("partial", [rooms(), of_several_materials()], ids=["brick", "several materials"])
@@ -184,17 +176,28 @@ def test_turned_and_mirrored() -> None:
     np.testing.assert_allclose(again, gain_db, atol=0.15)
 
 
-def test_opaque_paths_stay() -> None:
+@pytest.mark.parametrize("partial", [rooms, meshed])
+def test_opaque_paths_stay(partial: Callable[[], sp.PartialMap]) -> None:
     """Those without walls are the same, to the byte, and those with walls have refractions."""
+    settings = replace(EVERY, diffraction=None, max_depth=3)
     opaque, leaky = (
-        sp.trace_links(rooms(), TX, RX, trace_settings=replace(EVERY, refraction=on, diffraction=None))
-        for on in (False, True)
+        sp.trace_links(partial(), TX, RX, trace_settings=replace(settings, refraction=on)) for on in (False, True)
     )
     through = (leaky.interactions == REFRACTION).any(axis=1)
     assert through.any()
     assert np.sort(leaky.a[~through]).tobytes() == np.sort(opaque.a).tobytes()
-    walls = (leaky.interactions == REFRACTION).sum(axis=1)
-    assert walls.max() <= EVERY.max_walls
+    assert (leaky.interactions == REFRACTION).sum(axis=1).max() <= EVERY.max_walls
+
+
+@pytest.mark.parametrize("depth_m", [0.0, 0.6])
+def test_plans_and_meshes_agree(depth_m: float) -> None:
+    settings = replace(EVERY, wall_depth_m=depth_m, power_tolerance_db=0.1)
+    plan, mesh = (
+        sp.trace_links(each, TX, RX, trace_settings=settings, scene_settings=sp.SceneSettings(material=BRICK))
+        for each in (rooms(), meshed())
+    )
+    np.testing.assert_allclose(mesh.gain_db, plan.gain_db, atol=0.3)
+    assert mesh.to_dataframe("paths")["walls"].max() >= 2
 
 
 def test_weak_paths_that_are_left_out_do_not_matter() -> None:
@@ -210,7 +213,9 @@ def test_weak_paths_that_are_left_out_do_not_matter() -> None:
 def test_on_by_default_below_24_ghz() -> None:
     for frequency_hz, through in ((5e9, True), (23.9e9, True), (24e9, False), (60e9, False)):
         assert sp.TraceSettings(frequency_hz).through_walls is through
-        assert sp.Simulation(rooms(), sp.TraceSettings(frequency_hz)).resolved.trace_settings.refraction is through
+        for partial in (rooms(), meshed()):
+            resolved = sp.Simulation(partial, sp.TraceSettings(frequency_hz)).resolved
+            assert resolved.trace_settings.refraction is through
     assert sp.TraceSettings(5e9, refraction=False).through_walls is False
 
 

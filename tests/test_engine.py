@@ -18,7 +18,7 @@ from sionna_partial.scene.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
 from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault, open_scene
 from sionna_partial.tracing.paths import Candidates, SolvedPaths
-from sionna_partial.tracing.plan.diffraction import find_wedges
+from sionna_partial.tracing.plan.edges import find_wedges
 
 SHAPES = ("walls", "floor", "ceiling")
 TX = np.array([1.07, 1.93, 1.2])

@@ -6,19 +6,18 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from extruded import blocks_of, drywall
-from mesh_rays import TURN, joined, load_meshes, shapes_of
+from extruded import blocks_of
+from mesh_rays import TURN, joined, load_meshes, opaque, shapes_of
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.mesh.candidates import MeshCandidates
-from sionna_partial.tracing.mesh.faces import group_planes
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import shoot_rays
 from sionna_partial.tracing.paths import Candidates
 
 SIZE = np.array([8.0, 6.0, 3.0])
 TX = np.array([0.3, -0.2, 0.1])
 RX = np.random.default_rng(0).uniform(-0.45 * SIZE, 0.45 * SIZE, (30, 3))
-LIGHT_M_S = 299792458.0
 
 
 def candidates_of(
@@ -32,8 +31,8 @@ def candidates_of(
     **options: int,
 ) -> Candidates:
     shot = shoot_rays(scene.mi_scene, shapes_of(scene, len(meshes)), tx, rays, depth)
-    mesh = group_planes(*joined(*meshes)), np.zeros(sum(len(each.faces) for each in meshes), np.int64)
-    parts = blocks_of(MeshCandidates(*mesh, shot, tx, rx, depth, drywall()).listed(np.zeros(len(rx)), **options))
+    kind = MeshReflections(opaque(*meshes), tx, rx, TraceSettings(max_depth=depth), shot)
+    parts = blocks_of(kind.listed(np.zeros(len(rx)), **options))
     shares = [share for _, share in parts]
     assert shares == sorted(shares)
     assert depth == 0 or shares[-1] == 1.0
@@ -118,24 +117,6 @@ class TestRoom:
         mirrored = legs[:, :-1] - 2.0 * (legs[:, :-1] * normal[face]).sum(axis=2)[:, :, None] * normal[face]
         np.testing.assert_allclose(legs[:, 1:], mirrored, atol=1e-6)
 
-    def test_all_paths_of_stock_sionna_are_candidates(self, scene: Any) -> None:
-        import sionna.rt as rt
-
-        scene.add(rt.Transmitter("tx", position=TX.tolist()))
-        rx = RX[:10]
-        for k, position in enumerate(rx):
-            scene.add(rt.Receiver(f"rx{k}", position=position.tolist()))
-        paths = rt.PathSolver()(
-            scene, max_depth=3, refraction=False, samples_per_src=50_000, max_num_paths_per_src=2_000_000
-        )
-        valid, delay = paths.valid.numpy().reshape(len(rx), -1), paths.tau.numpy().reshape(len(rx), -1)
-        found = candidates_of(scene, room(), TX, rx)
-        assert len(found.rx) < 3 * valid.sum()
-        for k, lengths in enumerate(by_receiver(found, lengths_m(found, TX, rx), len(rx))):
-            away = np.abs(lengths[:, None] - LIGHT_M_S * delay[k][valid[k]]).min(axis=0)
-            assert len(away) > 30
-            assert away.max() < 2e-3
-
     def test_no_chain_twice_and_each_in_one_piece(self, scene: Any) -> None:
         found = candidates_of(scene, room(), TX, RX)
         assert len(np.unique(np.column_stack([found.rx, found.face]), axis=0)) == len(found.rx)
@@ -154,7 +135,7 @@ class TestRoom:
 
     def test_blocks_join_to_the_same_bytes(self, scene: Any) -> None:
         whole = candidates_of(scene, room(), TX, RX)
-        parts = candidates_of(scene, room(), TX, RX, receivers_per_part=50)
+        parts = candidates_of(scene, room(), TX, RX, sequences_at_once=50)
         for name in ("rx", "kind", "face", "vertices_m"):
             assert getattr(whole, name).tobytes() == getattr(parts, name).tobytes()
 
@@ -177,5 +158,5 @@ class TestOpenMesh:
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
 
     def test_without_rays_there_is_line_of_sight(self) -> None:
-        kind = MeshCandidates(group_planes(*joined(self.TRIANGLE)), np.zeros(1, np.int64), [], TX, RX, 2, drywall())
+        kind = MeshReflections(opaque(self.TRIANGLE), TX, RX, TraceSettings(max_depth=2), [])
         assert [part.rx.tolist() for part, _ in blocks_of(kind.listed(np.zeros(len(RX))))] == [list(range(len(RX)))]

@@ -3,7 +3,15 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 
-from sionna_partial.tracing.mesh.faces import PLANE_TOLERANCE_M, MeshPlanes, face_at, group_planes
+from sionna_partial.tracing.mesh.faces import (
+    PLANE_TOLERANCE_M,
+    MeshPlanes,
+    face_at,
+    face_tree,
+    faces_between,
+    group_planes,
+    scratch,
+)
 
 
 def planes_of(mesh: trimesh.Trimesh) -> MeshPlanes:
@@ -59,3 +67,21 @@ class TestFaceAt:
         planes = group_planes(np.column_stack([np.ones(6), corners]), np.array([[0, 1, 2], [3, 4, 5]]))
         points = np.array([[1, 2.5, 2.5], [1, -1, 0.2], [1, 7, 7], [1, 0.51, 0.51], [1, 0.5004, 0.5004], [1, 4.8, 4.8]])
         assert looked_up(planes, np.zeros(6, np.int32), points).tolist() == [-1, -1, -1, -1, 0, 1]
+
+
+def test_faces_between_points_are_those_of_brute_force() -> None:
+    rng = np.random.default_rng(0)
+    ball = trimesh.creation.icosphere(2, 1.0)
+    ends = rng.uniform(-1.2, 1.2, (200, 2, 3))
+    planes = group_planes(np.asarray(ball.vertices), np.asarray(ball.faces))
+    tree, met = face_tree(np.asarray(ball.triangles), planes.plane), scratch()
+    for a, b in ends:
+        count = faces_between(tree, a, b, -1, -1, met)
+        inside = (np.linalg.norm([a, b], axis=1) < 0.97).sum()
+        points = a + met.at[:count, None] * (b - a)
+        assert np.allclose(np.linalg.norm(points, axis=1), 1.0, atol=0.03)
+        assert (np.diff(met.at[:count]) > 0.0).all()
+        assert (
+            count == {0: count // 2 * 2, 1: 1, 2: 0}[int(inside)]
+            or np.abs(np.linalg.norm([a, b], axis=1) - 0.985).min() < 0.016
+        )

@@ -9,7 +9,7 @@ from mesh_rays import TURN, joined, load_meshes, shapes_of
 
 from sionna_partial.tracing.mesh import sequences as module
 from sionna_partial.tracing.mesh.faces import MeshPlanes, group_planes
-from sionna_partial.tracing.mesh.sequences import MARGIN, Rays, Sequences, collect_sequences, shoot_rays, view_sequences
+from sionna_partial.tracing.mesh.sequences import Rays, Sequences, collect_sequences, shoot_rays, view_sequences
 
 TX = np.array([0.3, -0.2, 0.1])
 
@@ -99,11 +99,13 @@ class TestViewChains:
         planes = group_planes(corners, np.array([[0, 1, 2], [3, 4, 5]]))
         rays = rays_along([[0, 1], [1, -1]], [[9, 10, 1], [1, np.inf, np.inf]])
         sequences = collect_sequences([rays], planes)
-        margin = view_sequences(sequences, planes, np.zeros(3)).margin
+        margin = view_sequences(sequences, planes, np.zeros(3), 8.0).margin
         assert sequence_planes(sequences, 1) == [planes.plane[0], planes.plane[1]]
         assert 0.1 * np.sqrt(2) / 9 < margin[0] < 0.02
         assert margin[1] == margin[0]
         assert margin[2] > 1.0
         np.testing.assert_allclose(
-            view_sequences(sequences._replace(rays=10**6), planes, np.zeros(3)).margin[2], MARGIN * 3.545e-3, rtol=1e-3
+            view_sequences(sequences._replace(rays=10**6), planes, np.zeros(3), 8.0).margin[2],
+            8.0 * 3.545e-3,
+            rtol=1e-3,
         )

@@ -10,11 +10,6 @@ import yaml
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.files import temporary_folder
-from sionna_partial.scene.scene import build_scene, write_scene
-from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.stock import stock_paths
 
 
 def hall() -> sp.PartialMap:
@@ -99,45 +94,7 @@ class TestFiles:
             sp.load_map(tmp_path / "map.yaml")
 
 
-TX, HEIGHTS_M = (1.83, -0.08, 1.1), (0.35, 0.9, 1.5)
-
-
-def traced(settings: sp.TraceSettings) -> tuple[sp.TracedLinks, SolvedPaths]:
-    """Return links of a hall with obstacles, and what Sionna RT's rays find of them in the exported scene."""
-    partial = low()
-    rx = np.array([(2.0 + 1.3 * k, 0.2 + 0.6 * (k % 4), HEIGHTS_M[k % 3]) for k in range(4)] + [(3.8, 0.5, 0.9)])
-    rx = rx[partial.radios_can_stand(rx)]
-    links = sp.trace_links(partial, TX, rx, trace_settings=settings)
-    geometry = build_scene(partial)
-    with temporary_folder() as folder:
-        xml = write_scene(geometry, folder, offset_m=geometry.origin_m, frequency_hz=settings.frequency_hz)
-        ends = np.array(TX) - [*partial.origin_m, 0.0], rx - [*partial.origin_m, 0.0]
-        deep = replace(settings, max_depth=settings.max_depth + (3 if settings.through_walls else 0))
-        scene = open_scene(xml, settings.frequency_hz)
-        return links, join_paths(list(stock_paths(scene, deep, *ends)), deep.max_depth)
-
-
 class TestTrace:
-    @pytest.mark.parametrize("frequency_hz", [28e9, 5e9])
-    def test_finds_what_rays_find_in_the_exported_scene(self, frequency_hz: float) -> None:
-        """All but reflections at the tops of obstacles, within 40 dB of the strongest path."""
-        depth, exact = 2, {"diffraction": False, "power_tolerance_db": 0.0, "wall_depth_m": 0.0}
-        settings = sp.TraceSettings(frequency_hz, depth, samples_per_tx=100_000, **exact)  # type: ignore[arg-type]
-        links, shot = traced(settings)
-        assert (links.interactions == 4).any() == settings.through_walls
-        lids = np.isclose(shot.vertices_m[..., 2], 0.75, atol=1e-3) | np.isclose(
-            shot.vertices_m[..., 2], 1.8, atol=1e-3
-        )
-        other = ~((shot.interactions == 1) & lids).any(axis=1) & ((shot.interactions == 1).sum(axis=1) <= depth)
-        strongest = np.zeros(len(links.rx))
-        np.maximum.at(strongest, shot.path_rx, shot.power)
-        compared = np.flatnonzero(other & (shot.power > 1e-4 * strongest[shot.path_rx]))
-        assert len(compared) > 20
-        for path in compared:
-            own = np.flatnonzero(links.path_rx == shot.path_rx[path])
-            near = own[np.abs(links.delay_s[own] - shot.delay_s[path]) * 3e8 < 2e-3]
-            assert np.abs(20 * np.log10(np.abs(links.a[near]) / np.sqrt(shot.power[path]))).min(initial=9.0) < 0.1
-
     def test_an_edge_of_a_table_diffracts_below_its_top(self) -> None:
         partial, settings = low(), sp.TraceSettings(max_depth=1)
         links = sp.trace_links(partial, (2.5, 1.5, 0.4), [(4.8, 0.5, 0.4), (4.8, 0.5, 1.2)], trace_settings=settings)

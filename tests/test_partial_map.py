@@ -222,6 +222,19 @@ def test_wrong_positions(points: object, message: str) -> None:
         PLAN.require_positions("tx", points)
 
 
+@pytest.mark.parametrize("point", [(10750, -3250, 1500), (1075, -325, 150), (1075, -325, 1.5)])
+def test_positions_in_other_units(point: tuple[float, float, float]) -> None:
+    with pytest.raises(PositionError, match=r"Did you mean metres\? Taken for (milli|centi)metres it is at .* m\.$"):
+        PLAN.require_positions("tx", point)
+    with pytest.raises(PositionError, match=r"extend the map with unknown cells\.$"):
+        PLAN.require_positions("tx", (9750, -3250, 1500))
+
+
+def test_names_of_positions() -> None:
+    with pytest.raises(PositionError, match=r"^door = \(10\.25, -3\.25, 1\.5\) is inside a wall"):
+        PLAN.require_positions("tx", [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5)], names=["hall", "door"])
+
+
 @pytest.mark.parametrize(
     ("turn", "hint"),
     [(np.flipud, "on the map upside down (numpy.flipud)."), (np.transpose, "on the map with rows and columns swapped")],

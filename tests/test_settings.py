@@ -4,6 +4,8 @@ import math
 import re
 import subprocess
 import sys
+from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from typing import get_type_hints
 
@@ -12,6 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import sionna_partial as sp
 from sionna_partial.checks import Checked, shown
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
@@ -255,6 +258,29 @@ class TestPredictorSettings:
 
 def test_materials_by_name() -> None:
     assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete", thickness_m=0.2))  # type: ignore[arg-type]
-    assert Material.named("drywall") == SceneSettings().material
+    assert Material.named("drywall") == SceneSettings().material == Material() == Material(thickness_m=0.1)
+    assert replace(Material(), conductivity_s_m=0.2).conductivity_exponent == Material().conductivity_exponent > 0.0
+    assert Material(4.0, 0.05).conductivity_exponent == Material(itu="brick").conductivity_exponent == 0.0
+    assert repr(Material.named("brick")) == "Material(itu='brick', thickness_m=0.11)"
+    custom = Material(4.0, 0.05, 0.2)
+    assert eval(repr(custom)) == custom
     with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, brick"):
         SceneSettings(material="cheese")  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: sp.predict_map(None, frequency_hz=5e9), "frequency_hz = 5000000000.0 is a setting: give trace_sett"),
+        (lambda: sp.predict_map(None, ceiling=False), "give scene_settings=SceneSettings(ceiling=...)."),
+        (lambda: sp.LinkModel(None, max_depth=3), "give trace_settings=TraceSettings(max_depth=...)."),
+        (lambda: sp.Simulation(None, material="brick"), "give scene_settings=SceneSettings(material=...)."),
+        (lambda: sp.trace_links(None, None, None, refraction=True), "give trace_settings=TraceSettings(refraction="),
+    ],
+)
+def test_settings_given_as_arguments(call: Callable[[], object], message: str) -> None:
+    for kind in (SettingsError, TypeError):
+        with pytest.raises(kind, match=re.escape(message)):
+            call()
+    with pytest.raises(TypeError, match="unexpected keyword argument 'frequency'"):
+        sp.predict_map(None, frequency=5e9)  # type: ignore[call-arg]

@@ -5,6 +5,7 @@ import html
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,6 @@ from sionna_partial.app.answer import Answer
 from sionna_partial.app.picture import LAYERS, Picture
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
 from sionna_partial.app.session import FILES, MORE_STEPS, ROUNDING_M, Session
-from sionna_partial.app.template import COPY, LOST, UPLOAD
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
@@ -33,6 +33,17 @@ _FILE_NAMES = {
     "pdf": "Report (PDF)",
     "project": "Project",
 }
+
+_UPLOAD = "document.getElementById(id).click()"
+_COPY = """
+const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
+copied.then(() => { message.text = "Copied." }, () => { message.text = "Select the lines, and copy them with Ctrl-C." })
+"""
+_LOST = (
+    "message.text = 'The connection has ended: start sionna-partial app again, and open the address that it prints.'"
+)
+
+TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 
 
 class Page:
@@ -60,7 +71,7 @@ class Page:
         for name, model in self._roots().items():
             model.name = name
             document.add_root(model)
-        document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=LOST))
+        document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
     # Widgets
 
@@ -133,10 +144,9 @@ class Page:
             Select(title="Paths through walls", options=list[Any](_WALLS.items()), value=""),
             lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),
         )
+        materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
         self.material = self._on(
-            Select(
-                title="Material of walls", name="material", options=[(name, name or "unknown") for name in MATERIALS]
-            ),
+            Select(title="Material of walls", name="material", options=materials),
             lambda name: self.session.set(material=name),
         )
         presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
@@ -177,9 +187,9 @@ class Page:
             self._button(name)
             for name in ("Open a map or project\u2026", "Learn from measurements (CSV)\u2026", "Copy as Python")
         )
-        upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=UPLOAD))
-        upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=UPLOAD))
-        copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=COPY))
+        upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
+        upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
+        copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
         self.forget = self._button("Forget the measurements", lambda: session.forget_measurements())
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
         x, y, z, eirp = self.fields.values()

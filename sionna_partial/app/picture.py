@@ -9,7 +9,6 @@ from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.app.answer import LEVELS, Answer
 from sionna_partial.app.radio import MOST_TRANSMITTERS
-from sionna_partial.app.template import UNSELECT
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
@@ -18,6 +17,9 @@ from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes,
 
 LAYERS = radio_layers(MOST_TRANSMITTERS)
 """Layers by the name of their variable."""
+
+_UNSELECT = "points.selection_manager.clear()"
+"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
@@ -109,7 +111,7 @@ class Picture:
         )
         plot.add_tools(hover, tool)
         plot.toolbar.active_tap = tool
-        plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=UNSELECT))
+        plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
 
     def show_map(self, partial: PartialMap) -> None:
         """Draw the cells of a map."""

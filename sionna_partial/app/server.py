@@ -7,9 +7,8 @@ import socket
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sionna_partial.app.page import Page
+from sionna_partial.app.page import TEMPLATE, Page
 from sionna_partial.app.session import FILES, Session
-from sionna_partial.app.template import TEMPLATE
 from sionna_partial.app.uploads import MOST_BYTES, UPLOADED_SUFFIXES
 from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap

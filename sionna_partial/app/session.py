@@ -23,7 +23,7 @@ from sionna_partial.app.radio import FINEST_M, MOST_TRANSMITTERS, PRESETS, Radio
 from sionna_partial.app.uploads import uploaded_map
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, reason_of, require, require_choice
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
@@ -46,9 +46,6 @@ from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.antennas import Antenna
-
-COARSER = 4
-"""Receiver spacing of the first picture, as a multiple of the spacing of the final one."""
 
 ROUNDING_M = 0.006
 """Distance up to which a position of the picture is the same as a rounded one [m]."""

@@ -7,7 +7,14 @@ from pathlib import Path, PurePath
 
 from sionna_partial.app.jobs import logged_warnings
 from sionna_partial.checks import shown
-from sionna_partial.constants import BAG_SUFFIXES, DRAWING_SUFFIXES, IFC_SUFFIXES, MESH_SUFFIXES, POINT_SUFFIXES
+from sionna_partial.constants import (
+    BAG_SUFFIXES,
+    DRAWING_SUFFIXES,
+    IFC_SUFFIXES,
+    MESH_SUFFIXES,
+    POINT_SUFFIXES,
+    VACUUM_SUFFIXES,
+)
 from sionna_partial.errors import MapError
 from sionna_partial.files import unzipped
 from sionna_partial.maps.map_files import load_map
@@ -19,7 +26,10 @@ MOST_BYTES = 200_000_000
 
 _IMAGES, _SHEETS = (".pgm", ".png", ".bmp"), (".yaml", ".yml")
 
-MAP_SUFFIXES = (*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES)
+MAP_SUFFIXES = (
+    *(*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES),
+    *VACUUM_SUFFIXES,
+)
 """Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
 
 UPLOADED_SUFFIXES = (*MAP_SUFFIXES, *_IMAGES, ".zip")

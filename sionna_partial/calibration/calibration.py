@@ -37,7 +37,7 @@ from sionna_partial.display import Pictured, part_of, reporting
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import measurements_of, merged
-from sionna_partial.settings import Material, SceneSettings, TraceSettings
+from sionna_partial.settings import Material, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, simulation_of
 
@@ -171,6 +171,7 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
         }
 
 
+@takes_settings
 def calibrate_materials(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     measurements: Any,

@@ -25,7 +25,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.links import TracedLinks, path_gain_db
 from sionna_partial.tracing.paths import SolvedPaths, path_order
 from sionna_partial.tracing.simulation import Simulation
@@ -156,6 +156,7 @@ class ChannelSamples(Shown):
         return folded.isel(tx=0) if self.link_state.ndim == 2 else folded
 
 
+@takes_settings
 def sample_channels(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike,

@@ -10,6 +10,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+import sionna_partial.cli.options as opt
 from sionna_partial import __version__
 from sionna_partial.cli.learning import dataset, evaluate, train
 from sionna_partial.cli.live import live, open_app
@@ -30,7 +31,7 @@ class _ErrorLineGroup(TyperGroup):
             with optional_packages():
                 return super().invoke(ctx)
         except SionnaPartialError as error:
-            typer.echo(f"error: {error}", err=True)
+            typer.echo(f"error: {opt.in_options(str(error))}", err=True)
         except BrokenPipeError:
             raise
         except OSError as error:
@@ -46,7 +47,11 @@ class _WarningLine(logging.Handler):
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record."""
-        typer.echo(f"{record.levelname.lower()}: {one_line(record.getMessage())}", err=True)
+        _warn(record.levelname.lower(), record.getMessage())
+
+
+def _warn(level: str, message: str) -> None:
+    typer.echo(f"{level}: {opt.in_options(one_line(message))}", err=True)
 
 
 app = typer.Typer(
@@ -93,7 +98,9 @@ def _prepare(
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ["MPLBACKEND"] = "agg"  # pictures are files, whatever the variable was
     logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
-    warnings.showwarning = lambda message, *_, **__: typer.echo(f"warning: {one_line(str(message))}", err=True)
+    warnings.showwarning = lambda message, *_, **__: typer.echo(
+        f"warning: {opt.in_options(one_line(str(message)))}", err=True
+    )
 
 
 app.command(cls=TransmitterCommand)(predict)

@@ -7,6 +7,7 @@ import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
+from sionna_partial.checks import transmitter_names
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MAX_COST
 from sionna_partial.files import atomic_files, require_writable
 from sionna_partial.process import cleaned_up
@@ -66,7 +67,7 @@ def live(
     predictor: opt.PredictorName = "",
 ) -> None:
     """Keep up with a robot's map: coverage as cost grids for its planner, until Ctrl-C."""
-    names = name or (["tx"] if len(tx) == 1 else [f"tx{number}" for number in range(len(tx))])
+    names = name or (["tx"] if len(tx) == 1 else transmitter_names(len(tx)))
     if len(names) != len(tx) or len({*names}) < len(names):
         raise typer.BadParameter(f"{len(names)} --name for {len(tx)} --tx: give each its own.")
     positions = dict(zip(names, map(opt.parse_position, tx), strict=True))

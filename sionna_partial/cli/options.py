@@ -3,6 +3,7 @@
 import functools
 import inspect
 import itertools
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,9 +19,44 @@ from sionna_partial.display import reporting
 from sionna_partial.files import require_writable
 from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
-MAP_HELP = "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, DXF floor plan, or IFC model."
+GROUPS = {
+    "Transmitter": ("tx", "tx_power", "power", "tx_antenna", "azimuth", "tilt"),
+    "Radio": (
+        *("frequency", "threshold", "rx_height", "spacing", "receivers", "max_depth", "diffraction", "predictor"),
+        *("measurements", "column", "access_point"),
+    ),
+    "Walls": ("material", "through_walls", "material_of", "wall_layer", "wall_height", "obstacle_height"),
+    "Map": ("strict", "resolution", "unit", "up", "height_band", "storey"),
+    "Output": ("out", "formats", "memory"),
+}
+"""Options in groups, as the help of a command has them."""
+
+UNITS_HZ = {"": 1.0, "hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
+"""Units of frequencies in lower case."""
+
+MAP_HELP = (
+    "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, DXF floor plan, IFC model, "
+    "Valetudo JSON, or picture."
+)
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
 _MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
+
+
+def parse_frequency(text: str) -> float:
+    """Frequency [Hz] from a number, or from a number with a unit."""
+    found = re.fullmatch(r"(.*?[\d.nf])\s*([kmg]?hz)?", str(text).strip().lower())
+    if not found or not _is_number(found[1]):
+        raise typer.BadParameter(f"{str(text)!r} is not a frequency: give hertz, or a number with its unit, as 5.2GHz.")
+    return float(found[1]) * UNITS_HZ[found[2] or ""]
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
 
 Map = Annotated[Path, typer.Argument(metavar="MAP", help=MAP_HELP, show_default=False)]
 MapIfGiven = Annotated[Path | None, typer.Argument(metavar="MAP", help=MAP_HELP, show_default=False)]
@@ -49,9 +85,23 @@ ObstacleHeight = Annotated[
     float | None,
     typer.Option(help="Height of what stands free on a robot's map [m]. Default: the ceiling.", show_default=False),
 ]
+Resolution = Annotated[
+    float | None,
+    typer.Option(
+        help="Of a picture: metres per pixel. Of scans and drawings: edge of the cells [m].", show_default=False
+    ),
+]
 Storey = Annotated[str | None, typer.Option(metavar="NAME", help="Of an IFC model: a storey.", show_default=False)]
 MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
-Frequency = Annotated[float, typer.Option(help="Carrier frequency [Hz].")]
+Frequency = Annotated[
+    float,
+    typer.Option(
+        help="Carrier frequency [Hz], or with its unit: 5.2GHz.",
+        parser=parse_frequency,
+        metavar="HZ",
+        show_default=f"{CARRIER_FREQUENCY_HZ / 1e9:g}GHz",
+    ),
+]
 MaxDepth = Annotated[int, typer.Option(help="Largest number of interactions on a path.")]
 Diffraction = Annotated[
     bool,
@@ -68,12 +118,22 @@ ThroughWalls = Annotated[
 Measured = Annotated[
     Path | None,
     typer.Option(
-        metavar="CSV", help="Measured gains, or powers as a phone writes them (x, y, rssi).", show_default=False
+        metavar="CSV|VWM",
+        help="Measured gains, or powers as a phone (x, y, rssi) or Valeronoi (.vwm) writes them.",
+        show_default=False,
     ),
 ]
 Columns = Annotated[
     list[str] | None,
     typer.Option("--column", metavar="NAME=HEADER", help="A header of the CSV: gain_db=level.", show_default=False),
+]
+AccessPoint = Annotated[
+    str | None,
+    typer.Option(
+        metavar="BSSID|SSID",
+        help="Of a recording (.vwm): its access point. Default: the one with most measurements.",
+        show_default=False,
+    ),
 ]
 RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
 Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
@@ -90,8 +150,24 @@ Drift = Annotated[float, typer.Option(help="Odometry drift per metre travelled [
 MissedWalls = Annotated[float, typer.Option(help="Fraction of walls that it does not detect, as glass [1].")]
 
 
+def in_options(message: str) -> str:
+    """Return a message of the package with switches as the command line has them: --strict for strict=True."""
+    return re.sub(r"\b(strict)=True\b", r"--\1", message)
+
+
 class OnceCommand(TyperCommand):
-    """Refuses an option that is given twice and is no list, of which the parser would take the last."""
+    """Groups its options in its help, and refuses an option that is given twice and is no list."""
+
+    def format_options(self, ctx: Any, formatter: Any) -> None:
+        """Write the options in their groups."""
+        options = {str(each.name): each for each in self.get_params(ctx) if each.param_type_name == "option"}
+        grouped = {name: title for title, names in GROUPS.items() for name in names}
+        for title in (*GROUPS, "Options"):
+            names = GROUPS.get(title, [name for name in options if name not in grouped])
+            rows = [options[name].get_help_record(ctx) for name in names if name in options]
+            if any(rows):
+                with formatter.section(title):
+                    formatter.write_dl([row for row in rows if row])
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Parse arguments, and count the options among them."""
@@ -153,10 +229,12 @@ def parse_material(text: str) -> Material:
     return Material(permittivity, conductivity_s_m, thickness_m)
 
 
-def read_measurements(path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None) -> Any:
-    """Read the CSV of --measurements, with headers as --column has them; None if there is none.
+def read_measurements(
+    path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None, access_point: str | None = None
+) -> Any:
+    """Read the file of --measurements, with headers as --column has them; None if there is none.
 
-    `tx` is the transmitter's position for a CSV without it.
+    `tx` is the transmitter's position for a file without it.
     """
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
@@ -164,10 +242,11 @@ def read_measurements(path: Path | None, column: list[str] | None, tx: tuple[flo
         raise typer.BadParameter(f"--column {wrong!r} is no NAME=HEADER: give gain_db=level.")
     if path is None:
         return None
-    columns = {name: header for name, _, header in pairs} or None
-    measured = sp.load_measurements(path, columns=columns)
+    options: dict[str, Any] = {"columns": {name: header for name, _, header in pairs} or None}
+    options["access_point"] = access_point
+    measured = sp.load_measurements(path, **options)
     if tx is not None and not measured.tx_known.any():
-        return sp.load_measurements(path, columns=columns, tx=tx)
+        return sp.load_measurements(path, **options, tx=tx)
     return measured
 
 
@@ -207,6 +286,7 @@ def _read_map(
     unit: Unit = None,
     storey: Storey = None,
     obstacle_height: ObstacleHeight = None,
+    resolution: Resolution = None,
 ) -> Any:
     pairs = [text.rpartition("=") for text in material_of or ()]
     for layer, _, material in pairs:
@@ -224,6 +304,7 @@ def _read_map(
         unit_m=unit,
         storey=storey,
         obstacle_height_m=obstacle_height,
+        resolution_m=resolution,
     )
 
 
@@ -278,14 +359,6 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
     run.__signature__ = inspect.Signature(keywords)  # type: ignore[attr-defined]
     run.__annotations__ = {name: parameter.annotation for name, parameter in options.items()}
     return run
-
-
-def _is_number(text: str) -> bool:
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
 
 
 @contextmanager

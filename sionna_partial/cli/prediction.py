@@ -1,15 +1,17 @@
 """Subcommands that predict: predict, network, channels, export-scene, explore, demo, info."""
 
+import math
 import re
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MEMORY_GB, CellState
+from sionna_partial.checks import require_number
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState
 from sionna_partial.display import part_of
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_files, read_columns
@@ -26,25 +28,47 @@ COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
 
 ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
 
+POWER_DBM, THRESHOLD_DBM = 20.0, -67.0
+"""Transmit power of a Wi-Fi access point, and the received power for which networks are planned [dBm]."""
+
+PICTURE = "coverage.png"
+"""Picture of a coverage map."""
+
 
 @opt.with_options
 def predict(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the coverage files.", show_default=False)],
     tx: Annotated[
-        str, typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given.")
+        str,
+        typer.Option(metavar="X Y [Z]", help="Transmitter [m]; found from --measurements if not given."),
     ] = "",
+    power: Annotated[
+        float | None,
+        typer.Option(
+            help=f"Transmit power, for the covered floor that is printed [dBm]. Default: {POWER_DBM:g}.",
+            show_default=False,
+        ),
+    ] = None,
     tx_antenna: opt.TxAntenna = "iso",
     azimuth: opt.Azimuth = 0.0,
     tilt: opt.Tilt = 0.0,
+    threshold: Annotated[
+        float | None,
+        typer.Option(
+            help=f"Received power that a receiver needs [dBm]. Default: {THRESHOLD_DBM:g}.", show_default=False
+        ),
+    ] = None,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.15,
     settings: opt.Settings,
     predictor: opt.PredictorName = "",
     measurements: opt.Measured = None,
     column: opt.Columns = None,
+    access_point: opt.AccessPoint = None,
     receivers: Annotated[
-        str, typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage.")
+        str,
+        typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage."),
     ] = "indoor",
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
@@ -53,7 +77,10 @@ def predict(
     """Predict the coverage of a transmitter on a partial map."""
     position, antenna = opt.parse_position(tx) if tx else None, opt.parse_antenna(tx_antenna, azimuth, tilt)
     suffixes = [_parse_format(name) for name in formats]
+    budget = _budget(power, threshold)
     with opt.reporting_to(out, "loading the predictor") as report:
+        from sionna_partial.plots.style import figure_png
+
         coverage = sp.predict_map(
             partial,
             position,
@@ -62,7 +89,7 @@ def predict(
             spacing_m=spacing,
             predictor=predictor or None,
             **settings,
-            measurements=opt.read_measurements(measurements, column, position),
+            measurements=opt.read_measurements(measurements, column, position, access_point),
             receivers=receivers,
             memory_gb=memory,
             progress=part_of(report, 0.0, 0.9),
@@ -71,8 +98,48 @@ def predict(
         with atomic_files(out) as folder:
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
-                sp.save_coverage(coverage, folder / name)
+                if name == PICTURE and budget:
+                    figure = sp.plot_coverage(coverage, threshold_db=budget.gain_db)
+                    (folder / name).write_bytes(figure_png(figure))
+                else:
+                    sp.save_coverage(coverage, folder / name)
     opt.print_files(out, names)
+    if budget:
+        typer.echo(_covered(coverage, budget) + (f"; open {out / PICTURE}" if PICTURE in names else ""))
+
+
+class _Budget(NamedTuple):
+    """Transmit power, and received power that a receiver needs [dBm]."""
+
+    power_dbm: float
+    threshold_dbm: float
+
+    @property
+    def gain_db(self) -> float:
+        """Path gain that a receiver needs [dB]."""
+        return min(max(self.threshold_dbm - self.power_dbm, GAIN_FLOOR_DB), 0.0)
+
+
+def _budget(power: float | None, threshold: float | None) -> _Budget | None:
+    """Return the budget with defaults; None if nothing was given."""
+    for name, value in (("--power", power), ("--threshold", threshold)):
+        if value is not None:
+            require_number(name, value, -200.0, 200.0)
+    if power is None and threshold is None:
+        return None
+    return _Budget(POWER_DBM if power is None else power, THRESHOLD_DBM if threshold is None else threshold)
+
+
+def _covered(coverage: Any, budget: _Budget) -> str:
+    """Return the covered fractions of each room, and in the last line of the floor, as a text."""
+    area = coverage.radio.area(budget.threshold_dbm, eirp_dbm=budget.power_dbm)
+    rows = zip(area.floor.values, area.fraction.values, strict=True)
+    parts = [(name, "none" if math.isnan(fraction) else f"{100 * fraction:.0f} %") for name, fraction in rows]
+    (_, observed), (_, every), *rooms = parts
+    what = f"above {area.threshold_dbm:g} dBm with probability {area.probability:g}"
+    text = f"{observed} of the observed floor, {every} of all, {what}, at {budget.power_dbm:g} dBm"
+    listed = ", ".join(f"{name.replace('_', ' ')} {fraction}" for name, fraction in rooms)
+    return f"by room: {listed}\n{text}" if listed else text
 
 
 @opt.with_options

@@ -39,10 +39,13 @@ MAX_RECEIVERS = 2_000_000
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 """Positions [m] along the dimension "tx" of the maps of several transmitters."""
 
+ROOM = "room"
+"""Variable with the rooms of a map that has names of rooms: flags, 0 for none."""
+
 ANTENNA = "tx_antenna"
 """Attribute of the map of one transmitter, coordinate along "tx" of several: its antenna."""
 
-_OF_ALL = ("observed", "cell_state", "wall_parts")
+_OF_ALL = ("observed", "cell_state", "wall_parts", ROOM)
 """Variables that do not depend on the transmitter."""
 
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
@@ -207,8 +210,7 @@ def coverage_map(
         "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
     }
     for name, values in columns.items():
-        fill = np.uint8(NO_RECEIVER) if name.endswith("link_state") else np.float32(np.nan)
-        layers[name] = np.full(receivers.valid.shape, fill)
+        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
         layers[name][receivers.valid] = values
     axes = {
         name: (
@@ -219,7 +221,14 @@ def coverage_map(
         )
         for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
     }
-    variables = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    if partial.room is not None:
+        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
+        names = {"none": 0}
+        for number, name in enumerate(partial.room_names, 1):
+            word = "_".join(name.split())
+            names[word if word and word not in names else f"{word}_{number}"] = number
+        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **_flags(names)}
     for name in (*DISTRIBUTION, "link_state"):
         variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
     return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
@@ -244,8 +253,9 @@ def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
     coordinates: dict[str, Any] = {
         name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
     }
-    joined = xr.concat([each.drop_vars(_OF_ALL) for each in maps], "tx", combine_attrs="drop_conflicts")
-    return joined.assign({name: maps[0][name] for name in _OF_ALL}).assign_coords(
+    of_all = [name for name in _OF_ALL if name in maps[0]]
+    joined = xr.concat([each.drop_vars(of_all) for each in maps], "tx", combine_attrs="drop_conflicts")
+    return joined.assign({name: maps[0][name] for name in of_all}).assign_coords(
         {"tx": names, ANTENNA: antennas, **coordinates}
     )
 
@@ -270,10 +280,8 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
     if missing or not coverage["valid"].size:
         raise SettingsError(f"coverage lacks {', '.join(missing) or 'receivers'}: {remedy}")
     for name, attributes in ATTRIBUTES.items():
-        whole = "units" not in attributes
-        require(
-            coverage[name].dtype.kind in ("biu" if whole else "f"), f"coverage.{name}", coverage[name].dtype, remedy
-        )
+        kinds = "f" if "units" in attributes else "biuf" if name.endswith("link_state") else "biu"
+        require(coverage[name].dtype.kind in kinds, f"coverage.{name}", coverage[name].dtype, remedy)
     for name, lowest in _LOWEST.items():
         require_number(f"coverage.{name}", coverage.attrs[name], lowest, 1e15, open_low=True)
     position_m = float_array("coverage.transmitter_m", coverage.attrs["transmitter_m"], SettingsError, remedy)
@@ -294,7 +302,8 @@ def _require_values(coverage: xr.Dataset) -> None:
     for name, attributes in ATTRIBUTES.items():
         values = coverage[name].to_numpy()
         if "flag_values" in attributes:
-            good, remedy = np.isin(values, attributes["flag_values"]), f"it is one of {[*attributes['flag_values']]}."
+            good = np.isin(values, attributes["flag_values"]) | (np.isnan(values) & ~valid)
+            remedy = f"it is one of {[*attributes['flag_values']]}."
         elif "units" in attributes:
             low, high = _RANGES["std" if "_std_" in name else attributes["units"]]
             good = ~valid | ((values >= low) & (values <= high))
@@ -474,9 +483,10 @@ class CoverageAccessor:
         Returns
         -------
         xarray.Dataset
-            On `floor`, "observed" (free cells) and "all" (each receiver weighted by the probability that it is indoors;
-            1 in free cells): `fraction` with at least that probability, `fraction_mean`, the mean probability, and the
-            size `area_m2`; NaN where there is no such floor. Several transmitters are on `tx`.
+            On `floor`, "observed" (free cells), "all" (each receiver weighted by the probability that it is indoors; 1
+            in free cells) and each room of the map: `fraction` with at least that probability, `fraction_mean`, the
+            mean probability, and the size `area_m2`; NaN where there is no such floor. Several transmitters are on
+            `tx`.
 
         Examples
         --------
@@ -491,7 +501,9 @@ class CoverageAccessor:
         above = self._probability_of(threshold_dbm - self._offset_db(eirp_dbm, rx_gain_db))
         valid, indoor = self._coverage["valid"].to_numpy() == 1, self._coverage["p_indoor"].to_numpy()
         free = np.broadcast_to(self._coverage["cell_state"].to_numpy() == CellState.FREE, above.shape)
-        weights = np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0)])
+        rooms = self._rooms()
+        of_rooms = [valid & free & room for room in rooms.values()]
+        weights = np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0), *of_rooms])
         total = weights.sum(axis=(-2, -1))
         dims = ("floor", *self._coverage["p_los"].dims[:-2])
         with np.errstate(invalid="ignore"):
@@ -499,9 +511,17 @@ class CoverageAccessor:
                 (weights * np.nan_to_num(each)).sum(axis=(-2, -1)) / total for each in (above >= probability, above)
             ]
         values = {"fraction": shares[0], "fraction_mean": shares[1], "area_m2": total * self._coverage.spacing_m**2}
-        coordinates = {"floor": ["observed", "all"]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
+        coordinates = {"floor": ["observed", "all", *rooms]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
         settings = {"threshold_dbm": float(threshold_dbm), "probability": float(probability)}
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
+
+    def _rooms(self) -> dict[str, Bools]:
+        """Return the receivers (ny, nx) in each room by its name."""
+        if ROOM not in self._coverage:
+            return {}
+        room = self._coverage[ROOM]
+        flags = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
+        return {name: room.to_numpy() == number for name, number in flags if number}
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
         """Return the sum of EIRP and receiver gain, () or (T, 1, 1) [dB]."""

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Progress, float_array, no_progress, require, require_names
+from sionna_partial.checks import Progress, float_array, no_progress, require, require_names, transmitter_names
 from sionna_partial.coverage.dataset import (
     ANTENNA,
     Receivers,
@@ -304,8 +304,8 @@ def transmitter_positions(
         raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
     positions = list(tx.values()) if isinstance(tx, Mapping) else tx
     positions = float_array("tx", positions, PositionError, "give x, y and z in metres, the same for all transmitters.")
-    tx_m = partial.require_positions("tx", with_height(positions))
-    names = [str(name) for name in tx] if isinstance(tx, Mapping) else [f"tx{number}" for number in range(len(tx_m))]
+    names = [str(name) for name in tx] if isinstance(tx, Mapping) else transmitter_names(len(np.atleast_1d(positions)))
+    tx_m = partial.require_positions("tx", with_height(positions), names=names)
     require_names("names of tx", names)
     return None if tx_m.ndim == 1 else names, tx_m.reshape(-1, 3)
 

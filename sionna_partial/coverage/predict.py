@@ -15,13 +15,14 @@ from sionna_partial.coverage.job import TxAntenna, predict_coverage
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation
 
 RECEIVERS = ("indoor", "anywhere")
 """Receivers that probabilities and gains refer to: indoors (default), or anywhere."""
 
 
+@takes_settings
 def predict_map(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike | Mapping[str, ArrayLike] | None = None,
@@ -47,8 +48,8 @@ def predict_map(
     a receiver is indoors wherever a cell is free, and outdoors elsewhere.
 
     Receivers inside walls, within 1.1 cm of a wall or at the transmitter (within 1.1 cm, or within wavelength / 4 pi,
-    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables are NaN and link
-    states 255.
+    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables and link states
+    are NaN. A NetCDF file holds these link states as 255, its `_FillValue`.
 
     Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
     probabilities and gains are averaged over 8 positions drawn from it.
@@ -58,8 +59,8 @@ def predict_map(
     scene : PartialMap, path, Simulation or LinkModel
         The map, or a file that `load_map` reads. With a `LinkModel`, later calls are faster.
     tx : (3,) or (2,) array-like, (T, 3) array-like, mapping of names to positions, or None
-        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx0",
-        "tx1" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
+        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx1",
+        "tx2" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
         1.5 m high unless they have its z.
     tx_antenna : Antenna, AntennaPattern or str, a sequence of these or mapping of names to them, optional
         Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains then

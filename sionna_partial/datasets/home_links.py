@@ -34,6 +34,19 @@ MAP_SUFFIXES = (".yaml", ".yml", ".npz")
 COMMON_STEMS = ("map", "scene")
 """Names of map files that do not name the home: it has the name of the folder."""
 
+NEAREST_M = 0.1
+"""Shortest distance of transmitter and receiver [m]."""
+
+FROM_BORDER_CELLS = 0.25
+"""Distance of transmitters and receivers from the borders of their cells [cells]."""
+
+_LIDAR_FRACTION = 2 / 3
+
+MAX_DRAWS = 1000
+"""Number of times that positions which cannot be used are drawn again."""
+
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class HomeSource:
@@ -112,20 +125,6 @@ def _maps_at(path: Path) -> Iterator[HomeSource]:
 def _scene_file(folder: Path) -> Path | None:
     """Return the map in a folder of one home."""
     return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)
-
-
-NEAREST_M = 0.1
-"""Shortest distance of transmitter and receiver [m]."""
-
-FROM_BORDER_CELLS = 0.25
-"""Distance of transmitters and receivers from the borders of their cells [cells]."""
-
-_LIDAR_FRACTION = 2 / 3
-
-MAX_DRAWS = 1000
-"""Number of times that positions which cannot be used are drawn again."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)

@@ -60,6 +60,9 @@ _NAMES = (
 )
 _FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
 
+Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
+"""Links, or one or more folders that `sionna-partial dataset` wrote."""
+
 
 def _columns(table: LinkTable) -> dict[str, Any]:
     context = table.context
@@ -298,10 +301,6 @@ class LinkTraces:
         """Return whether frequency (within 1e-6), diffraction and paths through walls are the same."""
         same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
         return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
-
-
-Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
-"""Links, or one or more folders that `sionna-partial dataset` wrote."""
 
 
 def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:

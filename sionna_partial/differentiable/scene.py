@@ -59,7 +59,7 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m
 from sionna_partial.prediction.windows import CELLS_M, map_windows
-from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
+from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
 from sionna_partial.tracing.path_set import PARAMETERS, PathSet
 from sionna_partial.tracing.simulation import Simulation
@@ -141,6 +141,7 @@ class DifferentiableScene:
     [4.343, 0.0, 0.0]
     """
 
+    @takes_settings
     def __init__(
         self,
         scene: PartialMap | str | Path | Simulation | LinkModel,

@@ -34,6 +34,15 @@ OFFICES = ("mixed", "open")
 _INDOOR_STD_DB = (0.0, 3.0, 8.03)
 """Shadow fading by LinkState [dB]."""
 
+ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
+"""Number of ends of a link that are in observed cells."""
+
+WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
+"""The predictor where receivers may be outside: as if all were indoors, and with `LinkPrediction.anywhere`."""
+
+ALWAYS_OUTAGE = "always outage"
+"""The baseline where most receivers are outside."""
+
 
 @dataclass(frozen=True)
 class Majority:
@@ -169,16 +178,6 @@ def baseline_predictions(
         "partial trace": LinkPrediction.of_trace(phi),
         **{f"TR 38.901 {office} office": tr38901_indoor(phi, frequency_hz, office) for office in OFFICES},
     }
-
-
-ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
-"""Number of ends of a link that are in observed cells."""
-
-WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
-"""The predictor where receivers may be outside: as if all were indoors, and with `LinkPrediction.anywhere`."""
-
-ALWAYS_OUTAGE = "always outage"
-"""The baseline where most receivers are outside."""
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import ndtr
 
 from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
@@ -145,25 +144,10 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
-    below, upto = _gain_probabilities(prediction, np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db))
+    gain_db = np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+    below, upto = (1.0 - prediction.probability_above(at_db) for at_db in (np.nextafter(gain_db, -np.inf), gain_db))
     width = np.maximum(upto - below, 1e-12)
     return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
-
-
-def _gain_probabilities(prediction: LinkPrediction, gain_db: Floats) -> tuple[Floats, Floats]:
-    """Predicted probabilities (N,) of a smaller gain, and of a gain that is not greater."""
-    floor, none = np.full_like(gain_db, GAIN_FLOOR_DB), np.zeros_like(gain_db)
-    below, upto = none.copy(), none.copy()
-    for p, mean_db, std_db in (
-        (prediction.p_outage, floor, none),
-        (prediction.p_los, prediction.gain_los_mean_db, prediction.gain_los_std_db),
-        (prediction.p_nlos, prediction.gain_nlos_mean_db, prediction.gain_nlos_std_db),
-    ):
-        offset_db = gain_db - mean_db
-        spread = ndtr(offset_db / np.where(std_db > 0.0, std_db, 1.0))
-        below += p * np.where(std_db > 0.0, spread, offset_db > 0.0)
-        upto += p * np.where(std_db > 0.0, spread, offset_db >= 0.0)
-    return below, upto
 
 
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:

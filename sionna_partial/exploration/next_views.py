@@ -38,7 +38,7 @@ from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
-from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls
 from sionna_partial.worlds.robot import (
     FORWARD_M,
@@ -197,6 +197,7 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
             stream.write(self.to_yaml())
 
 
+@takes_settings
 def next_views(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     tx: ArrayLike | None = None,

@@ -28,7 +28,7 @@ from sionna_partial.checks import (
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
+from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import NextViews, next_views
@@ -37,9 +37,6 @@ from sionna_partial.maps.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
-
-COARSER = 4
-"""Receiver spacing of the first answer, as a multiple of the spacing of the final one."""
 
 LATE_S = 30.0
 """A map whose stamp is older than the last stamp by less is late and is dropped; by more, the robot's clock has started

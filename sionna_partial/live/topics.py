@@ -38,6 +38,28 @@ UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 he
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
+HIGHEST_DOMAIN = 232
+"""Domains that have ports."""
+
+MOST_AT_ONCE = 100
+"""Number of messages of a topic that are taken before the next topic's."""
+
+POLL_S = 0.02
+"""Time between two looks for messages [s]."""
+
+_LIMITS = (
+    "<CycloneDDS><Domain><Internal>"
+    f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
+)
+
+MAX_BYTES = 100_000_000
+"""Largest message that is taken [bytes]."""
+
+RETRY_S = 1.0
+"""Time after which a server that is gone is looked for again [s]."""
+
+_log = logging.getLogger(__name__)
+
 
 @dataclass(frozen=True)
 class Topics(Checked):
@@ -188,21 +210,6 @@ def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) 
             listener.take(message.topic, message.content, message.time_s)
             while not rate and listener.live.step():
                 pass
-
-
-HIGHEST_DOMAIN = 232
-"""Domains that have ports."""
-
-MOST_AT_ONCE = 100
-"""Number of messages of a topic that are taken before the next topic's."""
-
-POLL_S = 0.02
-"""Time between two looks for messages [s]."""
-
-_LIMITS = (
-    "<CycloneDDS><Domain><Internal>"
-    f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
-)
 
 
 class Dds:
@@ -360,15 +367,6 @@ def filled(kind: str, values: Mapping[str, Any]) -> Any:
             value = [filled(description[0][1], each) for each in value]
         given[name] = value
     return struct(kind)(**given)
-
-
-MAX_BYTES = 100_000_000
-"""Largest message that is taken [bytes]."""
-
-RETRY_S = 1.0
-"""Time after which a server that is gone is looked for again [s]."""
-
-_log = logging.getLogger(__name__)
 
 
 class Rosbridge:

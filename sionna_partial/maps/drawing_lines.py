@@ -69,6 +69,32 @@ NO_WALL = "name of no wall"
 _AIA = re.compile(r"([A-Z]{1,2})-([A-Z]{4})((?:-[A-Z0-9]{4})*)(?:-([A-Z1-9]))?", re.IGNORECASE)
 _REFERENCE = re.compile(r"\||\$\d+\$")
 
+UNITS_M = {
+    "millimetres": 0.001,
+    "centimetres": 0.01,
+    "metres": 1.0,
+    "decimetres": 0.1,
+    "inches": 0.0254,
+    "feet": 0.3048,
+}
+"""Units in which plans are drawn [m]."""
+
+RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
+"""Misfit that units have in addition which are rare, unless the header has them."""
+
+POSSIBLE_M = (1.0, 2000.0)
+"""Longer side of any building [m]."""
+
+MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
+"""Differences of misfits from which the unit of the header is not taken; from which it is taken with a warning, or not
+taken if it is inches or feet and the drawing metric; and from which one unit is better than all others."""
+
+RASTER_CELLS = 1000
+"""Number of cells along the longer side of the plan in which openings are found."""
+
+MOST_LINES = 1500
+"""Number of the longest lines between which distances are taken."""
+
 
 def skip_reason(name: str) -> str:
     """Return the reason for which a layer is not read as walls, "" for one with walls.
@@ -250,33 +276,6 @@ def _curves(entity: Any) -> Iterator[Floats]:
             corners = np.array([corner.xyz for corner in path.flattening(flat, segments=4)])
         if len(corners) > 1:
             yield corners
-
-
-UNITS_M = {
-    "millimetres": 0.001,
-    "centimetres": 0.01,
-    "metres": 1.0,
-    "decimetres": 0.1,
-    "inches": 0.0254,
-    "feet": 0.3048,
-}
-"""Units in which plans are drawn [m]."""
-
-RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
-"""Misfit that units have in addition which are rare, unless the header has them."""
-
-POSSIBLE_M = (1.0, 2000.0)
-"""Longer side of any building [m]."""
-
-MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
-"""Differences of misfits from which the unit of the header is not taken; from which it is taken with a warning, or not
-taken if it is inches or feet and the drawing metric; and from which one unit is better than all others."""
-
-RASTER_CELLS = 1000
-"""Number of cells along the longer side of the plan in which openings are found."""
-
-MOST_LINES = 1500
-"""Number of the longest lines between which distances are taken."""
 
 
 class _Scale(NamedTuple):

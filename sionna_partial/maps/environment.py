@@ -40,6 +40,9 @@ DEGENERATE_M = 1e-6
 
 EnvironmentKind = Literal["plan", "mesh"]
 
+FAR_M = 1000.0
+"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
+
 
 @read_only
 @dataclass(frozen=True, eq=False)
@@ -269,10 +272,6 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
     if pair.shape != (2,) or not -MAX_COORDINATE_M <= pair[0] < pair[1] <= MAX_COORDINATE_M:
         raise MapError(f"{name} = {shown(given)} is not allowed: {remedy}")
     return float(pair[0]), float(pair[1])
-
-
-FAR_M = 1000.0
-"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Maps that reach farther are moved."""
 
 
 @dataclass(frozen=True)

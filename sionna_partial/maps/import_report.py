@@ -26,6 +26,17 @@ OPENING_RATIO = 0.65
 SMALLEST_RADIUS_CELLS = 4.0
 """Radius of the widest circle in the smallest room [cells]."""
 
+SIZES_M, DOORS_M = (3.0, 300.0), (0.5, 3.0)
+"""Plausible longer sides of a building, and plausible widths of doors [m]."""
+
+ENCLOSED_FRACTION = 0.1
+"""Fraction of the extent of a building that is free at least."""
+
+SHOWN_ROWS = 30
+"""Number of elements that the text of a report lists as used, and as skipped."""
+
+_Map = TypeVar("_Map", bound=Any)
+
 
 class Rooms(NamedTuple):
     """Number of rooms, and the widths [m] of the widest openings that join them, one for each room that is joined."""
@@ -75,18 +86,6 @@ def _join(clearance, order, nx, ratio, smallest):  # type: ignore[no-untyped-def
     for cell in order:
         areas += parent[cell] == cell and clearance[cell] >= smallest
     return openings[:count].copy(), areas
-
-
-SIZES_M, DOORS_M = (3.0, 300.0), (0.5, 3.0)
-"""Plausible longer sides of a building, and plausible widths of doors [m]."""
-
-ENCLOSED_FRACTION = 0.1
-"""Fraction of the extent of a building that is free at least."""
-
-SHOWN_ROWS = 30
-"""Number of elements that the text of a report lists as used, and as skipped."""
-
-_Map = TypeVar("_Map", bound=Any)
 
 
 class MapWarning(UserWarning):

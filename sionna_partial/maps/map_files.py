@@ -22,7 +22,9 @@ from sionna_partial.constants import (
     DRAWING_SUFFIXES,
     IFC_SUFFIXES,
     MESH_SUFFIXES,
+    PICTURE_SUFFIXES,
     POINT_SUFFIXES,
+    VACUUM_SUFFIXES,
     CellState,
 )
 from sionna_partial.errors import MapError, OutputError
@@ -38,7 +40,7 @@ from sionna_partial.files import (
 from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.import_report import ImportSource
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
-from sionna_partial.maps.ros_map import read_ros_map, write_ros_map
+from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
 ACCEPTED = (
@@ -46,8 +48,8 @@ ACCEPTED = (
     "the folder of a calibration, "
     f"a Mitsuba scene (folder or .xml), a mesh ({', '.join(MESH_SUFFIXES)}), a point cloud "
     f"({', '.join(POINT_SUFFIXES)}, .ply), a drawing ({', '.join(DRAWING_SUFFIXES)}), "
-    f"a building model ({', '.join(IFC_SUFFIXES)}), or a rosbag "
-    f"({', '.join(BAG_SUFFIXES)}, or a folder)"
+    f"a building model ({', '.join(IFC_SUFFIXES)}), the map of a vacuum robot ({', '.join(VACUUM_SUFFIXES)}), "
+    f"a floor plan as a picture ({', '.join(PICTURE_SUFFIXES)}), or a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
 """What load_map reads."""
 
@@ -92,8 +94,10 @@ def load_map(
         metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
         `.xml`, or a folder with one; a point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a
         floor plan (DXF; see `map_from_drawing`); a building model (IFC, with the extra `ifc`), whose
-        walls, columns, windows and curtain walls are cut 1.2 m above a storey, and whose doors are open; or a rosbag
-        (.bag, .mcap, .db3, or a folder; see `map_from_bag`).
+        walls, columns, windows and curtain walls are cut 1.2 m above a storey, and whose doors are open; the map of a
+        vacuum robot as Valetudo writes it (JSON), or the recording of Valeronoi (.vwm) with it, whose rooms become
+        `PartialMap.room`; a picture of a floor plan (PNG, JPEG, BMP), with `resolution_m`; or a rosbag (.bag, .mcap,
+        .db3, or a folder; see `map_from_bag`).
     strict : bool
         Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
         transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
@@ -109,7 +113,7 @@ def load_map(
         is. By default all cells above or below which the mesh has a surface.
     resolution_m : float or None
         Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
-        multiples of it.
+        multiples of it. Of a picture, the metres per pixel: a known length [m] over its number of pixels.
     up : {"z", "y"} or None
         Axis of a mesh or cloud that points up. By default y of glTF (.glb, .gltf), as its specification says, and z of
         other files, with a `MapWarning` if that looks wrong.
@@ -223,6 +227,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["material"] = json.dumps(asdict(partial.material))
         if partial.obstacle is not None:
             content["obstacle"], content["obstacle_heights_m"] = partial.obstacle, partial.obstacle_heights_m
+        if partial.room is not None:
+            content["room"], content["room_names"] = partial.room, json.dumps(partial.room_names)
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content, **partial.environment.arrays())
     else:
@@ -434,6 +440,18 @@ def _read_bag(source: Path) -> PartialMap:
     return map_from_bag(source)
 
 
+def _read_vacuum(source: Path) -> PartialMap:
+    from sionna_partial.maps.vacuum import read_vacuum_map
+
+    return read_vacuum_map(source)
+
+
+def _read_picture(source: Path, **options: Any) -> PartialMap:
+    from sionna_partial.maps.pictures import read_picture
+
+    return read_picture(source, **options)
+
+
 def _read_npz(source: Path) -> PartialMap:
     with decoding(source, "was not written by save_map", MapError, "save it again."):
         content = io.BytesIO(read_bytes(source, "path", MapError, MAX_MESH_BYTES))
@@ -452,6 +470,7 @@ def _read_npz(source: Path) -> PartialMap:
             of_walls = json.loads(str(content["wall_materials"])) if walls is not None else []
             obstacle = content.get("obstacle")
             heights_m = tuple(content["obstacle_heights_m"].tolist()) if obstacle is not None else ()
+            room, names = content.get("room"), tuple(json.loads(str(content.get("room_names", "[]"))))
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -460,7 +479,7 @@ def _read_npz(source: Path) -> PartialMap:
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
             wall_materials = tuple(Material(**record) for record in of_walls)
-    layers = walls, wall_materials, obstacle, heights_m
+    layers = walls, wall_materials, obstacle, heights_m, room, names
     return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, *layers)
 
 
@@ -481,6 +500,7 @@ _OPTIONS_OF = {
     "storey": "building models",
     "wall_layers": "drawings",
     "unit_m": "drawings and scans",
+    "resolution_m": "scans, drawings, building models and pictures",
 }
 """Files that options are for, other than scans."""
 
@@ -503,6 +523,8 @@ _READERS = {
     **dict.fromkeys(
         IFC_SUFFIXES, _Reader("a building model", _read_ifc, ("resolution_m", "layer_materials", "storey"))
     ),
+    **dict.fromkeys(VACUUM_SUFFIXES, _Reader("the map of a vacuum robot", _read_vacuum)),
+    **dict.fromkeys(PICTURE_SUFFIXES, _Reader("a picture", _read_picture, ("resolution_m",))),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
 """Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""
@@ -518,9 +540,8 @@ def _reader_of(source: Path) -> tuple[Path, _Reader]:
     if suffix in COVERAGE_SUFFIXES:
         remedy = "give the map that it was computed from; xarray.open_dataset reads a coverage (.nc)."
         raise MapError(f"path = '{source}' is a coverage, no map: {remedy}")
-    if suffix in (".pgm", ".png", ".bmp"):
-        remedy = f"give its YAML, such as '{source.with_suffix('.yaml')}'."
-        raise MapError(f"path = '{source}' is a bare image without resolution and origin: {remedy}")
+    if suffix == ".pgm":
+        raise bare_image(source)
     if suffix not in _READERS:
         raise MapError(f"path = '{source}' is of no known kind: give {ACCEPTED}.")
     return source, _READERS[suffix]

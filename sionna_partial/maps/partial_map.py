@@ -3,6 +3,7 @@
 import itertools
 import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -30,7 +31,7 @@ MAX_INTERIOR_CELLS = 2**53
 """Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 MAX_WALL_MATERIALS = 255
-"""Most materials of the walls of a map, and most heights of obstacles, which a byte per cell counts."""
+"""Most materials of the walls of a map, heights of obstacles, and rooms, which a byte per cell counts."""
 
 FREE_STANDING_M = 2.5
 """Extent along x and y up to which walls that stand free are furniture [m]."""
@@ -43,6 +44,9 @@ ROOM_M, BODY_M = 0.6, 0.3
 
 POCKET_M = 0.4
 """Edge of a square that an unknown region must hold for a robot to look into it [m]."""
+
+FAR_EXTENTS = 2.0
+"""Distance from the middle of a map, in its extents, from which a position is in another unit or of another map."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a point is on the border of a cell [cells]."""
@@ -86,6 +90,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
         At most 255 heights that `obstacle` counts [m].
+    room : (ny, nx) uint8 array or None
+        Room of each free cell: k for `room_names[k - 1]`, 0 for none. Kept read-only, and 0 where the cell is not free.
+    room_names : tuple of str
+        At most 255 names that `room` counts, such as those of the segments of a vacuum robot's map.
     import_source : ImportSource or None
         Facts about the file that the map was read from, for `import_report`. Maps that differ in it alone are equal.
 
@@ -113,6 +121,8 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     wall_materials: tuple[Material, ...] = ()
     obstacle: NDArray[np.uint8] | None = None
     obstacle_heights_m: tuple[float, ...] = ()
+    room: NDArray[np.uint8] | None = None
+    room_names: tuple[str, ...] = ()
     import_source: ImportSource | None = field(default=None, repr=False, compare=False)
 
     def __post_init__(self) -> None:
@@ -137,13 +147,15 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         object.__setattr__(self, "wall_material", self._layer("wall_material", "wall_materials"))
         object.__setattr__(self, "obstacle_heights_m", _checked_heights(self.obstacle_heights_m))
         object.__setattr__(self, "obstacle", self._layer("obstacle", "obstacle_heights_m"))
+        object.__setattr__(self, "room_names", _checked_names(self.room_names))
+        object.__setattr__(self, "room", self._layer("room", "room_names", CellState.FREE))
 
-    def _layer(self, name: str, counted: str) -> NDArray[np.uint8] | None:
-        """Return the numbers of the wall cells as a new read-only array, None where all are 0."""
+    def _layer(self, name: str, counted: str, of: CellState = CellState.WALL) -> NDArray[np.uint8] | None:
+        """Return the numbers of the cells of a state as a new read-only array, None where all are 0."""
         values = getattr(self, name)
         if values is None:
             return None
-        if self.mesh is not None:
+        if self.mesh is not None and of == CellState.WALL:
             raise MapError(f"{name} is for floor plans: a mesh has walls of its own.")
         cells, count = grid_array(name, values, "iub"), len(getattr(self, counted))
         if cells.shape != self.shape:
@@ -151,7 +163,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         if cells.min() < 0 or cells.max() > count:
             what = f"{name} has values {cells.min()} to {cells.max()}, and {counted} has {count} entries"
             raise MapError(f"{what}: give one for each value from 1 on; 0 is the default.")
-        cells = np.where(self.state == CellState.WALL, cells, 0).astype(np.uint8)
+        cells = np.where(self.state == of, cells, 0).astype(np.uint8)
         cells.setflags(write=False)
         return cells if cells.any() else None
 
@@ -172,7 +184,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
             window[inside] = cells[own]
             return window
 
-        names = "wall_material", "obstacle"
+        names = "wall_material", "obstacle", "room"
         layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
@@ -385,8 +397,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         ]
         return np.asarray(np.any(found, axis=0))
 
-    def require_positions(self, name: str, points_m: object, *, least: int = 1) -> Floats:
-        """Check radio positions (3,) or (N, 3) [m], called `name` in messages, and return them as a float64 array.
+    def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
+        """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
+
+        Messages call the argument `name`, and each position by its name in `names`, if there are any.
 
         Raises
         ------
@@ -399,9 +413,9 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         for fault, what, remedy in self._position_faults(flat):
             if fault.any():
                 index = int(np.argmax(fault))
-                which = name if points.ndim == 1 else f"{name}[{index}]"
+                which = name if points.ndim == 1 else names[index] if names else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
-                remedy += self._turned_hint(flat)
+                remedy += self._turned_hint(flat) or self._unit_hint(flat[index])
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
 
@@ -412,6 +426,19 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         for name, state in turns.items() if can_tell else ():
             if (PartialMap(state, self.resolution_m, self.origin_m).state_at(points_m) == CellState.FREE).all():
                 return f" All {len(points_m)} are free on the map {name}."
+        return ""
+
+    def _unit_hint(self, point_m: Floats) -> str:
+        """Ask for metres where a position (3,) far outside would be on the map in another unit."""
+        x0, y0, x1, y1 = self.bounds_m
+        if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
+            return ""
+        for unit, factor in (("millimetres", 1e-3), ("centimetres", 1e-2)):
+            for scale in (np.array([factor, factor, 1.0]), np.full(3, factor)):
+                meant = point_m * scale
+                if self.radios_can_stand(meant[None])[0]:
+                    text = ", ".join(f"{value:g}" for value in meant)
+                    return f" Did you mean metres? Taken for {unit} it is at ({text}) m."
         return ""
 
     def radios_can_stand(self, points_m: Floats) -> Bools:
@@ -625,6 +652,16 @@ def _checked_materials(values: object) -> tuple[Material, ...]:
     if len(materials) > MAX_WALL_MATERIALS:
         raise MapError(f"wall_materials has {len(materials)} materials: give at most {MAX_WALL_MATERIALS}.")
     return materials
+
+
+def _checked_names(values: object) -> tuple[str, ...]:
+    """Return names of rooms as a tuple, or raise a MapError."""
+    names = tuple(values) if isinstance(values, tuple | list) else (values,)
+    if len({*names}) < len(names) or not all(isinstance(name, str) and name and name.isprintable() for name in names):
+        raise MapError(f"room_names = {shown(values)} is not allowed: give different texts of printable characters.")
+    if len(names) > MAX_WALL_MATERIALS:
+        raise MapError(f"room_names has {len(names)} names: give at most {MAX_WALL_MATERIALS}.")
+    return names
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

@@ -179,7 +179,7 @@ def _layer(
     shape: tuple[int, ...],
     origin: tuple[float, float, float],
 ) -> States:
-    """Return the numbers of the wall cells, which are the shades of an image."""
+    """Return the numbers of cells, which are the shades of an image."""
     if image.mode != "L" or image.size != shape[::-1]:
         what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th listed."
         raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
@@ -218,6 +218,10 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         image = f"{path.stem}_obstacle.pgm"
         sheet["obstacle"] = {"image": image, "heights": [*partial.obstacle_heights_m]}
         images[path.with_name(image)] = partial.obstacle
+    if partial.room is not None:
+        image = f"{path.stem}_room.pgm"
+        sheet["room"] = {"image": image, "names": [*partial.room_names]}
+        images[path.with_name(image)] = partial.room
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
@@ -406,9 +410,16 @@ def _height_m(path: Path, field: str, value: object) -> float:
     return _number(path, {field: value}, field, 0.01, 100.0, "metres")
 
 
+def _room_name(path: Path, field: str, value: object) -> str:
+    if not isinstance(value, str):
+        raise _refuse(path, field, value, "give names of rooms.")
+    return value
+
+
 _LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "wall_material": ("materials", "wall_materials", _material),
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
+    "room": ("names", "room_names", _room_name),
 }
 """Layers of a map by their keys in the YAML: the key of what their shades count, its field of the map, its reader."""
 
@@ -486,13 +497,21 @@ def _read_pixels(sheet: _Sheet) -> _Pixels:
 
 
 def _decode(sheet: _Sheet) -> Image.Image:
+    image = opened_image(sheet.image, f"{sheet.source}: image = {shown(str(sheet.image))}", ("PPM", "PNG", "BMP"))
+    if image.mode == "F":
+        raise _refuse(sheet.source, "image", str(sheet.image), "it holds floating-point shades; save a PGM or PNG.")
+    return image
+
+
+def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Image:
+    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`, the argument and its value."""
     try:
         with (
-            open_regular(sheet.image, f"{sheet.source}: image", MapError, MAX_IMAGE_BYTES) as stream,
+            open_regular(path, given.partition(" = ")[0], MapError, MAX_IMAGE_BYTES) as stream,
             warnings.catch_warnings(),
         ):
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
-            image = Image.open(stream, formats=("PPM", "PNG", "BMP"))
+            image = Image.open(stream, formats=formats)
             too_large = image.width * image.height > MAX_CELLS
             if not too_large:
                 image.load()
@@ -501,14 +520,21 @@ def _decode(sheet: _Sheet) -> Image.Image:
     except Image.DecompressionBombError:
         too_large = True
     except Exception as error:  # decoders fail in many ways on damaged files
-        remedy = f"it is damaged or not a PGM, PNG or BMP ({error}); save the map again."
-        raise _refuse(sheet.source, "image", str(sheet.image), remedy) from error
+        kinds = " or ".join(", ".join(formats).replace("PPM", "PGM").rsplit(", ", 1))
+        remedy = f"it is damaged or not a {kinds} ({error}); save the map again."
+        raise MapError(f"{given} is not allowed: {remedy}") from error
     if too_large:
         remedy = f"it has more than {MAX_CELLS:,} cells; cut the map to the building or coarsen it."
-        raise _refuse(sheet.source, "image", str(sheet.image), remedy)
-    if image.mode == "F":
-        raise _refuse(sheet.source, "image", str(sheet.image), "it holds floating-point shades; save a PGM or PNG.")
+        raise MapError(f"{given} is not allowed: {remedy}")
     return image
+
+
+def bare_image(path: Path) -> MapError:
+    """Return the error for an image without resolution."""
+    remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
+    if path.suffix.lower() != ".pgm":
+        remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"
+    return MapError(f"path = '{path}' is a bare image without resolution and origin: {remedy}.")
 
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:

@@ -39,6 +39,22 @@ _ROUGH = 0.05
 _DEEP = 0.3
 """Wall cells behind faces per cell of a face on maps of full noise: measured on simulated lidars, 0.5 to 2.5."""
 
+RAGGED_FACTOR = 2.0
+"""Largest distance of a line from ragged walls, in tolerances."""
+
+_CORNERS = 64
+
+_RESIDUAL_COST = 3.0
+
+_RAGGED_TURNS = 4
+
+_RAGGED_SPACING = 10.0
+
+_LEVEL_CELLS = 1.0
+
+_ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
+"""Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
+
 
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) that bear outlines.
@@ -234,19 +250,6 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
         gone = simple & (around.sum(axis=0) >= 2)
         left[row[gone], column[gone]] = False
     return wall & ~left
-
-
-RAGGED_FACTOR = 2.0
-"""Largest distance of a line from ragged walls, in tolerances."""
-
-_CORNERS = 64
-_RESIDUAL_COST = 3.0
-_RAGGED_TURNS = 4
-_RAGGED_SPACING = 10.0
-_LEVEL_CELLS = 1.0
-
-_ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
-"""Corners (slope, offset) of the polygon of lines that are not steep and pass near the origin."""
 
 
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import logging
 import math
 import os
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +19,7 @@ from sionna_partial.checks import float_array, number_of, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
-from sionna_partial.files import read_columns
+from sionna_partial.files import decoding, is_path, read_columns
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 
@@ -47,6 +49,9 @@ MOST_MEASUREMENTS = 20_000
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
 """Number of other transmitters that the loss of walls is learnt from, and of the links of each."""
 
+VACUUM_HEIGHT_M = 0.1
+"""Height of the antenna of a vacuum robot [m]."""
+
 _log = logging.getLogger(__name__)
 
 _CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
@@ -65,7 +70,7 @@ _NAME_COLUMNS = (
 _STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 _GIVE = (
     "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV with the columns "
-    f"{', '.join(_CSV_COLUMNS)}."
+    f"{', '.join(_CSV_COLUMNS)}, or of a recording of Valeronoi (.vwm)."
 )
 
 
@@ -216,14 +221,17 @@ def load_measurements(
     columns: Mapping[str, str] | None = None,
     tx: ArrayLike | None = None,
     tx_power_dbm: float = 0.0,
+    access_point: str | None = None,
 ) -> Measurements:
-    r"""Read measurements from a CSV with a header, as a survey app writes it.
+    r"""Read measurements from a CSV with a header, as a survey app writes it, or from a recording of Valeronoi.
 
     Parameters
     ----------
     path : path-like
-        Its columns are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the receiver's.
-        Instead of gain_db there may be a received power: power_dbm, rssi or rsrp. Heights that are missing are 1.5 m.
+        Columns of a CSV are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the
+        receiver's. Instead of gain_db there may be a received power: power_dbm, rssi or rsrp. Heights that are missing
+        are 1.5 m. A recording (.vwm) has mean received powers of a vacuum robot, 0.1 m high, at positions on the map
+        that `load_map` reads from the same file; transmitters are not known.
     columns : mapping, optional
         Headers of the file for names of these columns, as ``{"rx_x": "east", "power_dbm": "level"}``. A header for
         gain_db that does not contain "gain" counts as a received power.
@@ -232,6 +240,8 @@ def load_measurements(
     tx_power_dbm : float
         Power that a receiver would report without path loss [dBm]. It is subtracted from received powers, never from
         gain_db. If it is not known, leave it out: `predict_map` and `calibrate_materials` estimate a common offset.
+    access_point : str, optional
+        BSSID or SSID of the access point of a recording; by default the one with most measurements.
 
     Returns
     -------
@@ -240,7 +250,8 @@ def load_measurements(
     Raises
     ------
     MeasurementError
-        If the file cannot be read, has no rows, lacks a column, or has values that are no measurements.
+        If the file cannot be read, has no rows, lacks a column or the access point, or has values that are no
+        measurements.
 
     Examples
     --------
@@ -252,16 +263,29 @@ def load_measurements(
     power_dbm = number_of(tx_power_dbm)
     if not math.isfinite(power_dbm):
         raise MeasurementError(f"tx_power_dbm = {shown(tx_power_dbm)} is not allowed: give a number of dBm.")
-    table = _read(path, columns, power_dbm)
+    table = _read(path, columns, power_dbm, access_point)
     if tx is not None and {"tx_x", "tx_y"} & {*table}:
         _log.warning("measurements '%s': tx is used instead of the columns tx_x and tx_y", path)
     return measurements_of(table if tx is None else table | {"tx": tx})
 
 
 def _read(
-    path: str | os.PathLike[str], columns: Mapping[str, str] | None = None, tx_power_dbm: float = 0.0
+    path: str | os.PathLike[str],
+    columns: Mapping[str, str] | None = None,
+    tx_power_dbm: float = 0.0,
+    access_point: str | None = None,
 ) -> dict[str, Floats]:
-    """Read the columns of a CSV by our names; `tx_power_dbm` is subtracted from received powers."""
+    """Read the columns of a file by our names; `tx_power_dbm` is subtracted from received powers."""
+    is_recording = is_path(path) and Path(path).suffix.lower() == ".vwm"
+    for name, value, other in (("columns", columns, is_recording), ("access_point", access_point, not is_recording)):
+        if value is not None and other:
+            kinds = "a CSV and not a recording (.vwm)" if is_recording else "a recording (.vwm) and not a CSV"
+            raise MeasurementError(
+                f"{name} = {shown(value)} is for {kinds}, as measurements '{path}' is: leave it out."
+            )
+    if is_recording:
+        table = _read_recording(Path(path), access_point)
+        return table | {"gain_db": table["gain_db"] - tx_power_dbm}
     names = _names_of_headers(columns)
     found, others = read_columns(path, "measurements", MeasurementError, names, _GIVE)
     absent = [header for header in (columns or {}).values() if not found.keys() & {names[header.strip().lower()]}]
@@ -285,6 +309,37 @@ def _read(
         message = "measurements '%s': columns that are not known are not used (%s); " + _NAME_COLUMNS.format("rx_x")
         _log.warning(message, path, ", ".join(others)[:200])
     return table
+
+
+def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
+    """Return the received powers of an access point in a recording of Valeronoi, and their positions."""
+    from sionna_partial.maps.vacuum import read_json  # few measurements are recordings of robots
+
+    raw, _, frame = read_json(path, "measurements", MeasurementError)
+    with decoding(path, "no recording of Valeronoi", MeasurementError):
+        rows = [row for row in raw["measurements"] if len(row["data"])]
+        points_m = frame.world_m([[number_of(row["x"]), number_of(row["y"])] for row in rows])
+        power_dbm = np.array([np.mean([number_of(value) for value in row["data"]]) for row in rows], dtype=np.float64)
+        points = {number: (str(wifi["bssid"]), str(wifi["ssid"])) for number, wifi in enumerate(raw["wifis"])}
+        of_row = [({-1: ("unknown", "unknown")} | points)[row["wifi"]] for row in rows]
+    if not rows:
+        raise MeasurementError(
+            f"measurements '{path}' has no measurements: let the robot drive while Valeronoi records."
+        )
+    counts = Counter(of_row).most_common()
+    listed = ", ".join(f"{ssid} ({bssid}): {count:,}" for (bssid, ssid), count in counts[:20])
+    asked = [point for point, _ in counts if access_point in (*point, None)]
+    remedy = "give the BSSID of one as access_point, or as --access-point on the command line"
+    if not asked or (access_point is not None and len(asked) > 1):
+        what = f"names {len(asked)} access points of measurements '{path}'"
+        raise MeasurementError(f"access_point = {shown(access_point)} {what}, which are {listed}: {remedy}.")
+    used = np.array([point == asked[0] for point in of_row])
+    if access_point is None and len(counts) > 1:
+        _log.warning(
+            "measurements '%s' are of %d access points (%s): the first is used; %s", path, len(counts), listed, remedy
+        )
+    height_m = np.full(len(rows), VACUUM_HEIGHT_M)
+    return {"rx": np.column_stack([points_m, height_m])[used], "gain_db": power_dbm[used]}
 
 
 def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:

@@ -21,7 +21,7 @@ from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, require_
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
-from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
@@ -40,6 +40,29 @@ _INDOOR_POSITIONS = 8
 _UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
 """Visibility falls as exp(-u / 4 m) with the unobserved length u; behind walls it is 0.8 exp(-d / 4 m) of that at the
 distance d. Fitted on made homes (others than in `benchmarks/placement.py`) to predicted coverage at -100 dB."""
+
+RECEIVERS = 120
+"""Largest number of receivers during the search; the final positions are compared at all receivers."""
+
+STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
+"""Number of positions that are traced first, and of those that are refined: fewest, most, and area for each [m^2].
+Fewer than 6 starts would miss the best room of a small home."""
+
+STEPS_M = (0.6, 0.25)
+"""Distances at which the refinement tries neighbours, in turn [m]."""
+
+OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
+
+OUTAGE["p_outage"] = 1.0
+"""Prediction of an outage that is certain."""
+
+_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
+
+SIMILARITY_PENALTY = 0.6
+"""Loss of score of a start that sees the same receivers as one that is chosen already."""
+
+FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
+"""The worst 5 % of the receivers, sorted by gain, count in full, and linearly less up to 15 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,29 +216,6 @@ def _boustrophedon(points_m: Floats) -> Indices:
     return np.lexsort((rows, np.round(np.where(stripe % 2 == 0, x, -x), 6), stripe))
 
 
-RECEIVERS = 120
-"""Largest number of receivers during the search; the final positions are compared at all receivers."""
-
-STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
-"""Number of positions that are traced first, and of those that are refined: fewest, most, and area for each [m^2].
-Fewer than 6 starts would miss the best room of a small home."""
-
-STEPS_M = (0.6, 0.25)
-"""Distances at which the refinement tries neighbours, in turn [m]."""
-
-OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
-OUTAGE["p_outage"] = 1.0
-"""Prediction of an outage that is certain."""
-
-_DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
-
-SIMILARITY_PENALTY = 0.6
-"""Loss of score of a start that sees the same receivers as one that is chosen already."""
-
-FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
-"""The worst 5 % of the receivers, sorted by gain, count in full, and linearly less up to 15 %."""
-
-
 @read_only
 @dataclass(frozen=True, eq=False)
 class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
@@ -294,6 +294,7 @@ class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitter(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     *,

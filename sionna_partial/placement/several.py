@@ -22,7 +22,7 @@ from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import RECEIVERS, PlacementArea, Search
 from sionna_partial.prediction.predictor import Predictor
-from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings
+from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation
 
 MOST_TRANSMITTERS = 16
@@ -95,6 +95,7 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
             stream.write(json.dumps(record, indent=1, sort_keys=True) + "\n")
 
 
+@takes_settings
 def place_transmitters(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,

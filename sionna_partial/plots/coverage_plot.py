@@ -3,6 +3,7 @@
 import io
 import itertools
 import math
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
+from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt
 
@@ -35,7 +37,8 @@ from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
-_NARROW_IN, _WIDE_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 7.2, 10.5, 0.35, 170, 3000
+_NARROW_IN, _WIDE_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0, 11.0, 0.75, 0.35, 170, 3000
+_ROW_NAME, _LOW_ASPECT, _OUTAGE_NOTE = 16, 0.2, "an outage counts as a path gain of \N{MINUS SIGN}150 dB"
 _NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
@@ -77,10 +80,10 @@ def coverage_layers(threshold_db: float) -> dict[str, Layer]:
             _variable("gain_mean_db"),
             Normalize(-150.0, -60.0),
             "viridis",
-            "dB; an outage counts \N{MINUS SIGN}150 dB",
+            "dB",
         ),
         "gain_std_db": Layer(
-            "Std. dev. of the path gain", _variable("gain_std_db"), Normalize(0.0, 40.0), "magma_r", "dB; with outages"
+            "Std. dev. of the path gain", _variable("gain_std_db"), Normalize(0.0, 40.0), "magma_r", "dB"
         ),
         "p_above": Layer(
             f"P(path gain > {threshold_db:g} dB)".replace("-", "\N{MINUS SIGN}"),
@@ -137,7 +140,7 @@ def plot_coverage(
     maps = transmitters_of(coverage)
     chosen = _choose(layers, threshold_db)
     figure = _plot_rows(maps, chosen) if len(maps) > 1 else _plot_sheet(next(iter(maps.values())), chosen)
-    figure.suptitle(headline("Coverage", maps))
+    figure.suptitle(headline("Coverage", maps).replace(": ", "\n", 1))
     _add_legend(figure, [*maps.values()], chosen)
     return figure
 
@@ -146,13 +149,13 @@ def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
     """Draw a panel for each layer."""
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
     columns = sheet_columns(len(layers), aspect)
-    figure, axes = _panels(math.ceil(len(layers) / columns), columns, aspect, keys_in=0.95 * columns)
+    figure, axes = _panels(math.ceil(len(layers) / columns), columns, aspect, keys_in=_KEY_IN * columns)
     panels = list(itertools.chain(*axes))
     for axis in panels[len(layers) :]:
         axis.set_axis_off()
     for axis, layer in zip(panels, layers, strict=False):
         _draw(axis, coverage, layer)
-        axis.set_title(layer.title)
+        axis.set_title(layer.title, fontsize="medium" if columns > 2 else "large")
         _add_key([axis], layer)
     return figure
 
@@ -164,9 +167,9 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
     for row, (name, coverage) in zip(axes, maps.items(), strict=True):
         for axis, layer in zip(row, layers, strict=True):
             _draw(axis, coverage, layer)
-        row[0].set_ylabel(f"{name}\n\ny [m]", parse_math=False)
+        row[0].set_ylabel(f"{textwrap.shorten(name, _ROW_NAME, placeholder='...')}\n\ny [m]", parse_math=False)
     for column, layer in zip(zip(*axes, strict=True), layers, strict=True):
-        column[0].set_title(layer.title)
+        column[0].set_title(layer.title, fontsize="medium")
         _add_key(column, layer, _KEY_PAD_IN / figure.get_figheight())
     return figure
 
@@ -190,7 +193,7 @@ def plot_comparison(
         _add_key(row, layer)
     for axis, (title, coverage) in zip(axes[0], coverages.items(), strict=True):
         axis.set_title(_heading(title, coverage))
-    figure.suptitle(headline("Coverage by what is observed of the map", {"": first}))
+    figure.suptitle(headline("Coverage by what is observed of the map", {"": first}).replace(": ", "\n", 1))
     _add_legend(figure, [first, *others], chosen)
     return figure
 
@@ -212,7 +215,7 @@ def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
     """
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
-        what = f"{what} if indoors"
+        what = f"{what} for receivers that are indoors"
     walls = f", {attributes['walls']}" if "walls" in attributes else ""
     return f"{what}: {transmitter_text(maps)}, {attributes['frequency_hz'] / 1e9:g} GHz{walls}"
 
@@ -227,8 +230,8 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
-    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 1.2), 12.0)
-    figure = Figure(figsize=(page, rows * (height + 0.35) + 1.1), dpi=_DPI, layout="compressed")
+    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), 12.0)
+    figure = Figure(figsize=(page, rows * (height + 0.35) + 1.6), dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axis in axes.flat:
         axis.set(xlabel="x [m]", ylabel="y [m]")
@@ -243,10 +246,18 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
     """
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
-        side, pad = ("bottom", pad_below) if pad_below else ("right", 0.05)
+        where: dict[str, Any] = {"location": "right", "pad": 0.05}
+        if pad_below:
+            where = {"location": "bottom", "pad": pad_below, "shrink": 0.88}
         extend = "neither" if layer.label == "probability" else "max"
-        bar = axes[0].figure.colorbar(colours, ax=axes, location=side, pad=pad, panchor=False, extend=extend)
-        bar.set_label(layer.label.replace("; ", ";\n"))
+        figure: Any = axes[0].figure
+        bar = figure.colorbar(colours, ax=axes, panchor=False, extend=extend, **where)
+        bar.set_label(layer.label)
+        (x0, x1), (y0, y1) = axes[0].get_xlim(), axes[0].get_ylim()
+        is_low = not pad_below and (y1 - y0) / (x1 - x0) < _LOW_ASPECT
+        bar.locator = MaxNLocator(2 if is_low else 4 if pad_below else 6)
+        if is_low:
+            bar.ax.yaxis.label.set(rotation=0, ha="left", va="center")
     elif layer.norm is None:
         _draw_triangle(axes[-1].inset_axes((0.32, -0.7, 0.36, 0.4) if pad_below else (1.02, 0.3, 0.36, 0.4)))
 
@@ -378,7 +389,8 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
         handles.append(
             Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
         )
-    legend_below(figure, handles, columns=4 if located else None)
+    note = _OUTAGE_NOTE if any(layer.label == "dB" for layer in layers) else ""
+    legend_below(figure, handles, columns=4 if located else None, title=note)
 
 
 def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float) -> bytes:

@@ -5,6 +5,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -75,25 +76,7 @@ source.change.emit()
 """
 """The error function follows Abramowitz and Stegun, 7.1.26, with an error below 1.5e-7."""
 
-_PAGE = """<!doctype html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; script-src 'unsafe-inline' 'unsafe-eval'; style-src 'unsafe-inline'; img-src data: blob:">
-<title>Coverage map</title>
-<style>body {{ font: 15px/1.5 sans-serif; margin: 1.5em; max-width: 900px }} h1 {{ font-size: 1.2em }}</style>
-{scripts}
-</head>
-<body>
-<h1>{headline}</h1>
-<div id="viewer"></div>
-<p>Star: transmitter{unknown}. Black: walls. Hatched: not observed. Grey: no receiver can stand there. In mean and
-standard deviation of the path gain, an outage counts &minus;150 dB. {several} Predictor: {predictor}.</p>
-<script>Bokeh.embed.embed_item({item}, "viewer")</script>
-</body>
-</html>
-"""
+_PAGE = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
 
 
 def coverage_page(coverage: xr.Dataset) -> bytes:
@@ -154,7 +137,7 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
 def radio_layers(servers: int) -> dict[str, Layer]:
     """Return layers of a transmitter with its power, or of the strongest of so many, by the name of their variable."""
     known = coverage_layers(THRESHOLD_DB)
-    level = Normalize(-130.0, -30.0), "viridis", "dBm; an outage counts \N{MINUS SIGN}150 dB of gain"
+    level = Normalize(-130.0, -30.0), "viridis", "dBm"
     ratio, numbers = (Normalize(-20.0, 50.0), "viridis", "dB"), Normalize(0, servers - 1)
     added: dict[str, tuple[str, Normalize, str | ListedColormap, str]] = {
         "power_mean_dbm": ("Mean received power", *level),

@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -17,7 +17,6 @@ from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
 from sionna_partial.datasets.link_table import stage_name
-from sionna_partial.evaluation.evaluate import Evaluation, Row
 from sionna_partial.evaluation.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.placement.several import NetworkPlacement
@@ -36,8 +35,35 @@ from sionna_partial.plots.style import (
 from sionna_partial.settings import Material
 from sionna_partial.tracing.power import reflection_loss_db
 
+if TYPE_CHECKING:
+    from sionna_partial.evaluation.evaluate import Evaluation, Row  # reads data sets with pyarrow, which is optional
+
 _WIDTH_IN, _DPI = 9.0, 130
 _STAR: dict[str, Any] = STAR | {"markersize": 15}
+
+ANGLES_DEG = np.linspace(0.0, 85.0, 171)
+"""Angles of incidence at which reflections are drawn [degrees]."""
+
+LARGEST_LOSS_DB = 30.0
+"""Largest loss of a reflection that is drawn [dB]."""
+
+_LINE: dict[str, Any] = {"linewidth": 1.6}
+
+_PANELS = {
+    "accuracy": "accuracy of the link state",
+    "rmse_db": "RMSE of the path gain [dB]",
+    "rmse_linked_db": "RMSE without outages [dB]",
+}
+
+_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
+"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
+
+_STYLES: dict[str, dict[str, Any]] = {
+    "test": {"marker": "o", "linestyle": "-"},
+    "train": {"marker": "s", "linestyle": "--", "fillstyle": "none"},
+}
+
+_IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
@@ -178,15 +204,6 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
     axis.plot(x, y, zorder=6, **_STAR)
 
 
-ANGLES_DEG = np.linspace(0.0, 85.0, 171)
-"""Angles of incidence at which reflections are drawn [degrees]."""
-
-LARGEST_LOSS_DB = 30.0
-"""Largest loss of a reflection that is drawn [dB]."""
-
-_LINE: dict[str, Any] = {"linewidth": 1.6}
-
-
 def plot_calibration(calibration: MaterialCalibration) -> Figure:
     """Draw a calibration of materials.
 
@@ -271,22 +288,7 @@ def _words(material: Material) -> str:
     return f"{material.relative_permittivity:.3g}, {material.conductivity_s_m:.2g} S/m"
 
 
-_PANELS = {
-    "accuracy": "accuracy of the link state",
-    "rmse_db": "RMSE of the path gain [dB]",
-    "rmse_linked_db": "RMSE without outages [dB]",
-}
-_COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
-"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
-
-_STYLES: dict[str, dict[str, Any]] = {
-    "test": {"marker": "o", "linestyle": "-"},
-    "train": {"marker": "s", "linestyle": "--", "fillstyle": "none"},
-}
-_IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
-
-
-def plot_stages(evaluation: Evaluation) -> Figure:
+def plot_stages(evaluation: "Evaluation") -> Figure:
     """Draw accuracy and gain errors against the stage of exploration, receivers indoors (paper, Fig. 6).
 
     The predictor and every baseline have a colour each. Solid lines are test homes; the dashed line is the predictor
@@ -304,7 +306,7 @@ def plot_stages(evaluation: Evaluation) -> Figure:
     return figure
 
 
-def _draw_lines(axis: Axes, rows: list[Row], name: str) -> None:
+def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
     """Draw one figure of merit."""
     models = list(dict.fromkeys(row.model for row in rows))
     for model, colour in zip(models, itertools.cycle(_COLOURS), strict=False):

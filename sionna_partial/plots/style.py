@@ -44,6 +44,8 @@ _SERVERS = "tab20"
 _POINTS = 72
 """Pixels of a notebook for each inch of a figure."""
 
+_WIDTH_IN, _DPI = 6.4, 110
+
 
 class Figure(matplotlib.figure.Figure):
     """A figure that a notebook shows when a cell ends with it, although pyplot has no part in it."""
@@ -96,12 +98,12 @@ def server_colours(count: int) -> list[tuple[float, ...]]:
     return [cmap(number % cmap.N) for number in range(count)]
 
 
-def legend_below(figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None) -> None:
-    """Draw a legend below the axes, in one row by default."""
-    figure.legend(handles=handles, loc="outside lower center", ncols=columns or len(handles), frameon=False)
-
-
-_WIDTH_IN, _DPI = 6.4, 110
+def legend_below(
+    figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None, title: str = ""
+) -> None:
+    """Draw a legend below the axes, in one row by default, with a line above it."""
+    count = columns or len(handles)
+    figure.legend(handles=handles, loc="outside lower center", ncols=count, frameon=False, title=title or None)
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:

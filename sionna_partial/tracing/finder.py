@@ -19,15 +19,13 @@ from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import SceneSolver, open_scene, set_antennas
-from sionna_partial.tracing.mesh.candidates import MeshCandidates
-from sionna_partial.tracing.mesh.crossings import MeshCrossings
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
-from sionna_partial.tracing.mesh.sequences import shoot_rays
+from sionna_partial.tracing.mesh.reflections import MeshReflections
+from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges
-from sionna_partial.tracing.plan.crossed_edges import CrossedEdgeCandidates
-from sionna_partial.tracing.plan.crossings import CrossingCandidates
-from sionna_partial.tracing.plan.diffraction import DiffractionCandidates, find_wedges
-from sionna_partial.tracing.plan.specular import Room, SpecularCandidates
+from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
+from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
 from sionna_partial.tracing.select import Block, Kind, rounds
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
@@ -99,30 +97,22 @@ class MeshScene:
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         """Return the kinds of candidates, by the sequences of planes that rays meet."""
-        depth, frequency_hz = self.settings.max_depth, self.settings.frequency_hz
-        rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, self.settings.samples_per_tx, depth)
-        materials = materials_of(solver.materials.values(), frequency_hz)
-        mesh = self.planes, solver.material_of_face
-        opaque: list[Kind] = [MeshCandidates(*mesh, rays, tx_m, rx_m, depth, materials, gains)]
-        if not self.settings.through_walls:
+        settings = self.settings
+        rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, settings.max_depth)
+        materials = materials_of(solver.materials.values(), settings.frequency_hz)
+        mesh = SolidMesh(*self.faces, self.cells, materials, solver.material_of_face)
+        opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
+        if not settings.through_walls:
             return opaque, []
-        solid = SolidMesh(self.tree, self.planes, self.bodies, self.cells, materials, solver.material_of_face)
-        return opaque, [MeshCrossings(solid, tx_m, rx_m, self.settings, gains)]
+        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, min(SPLIT_RAYS, settings.samples_per_tx), gains)]
 
     @cached_property
-    def planes(self) -> MeshPlanes:
-        """The planes of its faces."""
-        return group_planes(self.vertices_m, self.triangles)
-
-    @cached_property
-    def tree(self) -> FaceTree:
-        """Its faces, for lines through them."""
-        return face_tree(self.vertices_m[self.triangles], self.planes.plane)
-
-    @cached_property
-    def bodies(self) -> Bodies:
-        """Its closed bodies."""
-        return closed_bodies(self.vertices_m, self.triangles)
+    def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:
+        """Its faces for lines through them, their planes, and the closed bodies; opaque faces are not crossed."""
+        crossed = self.triangles if self.settings.through_walls else self.triangles[:0]
+        planes = group_planes(self.vertices_m, self.triangles)
+        tree = face_tree(self.vertices_m[crossed], planes.plane)
+        return tree, planes, closed_bodies(self.vertices_m, crossed)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.links import LinkSums
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
 
@@ -81,6 +81,7 @@ class GainGradients(Shown):
     scene_settings: SceneSettings
 
 
+@takes_settings
 def gain_gradients(
     scene: PartialMap | str | Path | Simulation,
     tx: ArrayLike,

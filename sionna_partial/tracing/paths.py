@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 
+SHORTEST_LEG_M = 0.0101
+"""Sionna RT drops paths with legs of 1 cm or less."""
+
 
 @dataclass(frozen=True)
 class SolvedPaths:
@@ -244,26 +247,31 @@ class Candidates:
         same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
         return same and (self.same_wall is None) == (other.same_wall is None)
 
+    @property
+    def columns(self) -> dict[str, NDArray[Any]]:
+        """The arrays that it has, by name, each with a row for every candidate."""
+        arrays = {name: value for name, value in vars(self).items() if name != "wedges"}
+        return {name: array for name, array in arrays.items() if array is not None}
+
     @classmethod
     def concatenate(cls, parts: list["Candidates"]) -> "Candidates":
         """Join candidates that can be verified together; at least one part."""
-        wedge = None if parts[0].wedge is None else np.concatenate([each.wedge for each in parts])  # type: ignore[misc]
-        same = None if parts[0].same_wall is None else np.concatenate([each.same_wall for each in parts])  # type: ignore[misc]
-        rx, kind, face, vertices_m = (
-            np.concatenate([getattr(each, name) for each in parts]) for name in ("rx", "kind", "face", "vertices_m")
-        )
-        return cls(rx, kind, face, vertices_m, wedge, parts[0].wedges, same)
+        joined = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+        return replace(parts[0], **joined)
 
     def widened(self, depth: int) -> "Candidates":
         """Return them with room for `depth` interactions."""
-        same_wall = None if self.same_wall is None else widened(self.same_wall, depth, 0)
-        kind, face = widened(self.kind, depth, 0), widened(self.face, depth, -1)
-        vertices_m = widened(self.vertices_m, depth, 0.0)
-        return replace(self, kind=kind, face=face, vertices_m=vertices_m, same_wall=same_wall)
+        nothing = {"kind": 0, "face": -1, "vertices_m": 0.0, "same_wall": 0}
+        columns = self.columns
+        return replace(
+            self, **{name: widened(columns[name], depth, nothing[name]) for name in columns.keys() & nothing}
+        )
+
+    def narrowed(self) -> "Candidates":
+        """Return them without the last columns, which none of them uses."""
+        used = max(1, int((self.kind > 0).sum(axis=1).max(initial=0)))
+        return replace(self, **{name: array[:, :used] for name, array in self.columns.items() if array.ndim > 1})
 
     def rows(self, index: Indices) -> "Candidates":
         """Pick some of the candidates."""
-        wedge = None if self.wedges is None or self.wedge is None else self.wedge[index]
-        same_wall = None if self.same_wall is None else self.same_wall[index]
-        columns = {name: getattr(self, name)[index] for name in ("rx", "kind", "face", "vertices_m")}
-        return replace(self, **columns, wedge=wedge, same_wall=same_wall)
+        return replace(self, **{name: array[index] for name, array in self.columns.items()})

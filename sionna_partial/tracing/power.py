@@ -216,9 +216,10 @@ def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def power_near(coefficients, cosine):  # type: ignore[no-untyped-def]
+def power_near(table, material, cosine):  # type: ignore[no-untyped-def]
     """Return the fraction of the power, of the better polarisation, that one slab reflects or lets through."""
-    te, tm = coefficients[min(int(cosine * COSINES + 0.5), COSINES)]
+    at = min(int(cosine * COSINES + 0.5), COSINES)
+    te, tm = table[material, at, 0], table[material, at, 1]
     return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
 
 
@@ -227,8 +228,8 @@ def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
     """Interpolate the coefficients TE and TM of a slab."""
     at = cosine * COSINES
     low = min(int(at), COSINES - 1)
-    part, first, second = at - low, table[material, low], table[material, low + 1]
-    return first[0] + part * (second[0] - first[0]), first[1] + part * (second[1] - first[1])
+    part, te, tm = at - low, table[material, low, 0], table[material, low, 1]
+    return te + part * (table[material, low + 1, 0] - te), tm + part * (table[material, low + 1, 1] - tm)
 
 
 @njit(cache=True)
@@ -382,7 +383,7 @@ def vertical_field(k):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def received_power(k, e):  # type: ignore[no-untyped-def]
-    """Fraction of the power that a vertical antenna receives of a field that comes in a direction."""
+    """Return the fraction of the power that a vertical antenna receives from a field with some direction."""
     vertical = vertical_field(k)
     field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
     return field.real**2 + field.imag**2

@@ -16,7 +16,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.checks import Progress, no_progress, require, require_choice, require_memory, settings_or_default
+from sionna_partial.checks import (
+    Progress,
+    no_progress,
+    require,
+    require_choice,
+    require_memory,
+    settings_or_default,
+    transmitter_names,
+)
 from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
@@ -24,7 +32,7 @@ from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
 from sionna_partial.scene.scene import scene_settings_of
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
 from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
@@ -94,6 +102,7 @@ class Simulation:
     [-67.4, -73.4]
     """
 
+    @takes_settings
     def __init__(
         self,
         scene: PartialMap | str | Path,
@@ -105,6 +114,12 @@ class Simulation:
         self.scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
         self.resolved = resolved_settings(self.partial, self.trace_settings, self.scene_settings)
         self._origin_m = np.array([*self.partial.origin_m, 0.0])
+
+    def __repr__(self) -> str:
+        x0, y0, x1, y1 = self.partial.bounds_m
+        frequency = f"{self.trace_settings.frequency_hz / 1e9:g} GHz"
+        walls = "through walls" if self.trace_settings.through_walls else "opaque walls"
+        return f"Simulation({x1 - x0:.4g} x {y1 - y0:.4g} m, {frequency}, {walls})"
 
     def links(
         self,
@@ -372,6 +387,7 @@ def simulation_of(
     return simulation
 
 
+@takes_settings
 def trace_links(
     scene: PartialMap | str | Path | Simulation | Simulated,
     tx: ArrayLike,
@@ -475,9 +491,9 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
 
 def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
     """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
-    tx_m, rx_m = partial.require_positions("tx", tx), _receivers(rx)
+    tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
     partial.require_positions("rx", rx_m, least=0)
-    tx_m, limit_m = tx_m.reshape(-1, 3), nearest_m(frequency_hz)
+    limit_m = nearest_m(frequency_hz)
     for source_m in tx_m:
         distance_m = np.linalg.norm(rx_m - source_m, axis=1)
         if distance_m.min(initial=math.inf) < limit_m:
@@ -491,9 +507,15 @@ def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequen
 
 def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
     """Return transmitters (T, 3) and receivers (N, 3) [m], and whether `checked_positions` takes each link (T, N)."""
-    tx_m, rx_m = partial.require_positions("tx", tx).reshape(-1, 3), _receivers(rx)
+    tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
     far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
     return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
+
+
+def _transmitters(partial: PartialMap, tx: ArrayLike) -> Floats:
+    """Return transmitters as (T, 3) [m], or raise an error that names one as tx1, tx2 and so on."""
+    points_m = position_array("tx", tx)
+    return partial.require_positions("tx", points_m, names=transmitter_names(len(points_m))).reshape(-1, 3)
 
 
 def _receivers(rx: ArrayLike) -> Floats:

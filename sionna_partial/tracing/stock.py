@@ -14,7 +14,7 @@ from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
 from sionna_partial.tracing.paths import SolvedPaths, Wedges
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS
+from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS
 
 TABLE_SIZE = 3_000_000
 """Entries of the hash table, at least: more lose fewer paths where refraction makes many, and take more memory."""

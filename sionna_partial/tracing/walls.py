@@ -155,7 +155,7 @@ def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyp
 def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
     """Return whether two faces, met at two fractions of a line from a to b, enclose the inside of one wall.
 
-    Faces that are across each other are a wall and the floor that it stands on, or two walls at a corner.
+    Faces that are across each other are a wall and the floor below it, or two walls at a corner.
     """
     normal, p, q = mesh.planes.normal, mesh.planes.plane[first], mesh.planes.plane[second]
     if abs(normal[p, 0] * normal[q, 0] + normal[p, 1] * normal[q, 1] + normal[p, 2] * normal[q, 2]) < 0.5:
@@ -243,7 +243,7 @@ def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-un
 
 @njit(cache=True)
 def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-def]
-    """Return whether a free cell lies on a leg between two fractions of it, except cells that the faces there cut."""
+    """Return whether a leg meets a free cell between two fractions of it, except cells that the faces there cut."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
     s, high = first * length + cells.cell_m, last * length - cells.cell_m

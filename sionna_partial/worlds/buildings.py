@@ -21,6 +21,32 @@ Rng = np.random.Generator
 _EMPTY_ROOM_M2 = 2.5
 _PILLARED_ROOM_M2 = 20.0
 
+_FREQUENCIES = (0.3, 0.25, 0.15, 0.1, 0.2)
+
+LARGEST_M = (100.0, 60.0)
+"""Length and width of the largest building [m]."""
+
+_BAND_M = (4.5, 10.5)
+
+_CORRIDOR_M = (1.6, 4.5)
+
+_BROAD_M = 11.0
+
+_MODULE_M = (2.4, 4.0)
+
+_HALL_M2 = (60.0, 1200.0)
+
+_SERVICE_M2 = 20.0
+
+_COLUMNED_ROOM_M2 = 120.0
+
+_BAY_M = 2.4
+
+_FAR_M = 1e3
+
+Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
+"""Draws the objects in a hall."""
+
 
 def union_of(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
     """Union of shapes on a grid of `GRID_M`."""
@@ -125,22 +151,6 @@ _KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
 )
 """Drawing function of each kind, and the probability that it is placed at a wall."""
 
-_FREQUENCIES = (0.3, 0.25, 0.15, 0.1, 0.2)
-
-
-LARGEST_M = (100.0, 60.0)
-"""Length and width of the largest building [m]."""
-
-_BAND_M = (4.5, 10.5)
-_CORRIDOR_M = (1.6, 4.5)
-_BROAD_M = 11.0
-_MODULE_M = (2.4, 4.0)
-_HALL_M2 = (60.0, 1200.0)
-_SERVICE_M2 = 20.0
-_COLUMNED_ROOM_M2 = 120.0
-_BAY_M = 2.4
-_FAR_M = 1e3
-
 
 class Layout(NamedTuple):
     """Rooms, through the middle of their walls, and fixed objects in them: columns, machines, shelves [m]."""
@@ -148,9 +158,6 @@ class Layout(NamedTuple):
     rooms: list[Polygon]
     fixtures: list[Polygon]
 
-
-Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
-"""Draws the objects in a hall."""
 
 LayoutMaker = Callable[[Rng, float, float], Layout]
 """Draws a layout from the area of the building and a typical area of its small rooms [m2]."""

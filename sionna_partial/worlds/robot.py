@@ -32,6 +32,52 @@ LOG_ODDS_LIMITS = (-2.0, 3.5)
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 _NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
 
+WIDE_M = 0.35
+"""Length of a frontier that is about as wide as a robot [m]."""
+
+FORWARD_M = 0.25
+"""Length of a forward action [m] (Active Neural SLAM, Section 4)."""
+
+TURN_DEG = 10
+"""Angle of a turn [degree] (Active Neural SLAM, Section 4)."""
+
+ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
+"""Radii of the robot [m]: it takes the largest with which it gets around in the home."""
+
+ROAMED_FRACTION = 0.95
+"""Fraction of the free area that the robot must be able to cover to get around."""
+
+GOAL_RANGES = 2.0
+"""Ranges of the sensor that the robot may go before it chooses its goal anew [1].
+
+25 actions with the camera of Active Neural SLAM (Section 4), which sees 3.2 m; more where one look shows more.
+"""
+
+GOAL_SHARPNESS = 3.0
+"""Power of a frontier's promise in its odds to become the goal [1].
+
+Active Neural SLAM's global policy draws its goals from a distribution. The best frontier every time would see more
+than the robot of the paper; with this power the mean observed fractions on real homes are the paper's.
+"""
+
+_AHEAD_M = 0.3
+
+_BUMP_M = 0.25
+
+_ARRIVAL_M = 0.3
+
+_DECISION_STEPS = 5.0
+
+_EIGHT = np.ones((3, 3), dtype=bool)
+
+_SMALLEST_FRONTIER_CELLS = 3
+
+_COMFORT_M = 0.3
+
+_COMFORT_COST = 3.0
+
+_TIGHT_COST = 15.0
+
 
 class Camera:
     """Sees a home (ny, nx), with unknown cells all around, from where the robot is; maps it where it believes to be.
@@ -212,45 +258,6 @@ def _next(walk):  # type: ignore[no-untyped-def]
         row, next_y = row + walk.step_y, next_y + walk.pace_y
     leaves = max(min(next_x, next_y), walk.leaves + 1e-9)
     return _Walk(row, column, walk.leaves, leaves, walk.step_x, walk.step_y, walk.pace_x, walk.pace_y, next_x, next_y)
-
-
-WIDE_M = 0.35
-"""Length of a frontier that is about as wide as a robot [m]."""
-
-FORWARD_M = 0.25
-"""Length of a forward action [m] (Active Neural SLAM, Section 4)."""
-
-TURN_DEG = 10
-"""Angle of a turn [degree] (Active Neural SLAM, Section 4)."""
-
-ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
-"""Radii of the robot [m]: it takes the largest with which it gets around in the home."""
-
-ROAMED_FRACTION = 0.95
-"""Fraction of the free area that the robot must be able to cover to get around."""
-
-GOAL_RANGES = 2.0
-"""Ranges of the sensor that the robot may go before it chooses its goal anew [1].
-
-25 actions with the camera of Active Neural SLAM (Section 4), which sees 3.2 m; more where one look shows more.
-"""
-
-GOAL_SHARPNESS = 3.0
-"""Power of a frontier's promise in its odds to become the goal [1].
-
-Active Neural SLAM's global policy draws its goals from a distribution. The best frontier every time would see more
-than the robot of the paper; with this power the mean observed fractions on real homes are the paper's.
-"""
-
-_AHEAD_M = 0.3
-_BUMP_M = 0.25
-_ARRIVAL_M = 0.3
-_DECISION_STEPS = 5.0
-_EIGHT = np.ones((3, 3), dtype=bool)
-_SMALLEST_FRONTIER_CELLS = 3
-_COMFORT_M = 0.3
-_COMFORT_COST = 3.0
-_TIGHT_COST = 15.0
 
 
 class Frontier(NamedTuple):

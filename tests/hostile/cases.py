@@ -147,7 +147,7 @@ SPOILS = (
 KINDS = (
     *("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz", "plan.dxf", "drive.bag", "drive.mcap", "drive.db3"),
     *("map.yaml", "map.pgm", "map.npz", "mesh.ply", "mesh.obj", "scene.xml", "scene folder", "measurements.csv"),
-    *("antenna.msi",),
+    *("antenna.msi", "vacuum.json", "vacuum.vwm", "plan.png"),
     *("predictor.keras", "predictor.json", "coverage.nc", "channels.nc", "dataset.parquet", "dataset.json"),
 )
 

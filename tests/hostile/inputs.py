@@ -158,6 +158,30 @@ def _csv(folder: Path) -> Path:
     return path
 
 
+def _vacuum(suffix: str, folder: Path) -> Path:
+    sys.path.insert(0, str(Path(HERE).parent))
+    from vacuum_files import valetudo_map, write_json, write_recording
+
+    path = folder / f"home{suffix}"
+    return write_json(path, valetudo_map()) if suffix == ".json" else write_recording(path)
+
+
+def _read_recording(path: Path) -> None:
+    for read in (sp.load_map, sp.load_measurements):
+        with suppress(sp.SionnaPartialError):
+            read(path)
+
+
+def _picture(folder: Path) -> Path:
+    from PIL import Image
+
+    picture = np.full((90, 120), 255, np.uint8)
+    picture[5:85, 5:115] = 0
+    picture[9:81, 9:111] = 255
+    Image.fromarray(picture).save(folder / "plan.png")
+    return folder / "plan.png"
+
+
 def _antenna(folder: Path) -> Path:
     path, cut = folder / "antenna.msi", "".join(f"{angle} {min(angle, 360 - angle) / 6}\n" for angle in range(360))
     path.write_text(f"NAME a\nGAIN 9 dBi\nHORIZONTAL 360\n{cut}VERTICAL 360\n{cut}", encoding="ascii")
@@ -317,6 +341,9 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
     "scene.xml": (_scene, lambda path: sp.load_map(path, resolution_m=0.2)),
     "scene folder": (_scene, lambda path: sp.load_map(path.parent)),
     "antenna.msi": (_antenna, sp.load_antenna),
+    "vacuum.json": (functools.partial(_vacuum, ".json"), sp.load_map),
+    "vacuum.vwm": (functools.partial(_vacuum, ".vwm"), _read_recording),
+    "plan.png": (_picture, lambda path: sp.load_map(path, resolution_m=0.05)),
     "measurements.csv": (_csv, lambda path: sp.calibrate_materials(room(), path)),
     "predictor.keras": (_predictor, sp.Predictor.load),
     "predictor.json": (

@@ -31,12 +31,11 @@ _FACE_TOLERANCE_M = 1e-3
 """Distance beyond a face [m] up to which a point counts as on it."""
 
 
-class FaceTree(NamedTuple):
-    """F faces in a tree of K boxes; box 0 holds all.
+class Boxes(NamedTuple):
+    """F items in a tree of K boxes; box 0 holds all.
 
-    Box k holds the part `start` to `stop` of the faces in `order` (F,), whose corners are `corner_m` (F, 3, 3) in that
-    order, and `child` is the first of the two boxes in it, or -1. `low_m`, `high_m` (K, 3) are the corners of the
-    boxes. `plane` (F,) is the plane of each face, counted as the mesh counts them.
+    Box k holds the part `start` to `stop` of the items in `order` (F,), and `child` is the first of the two boxes in
+    it, or -1. `low_m`, `high_m` (K, 3) are the corners of the boxes.
     """
 
     order: NDArray[np.int64]
@@ -45,25 +44,28 @@ class FaceTree(NamedTuple):
     child: NDArray[np.int64]
     low_m: Floats
     high_m: Floats
+
+
+class FaceTree(NamedTuple):
+    """F faces in boxes: their corners (F, 3, 3) in the order of the boxes, and the plane of each face (F,)."""
+
+    boxes: Boxes
     corner_m: Floats
     plane: NDArray[np.int32]
 
 
 def face_tree(corner_m: Floats, plane: NDArray[np.int32]) -> FaceTree:
     """Sort faces with corners (F, 3, 3) [m], each of one of some planes (F,), into boxes."""
-    order, start, stop, child, low_m, high_m = _divide(corner_m)
-    return FaceTree(order, start, stop, child, low_m, high_m, corner_m[order], plane)
+    boxes = divide(corner_m.min(axis=1), corner_m.max(axis=1), _LEAF)
+    return FaceTree(boxes, corner_m[boxes.order], plane)
 
 
 @njit(cache=True)
-def _divide(corner):  # type: ignore[no-untyped-def]
-    """Divide faces into boxes, each time at the median of their middles along the longest side."""
-    count = len(corner)
-    size = 4 * (count // _LEAF + 1)
-    order, middle = np.arange(count), np.empty((count, 3))
-    for f in range(count):
-        for axis in range(3):
-            middle[f, axis] = corner[f, :, axis].min() + corner[f, :, axis].max()
+def divide(low_m, high_m, leaf):  # type: ignore[no-untyped-def]
+    """Divide items with these corners into boxes of at most `leaf`, each at the median along the longest side."""
+    count = len(low_m)
+    size = 4 * (count // leaf + 1)
+    order, middle = np.arange(count), low_m + high_m
     start, stop, child = np.zeros(size, np.int64), np.zeros(size, np.int64), np.full(size, -1, np.int64)
     low, high = np.full((size, 3), np.inf), np.full((size, 3), -np.inf)
     stop[0], boxes, box = count, 1, 0
@@ -71,13 +73,15 @@ def _divide(corner):  # type: ignore[no-untyped-def]
         longest, spread = 0, -1.0
         for axis in range(3):
             least, most = np.inf, -np.inf
-            for k in range(start[box], stop[box]):
-                low[box, axis] = min(low[box, axis], corner[order[k], :, axis].min())
-                high[box, axis] = max(high[box, axis], corner[order[k], :, axis].max())
-                least, most = min(least, middle[order[k], axis]), max(most, middle[order[k], axis])
+            for item in order[start[box] : stop[box]]:
+                low[box, axis], high[box, axis] = (
+                    min(low[box, axis], low_m[item, axis]),
+                    max(high[box, axis], high_m[item, axis]),
+                )
+                least, most = min(least, middle[item, axis]), max(most, middle[item, axis])
             if most - least > spread:
                 longest, spread = axis, most - least
-        if stop[box] - start[box] > _LEAF:
+        if stop[box] - start[box] > leaf:
             inside = order[start[box] : stop[box]].copy()
             order[start[box] : stop[box]] = inside[np.argsort(middle[inside, longest], kind="mergesort")]
             half = (start[box] + stop[box]) // 2
@@ -85,7 +89,7 @@ def _divide(corner):  # type: ignore[no-untyped-def]
             child[box] = boxes
             boxes += 2
         box += 1
-    return order, start[:boxes], stop[:boxes], child[:boxes], low[:boxes], high[:boxes]
+    return Boxes(order, start[:boxes], stop[:boxes], child[:boxes], low[:boxes], high[:boxes])
 
 
 class Met(NamedTuple):
@@ -104,7 +108,7 @@ def scratch():  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def faces_between(tree, a, b, own, other, met):  # type: ignore[no-untyped-def]
-    """Write the faces between two points, but those in the planes `own` and `other`, and return their number.
+    """Write the faces between two points, except faces in the planes `own` and `other`, and return their number.
 
     Several faces in one plane count once.
     """
@@ -112,25 +116,25 @@ def faces_between(tree, a, b, own, other, met):  # type: ignore[no-untyped-def]
     ix = 1.0 / dx if dx != 0.0 else 1e300
     iy = 1.0 / dy if dy != 0.0 else 1e300
     iz = 1.0 / dz if dz != 0.0 else 1e300
-    count, top = 0, 1
+    boxes, count, top = tree.boxes, 0, 1
     met.stack[0] = 0
     while top > 0:
         top -= 1
         box = met.stack[top]
-        x0, x1 = (tree.low_m[box, 0] - 1e-6 - a[0]) * ix, (tree.high_m[box, 0] + 1e-6 - a[0]) * ix
-        y0, y1 = (tree.low_m[box, 1] - 1e-6 - a[1]) * iy, (tree.high_m[box, 1] + 1e-6 - a[1]) * iy
-        z0, z1 = (tree.low_m[box, 2] - 1e-6 - a[2]) * iz, (tree.high_m[box, 2] + 1e-6 - a[2]) * iz
+        x0, x1 = (boxes.low_m[box, 0] - 1e-6 - a[0]) * ix, (boxes.high_m[box, 0] + 1e-6 - a[0]) * ix
+        y0, y1 = (boxes.low_m[box, 1] - 1e-6 - a[1]) * iy, (boxes.high_m[box, 1] + 1e-6 - a[1]) * iy
+        z0, z1 = (boxes.low_m[box, 2] - 1e-6 - a[2]) * iz, (boxes.high_m[box, 2] + 1e-6 - a[2]) * iz
         first = max(min(x0, x1), min(y0, y1), min(z0, z1), 0.0)
         if first > min(max(x0, x1), max(y0, y1), max(z0, z1), 1.0):
             continue
-        if tree.child[box] >= 0:
-            met.stack[top], met.stack[top + 1] = tree.child[box], tree.child[box] + 1
+        if boxes.child[box] >= 0:
+            met.stack[top], met.stack[top + 1] = boxes.child[box], boxes.child[box] + 1
             top += 2
             continue
-        for k in range(tree.start[box], tree.stop[box]):
+        for k in range(boxes.start[box], boxes.stop[box]):
             t = _meets(tree.corner_m[k], a, dx, dy, dz)
             if 0.0 < t < 1.0:
-                count = _insert(tree.order[k], t, tree.plane, own, other, met, count)
+                count = _insert(boxes.order[k], t, tree.plane, own, other, met, count)
     return count
 
 

@@ -1,4 +1,10 @@
-"""Rays from a transmitter, and the sequences of planes that they meet."""
+"""The sequences of planes that rays from a transmitter meet.
+
+Between opaque faces, Mitsuba reflects many rays. Where faces let power through, every ray splits at every face into a
+reflected ray and one that goes on; fewer rays are followed, here, down to the power that still matters. An opaque face
+is a face with transmission 0, where only the reflected ray is left: Mitsuba follows ten times as many of these rays in
+less time. Both fill the same tree.
+"""
 
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -6,14 +12,28 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.floor_plan import grow
-from sionna_partial.tracing.mesh.faces import MeshPlanes, mix
+from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, Met, faces_between, mix, scratch
+from sionna_partial.tracing.power import COSINES, Gains, gain_towards
+from sionna_partial.tracing.select import Limits, NeedsByDistance, discount_after, matters
+from sionna_partial.tracing.walls import SolidMesh, cosine_at, is_one_wall
 
-MARGIN = 8.0
-"""Distance in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays."""
+SPLIT_RAYS = 20_000
+"""Number of rays that are split at faces; fewer where fewer are asked for."""
 
 _RAYS_PER_CHUNK = 250_000
+
+
+class MeshLinks(NamedTuple):
+    """The mesh, both ends of all paths of a call, their limits, and the gains of the transmit antenna."""
+
+    mesh: SolidMesh
+    tx_m: Floats
+    rx_m: Floats
+    limits: Limits
+    gains: Gains
 
 
 class Rays(NamedTuple):
@@ -103,7 +123,8 @@ class Sequences(NamedTuple):
 
     `parent` (M,) is the sequence without its last plane (-1 for none), `plane` (M,) that plane. Boxes `low`, `high`
     (M, 3) hold the unit directions in which rays left it, and `reach_m` (M,) is the unfolded length of the longest of
-    these rays, to where it met the next face. `table` is a hash table of the sequences, -1 where it is empty.
+    these rays, to where it met the next face. `left` (M,) is the largest fraction of power that split rays had left.
+    `table` is a hash table of the sequences, -1 where it is empty.
     """
 
     parent: NDArray[np.int32]
@@ -111,6 +132,7 @@ class Sequences(NamedTuple):
     low: NDArray[np.float32]
     high: NDArray[np.float32]
     reach_m: NDArray[np.float32]
+    left: Floats
     table: NDArray[np.int32]
     size: int
     rays: int
@@ -131,54 +153,57 @@ class Views(NamedTuple):
 
 def collect_sequences(rays: Iterable[Rays], planes: MeshPlanes) -> Sequences:
     """Make the tree of all sequences of planes that rays have met."""
-    sequences = Sequences(
-        parent=np.empty(1024, np.int32),
-        plane=np.empty(1024, np.int32),
-        low=np.empty((1024, 3), np.float32),
-        high=np.empty((1024, 3), np.float32),
-        reach_m=np.empty(1024, np.float32),
-        table=np.full(4096, -1, np.int32),
-        size=0,
-        rays=0,
-    )
+    sequences, size = _no_sequences(), 0
     for part in rays:
-        sequences = _add_rays(sequences, part.face, part.leg_m, part.direction, planes.plane)
+        added, depth = 0, part.face.shape[1]
+        while added < len(part.face):
+            if size + depth > len(sequences.parent):
+                sequences = _with_room(sequences, size, depth)
+            added, size = _add_rays(sequences, size, added, part.face, part.leg_m, part.direction, planes.plane)
+        sequences = sequences._replace(size=size, rays=sequences.rays + added)
     return sequences
 
 
+def _no_sequences() -> Sequences:
+    """Return a tree without sequences or room for any."""
+    numbers, directions = (np.empty(0, np.int32) for _ in range(3)), (np.empty((0, 3), np.float32) for _ in range(2))
+    parent, plane, table = numbers
+    return Sequences(parent, plane, *directions, np.empty(0, np.float32), np.empty(0), table, 0, 0)
+
+
 @njit(cache=True)
-def _add_rays(sequences, face, leg, direction, plane_of):  # type: ignore[no-untyped-def]
-    """Add the sequences of some rays to the tree."""
-    parent, plane, low, high, reach, table, count, rays = sequences
-    for i in range(face.shape[0]):
-        room = count + face.shape[1]
-        if room > len(parent):
-            parent, plane, reach = grow(parent, room), grow(plane, room), grow(reach, room)
-            low, high = grow(low, room), grow(high, room)
-        if 2 * room > len(table):
-            table = rehash(parent, plane, count, 2 * len(table))
-        above, length = -1, leg[i, 0]
-        for k in range(face.shape[1]):
-            if face[i, k] < 0:
+def _with_room(sequences, size, more):  # type: ignore[no-untyped-def]
+    """Return `size` sequences with room for some more: at first 1024, then twice as many, as a hash table needs it."""
+    parent, plane, low, high, reach, left, table, _, rays = sequences
+    room = max(1024, size + more)
+    parent, plane, reach, left = grow(parent, room), grow(plane, room), grow(reach, room), grow(left, room)
+    low, high, table = grow(low, room), grow(high, room), np.full(2 * len(parent), -1, np.int32)
+    reach[size:], left[size:], low[size:], high[size:] = 0.0, 0.0, 2.0, -2.0
+    for node in range(size):
+        table[_slot(table, parent, plane, parent[node], plane[node])] = node
+    return Sequences(parent, plane, low, high, reach, left, table, size, rays)
+
+
+@njit(cache=True)
+def _add_rays(sequences, size, added, face, leg, direction, plane_of):  # type: ignore[no-untyped-def]
+    """Add the sequences of rays while there is room; return how many rays are added, and the number of sequences."""
+    parent, plane, low, high, reach, _, table, _, _ = sequences  # attributes cost time in a loop
+    depth = face.shape[1]
+    while added < len(face) and size + depth <= len(parent):
+        node, length = -1, leg[added, 0]
+        for k in range(depth):
+            if face[added, k] < 0:
                 break
-            length += leg[i, k + 1]
-            slot = find_sequence(table, parent, plane, above, plane_of[face[i, k]])
-            node = table[slot]
-            if node < 0:
-                parent[count], plane[count], reach[count] = above, plane_of[face[i, k]], length
-                low[count], high[count] = direction[i, k + 1], direction[i, k + 1]
-                table[slot] = node = count
-                count += 1
-            reach[node] = max(reach[node], length)
-            for axis in range(3):
-                low[node, axis] = min(low[node, axis], direction[i, k + 1, axis])
-                high[node, axis] = max(high[node, axis], direction[i, k + 1, axis])
-            above = node
-    return Sequences(parent, plane, low, high, reach, table, count, rays + len(face))
+            length += leg[added, k + 1]
+            node = _next_sequence(table, parent, plane, size, node, plane_of[face[added, k]])
+            size, reach[node] = max(size, node + 1), max(reach[node], length)
+            _widen(low, high, node, direction[added, k + 1])
+        added += 1
+    return added, size
 
 
 @njit(cache=True)
-def find_sequence(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
+def _slot(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
     """Slot in the hash table of the sequence that adds the plane `last` to the sequence `node`, or where it belongs."""
     mask = np.uint64(len(table) - 1)
     slot = mix(node + 1, last) & mask
@@ -188,17 +213,117 @@ def find_sequence(table, parent, plane, node, last):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def rehash(parent, plane, count, size):  # type: ignore[no-untyped-def]
-    """Hash table of a larger size."""
-    table = np.full(size, -1, np.int32)
-    for node in range(count):
-        table[find_sequence(table, parent, plane, parent[node], plane[node])] = node
-    return table
+def _next_sequence(table, parent, plane, size, node, last):  # type: ignore[no-untyped-def]
+    """Find the sequence that adds the plane `last` to the sequence `node`, or add it as number `size`."""
+    slot = _slot(table, parent, plane, node, last)
+    if table[slot] < 0:
+        table[slot], parent[size], plane[size] = size, node, last
+    return np.int64(table[slot])
 
 
-def view_sequences(
-    sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64], spacings: float = MARGIN
-) -> Views:
+@njit(cache=True)
+def _widen(low, high, node, direction):  # type: ignore[no-untyped-def]
+    """Enlarge the box of directions in which rays left a sequence."""
+    for axis in range(3):
+        low[node, axis], high[node, axis] = (
+            min(low[node, axis], direction[axis]),
+            max(high[node, axis], direction[axis]),
+        )
+
+
+class _RayStack(NamedTuple):
+    """Rays that have been split off.
+
+    `value` (K, 8) are origin, direction, length and fraction of power left; `number` (K, 3) sequence, reflections and
+    walls crossed.
+    """
+
+    value: Floats
+    number: NDArray[np.int64]
+    end: Floats
+    met: Met
+
+
+def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequences:
+    """Make the tree of the sequences of planes that rays meet which split at all faces, down to the power needed."""
+    boxes = links.mesh.tree.boxes
+    low, high = np.minimum(boxes.low_m[0], links.tx_m), np.maximum(boxes.high_m[0], links.tx_m)
+    far = float(np.linalg.norm(high - low)) + 1.0
+    directions = lattice(np.arange(count), count).astype(np.float64)
+    sequences, size = _split(_no_sequences(), directions, needed, links, far)
+    return sequences._replace(size=size, rays=count)  # type: ignore[no-any-return]
+
+
+@njit(cache=True)
+def _split(sequences, directions, needed, links, far):  # type: ignore[no-untyped-def]
+    """Add the sequences of rays in some directions (R, 3), and count them; no line in the mesh is longer than `far`."""
+    room, size = MOST_FACES * (links.limits.reflections + 1), sequences.size
+    stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
+    for direction in directions:
+        stack.value[0, :3], stack.value[0, 3:6] = links.tx_m, direction
+        gain = gain_towards(links.gains, direction[0], direction[1], direction[2])
+        stack.value[0, 6], stack.value[0, 7] = 0.0, gain
+        stack.number[0, 0], stack.number[0, 1], stack.number[0, 2] = -1, 0, 0
+        top = 1
+        while top > 0:
+            if size + MOST_FACES > len(sequences.parent):
+                sequences = _with_room(sequences, size, MOST_FACES)
+            size, top = _go_on(sequences, size, stack, top - 1, needed, links, far)
+    return sequences, size
+
+
+@njit(cache=True)
+def _go_on(sequences, size, stack, top, needed, links, far):  # type: ignore[no-untyped-def]
+    """Follow one ray through all faces, and put the reflected ones in its place; the numbers of sequences and rays."""
+    mesh, limits, met, end = links.mesh, links.limits, stack.met, stack.end
+    a, d = stack.value[top, :3].copy(), stack.value[top, 3:6].copy()
+    length, left = stack.value[top, 6], stack.value[top, 7]
+    node, depth, crossed = stack.number[top, 0], stack.number[top, 1], stack.number[top, 2]
+    for axis in range(3):
+        end[axis] = a[axis] + far * d[axis]
+    own = sequences.plane[node] if node >= 0 else -1
+    discount, next_discount = discount_after(limits, depth), discount_after(limits, depth + 1)
+    stop, start, steep = far, 0.0, 1.0
+    for j in range(faces_between(mesh.tree, a, end, own, -1, met)):
+        face, t = met.face[j], met.at[j]
+        cosine, near = cosine_at(mesh.planes, face, d[0], d[1], d[2]), length + t * far
+        steep = min(steep, cosine)
+        same = j > 0 and (t - start) * far * steep <= mesh.cells.depth_m
+        if same and is_one_wall(mesh, met.face[j - 1], face, a, end, met.at[j - 1], t):
+            continue
+        material = mesh.material[face]
+        after = left * mesh.materials.most_reflected[material, int(cosine * COSINES)]
+        if depth < limits.reflections and matters(after * next_discount, near, needed):
+            child = _next_sequence(
+                sequences.table, sequences.parent, sequences.plane, size, node, mesh.planes.plane[face]
+            )
+            size = max(size, child + 1)
+            _reflect(a, d, t * far, mesh.planes, mesh.planes.plane[face], stack.value[top])
+            _widen(sequences.low, sequences.high, child, stack.value[top, 3:6])
+            sequences.left[child] = max(sequences.left[child], after)
+            stack.value[top, 6], stack.value[top, 7] = near, after
+            stack.number[top, 0], stack.number[top, 1], stack.number[top, 2] = child, depth + 1, crossed
+            top += 1
+        left *= mesh.materials.most_transmitted[material, int(cosine * COSINES)]
+        crossed, start, steep = crossed + 1, t, cosine
+        if crossed > limits.walls or not matters(left * discount, near, needed):
+            stop = t * far
+            break
+    if node >= 0:
+        sequences.reach_m[node] = max(sequences.reach_m[node], length + stop)
+    return size, top
+
+
+@njit(cache=True)
+def _reflect(a, d, length, planes, p, ray):  # type: ignore[no-untyped-def]
+    """Write origin and direction of a ray that a plane reflects after a length."""
+    along = d[0] * planes.normal[p, 0] + d[1] * planes.normal[p, 1] + d[2] * planes.normal[p, 2]
+    for axis in range(3):
+        ray[axis] = a[axis] + length * d[axis]
+        ray[3 + axis] = d[axis] - 2.0 * along * planes.normal[p, axis]
+
+
+def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64], spacings: float) -> Views:
     """Find the image, the margin, in spacings of the rays, and the order of all sequences."""
     parent, plane = sequences.parent[: sequences.size], sequences.plane[: sequences.size]
     margin = spacings * np.sqrt(4.0 * np.pi / max(1, sequences.rays))

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.diffraction import MAX_REFLECTIONS, find_wedges
+from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, find_wedges
 
 TX = np.array([1.07, 1.93, 1.2])
 CORNER = np.array([[(3.0, 2.0), (5.0, 2.0)], [(3.0, 2.0), (3.0, 4.0)]])

@@ -1,0 +1,436 @@
+"""Specular paths of meshes, with or without walls that they go through, by the sequences of planes that rays met.
+
+A specular path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays
+determine which sequences there are, and, seen from the image, in which directions their last leg goes and how far. A
+receiver that lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of each plane.
+
+Where walls let power through, every leg of a candidate is then cast through the mesh, the faces on it are grouped to
+walls, and the power of the path follows. Where no wall may be crossed, Sionna RT finds the faces in its way.
+"""
+
+import itertools
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats, Indices
+from sionna_partial.process import in_order, njit
+from sionna_partial.scene.floor_plan import grow
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.interactions import REFLECTION
+from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, divide, face_at, faces_between, scratch
+from sionna_partial.tracing.mesh.sequences import (
+    MeshLinks,
+    Rays,
+    Sequences,
+    Views,
+    collect_sequences,
+    split_rays,
+    view_sequences,
+)
+from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates
+from sionna_partial.tracing.power import (
+    ISOTROPIC,
+    Gains,
+    at_slab,
+    gain_towards,
+    received_power,
+    reflected_power,
+    vertical_field,
+)
+from sionna_partial.tracing.select import Limits, Listed, discount_after, needs_by_distance
+from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces
+
+_REACH, _REACH_M = 1.1, 0.3
+"""Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
+
+_LEAF = 8
+"""Largest number of receivers in a box that is not divided further."""
+
+_PART = 0.5
+"""Part of the weakest power that matters down to which sequences are followed, as split rays only sample them."""
+
+_AT_ONCE = 20_000
+"""Number of candidates through walls that are written together, which bounds the memory."""
+
+_SEQUENCES_AT_ONCE, _PARTS = 500, 64
+"""Number of sequences whose candidates one thread lists at a time, and about the most parts of all sequences."""
+
+_ENTRIES = 160
+"""Most faces that a path through walls may meet."""
+
+
+_OPAQUE_MARGIN, _MARGIN = 8.0, 4.0
+"""Distances in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays.
+
+Split rays are fewer, which makes the spacing wide.
+"""
+
+
+class View(NamedTuple):
+    """The view of one sequence: image (3,), box of directions, width by which it is enlarged, and reach."""
+
+    source: NDArray[np.float64]
+    low: NDArray[np.float32]
+    high: NDArray[np.float32]
+    margin: float
+    reach: float
+
+
+class Traced(NamedTuple):
+    """Sequences of planes that rays met, and where their receivers are."""
+
+    sequences: Sequences
+    views: Views
+
+
+class Images(NamedTuple):
+    """The columns of `Traced` and of the mesh that `fold_line` reads: passing both takes longer than its work."""
+
+    parent: NDArray[np.int32]
+    plane: NDArray[np.int32]
+    depth: NDArray[np.int32]
+    source_m: Floats
+    planes: MeshPlanes
+    material: NDArray[np.int64]
+    largest: Floats
+    wavelength_m: float
+
+
+@njit(cache=True)
+def images_of(traced, mesh):  # type: ignore[no-untyped-def]
+    """Take the columns from a mesh and the sequences in it."""
+    (sequences, views), materials = traced, mesh.materials
+    columns = sequences.parent, sequences.plane, views.depth, views.source_m
+    return Images(*columns, mesh.planes, mesh.material, materials.largest, materials.wavelength_m)
+
+
+class Pairs(NamedTuple):
+    """Candidates: the sequence of each (C,), -1 for a straight line, its receiver, and a bound of its power."""
+
+    node: NDArray[np.int32]
+    rx: NDArray[np.int32]
+    power: Floats
+
+
+class MeshReflections:
+    """Specular paths between a transmitter (3,) and receivers (N, 3), all between opaque faces, or all through walls.
+
+    `rays` come from `shoot_rays`, with the same transmitter and depth, and count the faces as `mesh` does; no face is
+    crossed then. With a number of rays, paths cross 1 to `max_walls` walls.
+    """
+
+    def __init__(
+        self,
+        mesh: SolidMesh,
+        tx_m: Floats,
+        rx_m: Floats,
+        settings: TraceSettings,
+        rays: Iterable[Rays] | int,
+        gains: Gains = ISOTROPIC,
+    ) -> None:
+        ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64)), settings.max_depth
+        if isinstance(rays, int):
+            self.name, self._opaque, self._rays = "paths through walls", None, rays
+            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1)
+        else:
+            self.name, limits = "reflections", Limits(depth, depth, 0, 1.0, 0.0)
+            sequences = collect_sequences(rays, mesh.planes)
+            self._opaque = Traced(sequences, view_sequences(sequences, mesh.planes, ends[0], _OPAQUE_MARGIN))
+        self._links = MeshLinks(mesh, *ends, limits, gains)
+
+    def listed(self, found: Floats, *, sequences_at_once: int = _SEQUENCES_AT_ONCE) -> Iterator[Listed]:
+        """List straight lines, then the candidates of sequence after sequence; none is negligible.
+
+        Paths through walls come in one part, with their powers: those that links may need whose indirect paths without
+        walls have the power `found` (N,).
+        """
+        links, every = self._links, np.arange(len(self._links.rx_m), dtype=np.int32)
+        direct = _straight(links) if self._opaque is None else np.full(len(every), np.inf)
+        needed = links.limits.min_power(found + direct) if self._opaque is None else np.zeros(len(every))
+        traced, boxes = self._opaque or self._split(needed), divide(links.rx_m, links.rx_m, _LEAF)
+        count = len(traced.views.order)
+        step = max(sequences_at_once, count // _PARTS)
+
+        def of_sequences(start: int) -> Pairs:
+            return _pairs(traced.views.order[start : start + step], traced, boxes, needed, links)  # type: ignore[no-any-return]
+
+        straight = Pairs(np.full(len(every), -1, np.int32), every, direct)
+        parts: Iterable[Pairs] = itertools.chain([straight], in_order(of_sequences, range(0, count, step)))
+        if self._opaque is None:
+            parts = [Pairs(*(np.concatenate(column) for column in zip(*parts, strict=True)))]
+        for number, (node, rx, power) in enumerate(parts):
+            done = min(number * step / max(1, count), 1.0)
+            yield Listed(rx, power, partial(self._written, traced, node, rx), done, at_once=_AT_ONCE)
+
+    def _split(self, needed: Floats) -> Traced:
+        """Split rays at all faces; there are no sequences where no reflection is allowed, or no face there."""
+        links, sequences = self._links, collect_sequences([], self._links.mesh.planes)
+        if links.limits.reflections and len(needed) and len(links.mesh.tree.plane):
+            wavelength_m = links.mesh.materials.wavelength_m
+            by_distance = needs_by_distance(links.tx_m, links.rx_m, _PART * needed, wavelength_m)
+            sequences = split_rays(links, self._rays, by_distance)
+        return Traced(sequences, view_sequences(sequences, links.mesh.planes, links.tx_m, _MARGIN))
+
+    def _written(self, traced: Traced, node: Indices, rx: NDArray[np.int32], rows: Indices) -> Candidates:
+        depth = max(1, self._links.limits.depth)
+        kind, face, vertices_m, same_wall = _write(
+            node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES
+        )
+        candidates = Candidates(rx[rows], kind, face, vertices_m)
+        return candidates if self._opaque else replace(candidates, same_wall=same_wall).narrowed()
+
+
+@njit(cache=True, nogil=True)
+def _straight(links):  # type: ignore[no-untyped-def]
+    """Power (N,) of straight lines to all receivers, 0 where no wall is on them, or too many."""
+    met, entries, power = scratch(), met_faces(_ENTRIES), np.zeros(len(links.rx_m))
+    faces, points = np.empty(0, np.int32), np.empty((0, 3))
+    for rx in range(len(power)):
+        number = _follow(0, links.rx_m[rx], links, met, entries, faces, points)
+        if number >= 0:
+            power[rx] = _power(entries, number, links.rx_m[rx], links)
+    return power
+
+
+@njit(cache=True, nogil=True)
+def _pairs(nodes, traced, boxes, needed, links):  # type: ignore[no-untyped-def]
+    """List the candidates of some sequences that have the power `needed` (N,) of the receivers in their view."""
+    (sequences, views), mesh, limits, rx_m, tx_m = traced, links.mesh, links.limits, links.rx_m, links.tx_m
+    all_node, all_rx, all_power = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)
+    met, entries, depth, through, count = scratch(), met_faces(_ENTRIES), max(1, limits.depth), limits.walls > 0, 0
+    faces, points, spread = np.empty(depth, np.int32), np.empty((depth, 3)), mesh.materials.wavelength_m / (4.0 * np.pi)
+    images, gains, planes = images_of(traced, mesh), links.gains, mesh.planes
+    seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
+    for node in nodes:
+        source, discount = views.source_m[node], discount_after(limits, views.depth[node])
+        reach = _REACH * sequences.reach_m[node] + _REACH_M
+        view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)
+        bound_view(view, farthest(source, boxes), planes, sequences.plane[node], bounds)
+        number = receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
+        most = sequences.left[node] * spread**2
+        for rx in seen[:number]:
+            least = needed[rx] / discount
+            x, y, z = rx_m[rx, 0] - source[0], rx_m[rx, 1] - source[1], rx_m[rx, 2] - source[2]
+            if through and most < _PART * least * (x * x + y * y + z * z):
+                continue
+            power = fold_line(node, rx_m[rx], images, faces, points)
+            if power < 0.0:
+                continue
+            x, y, z = points[0, 0] - tx_m[0], points[0, 1] - tx_m[1], points[0, 2] - tx_m[2]
+            power *= gain_towards(gains, x, y, z)
+            if through and power >= least:
+                entered = _follow(views.depth[node], rx_m[rx], links, met, entries, faces, points)
+                power = _power(entries, entered, rx_m[rx], links) if entered >= 0 else -1.0
+            if power >= least:
+                all_node, all_rx = grow(all_node, count + 1), grow(all_rx, count + 1)
+                all_power = grow(all_power, count + 1)
+                all_node[count], all_rx[count], all_power[count] = node, rx, power
+                count += 1
+    return Pairs(all_node[:count].copy(), all_rx[:count].copy(), all_power[:count].copy())
+
+
+@njit(cache=True, nogil=True)
+def _write(nodes, rx, traced, links, room):  # type: ignore[no-untyped-def]
+    """Kinds and faces (C, D) of candidates, vertices (C, D, 3), and whether each is of a wall that is crossed."""
+    met, entries, shape = scratch(), met_faces(room), (len(nodes), room)
+    kind, face, same_wall = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32), np.zeros(shape, np.bool_)
+    vertices, depth = np.zeros((len(nodes), room, 3)), max(1, links.limits.depth)
+    faces, points, images = np.empty(depth, np.int32), np.empty((depth, 3)), images_of(traced, links.mesh)
+    for c in range(len(nodes)):
+        node, target, reflections = nodes[c], links.rx_m[rx[c]], 0
+        if node >= 0:
+            fold_line(node, target, images, faces, points)
+            reflections = traced.views.depth[node]
+        if links.limits.walls == 0:
+            kind[c, :reflections], face[c, :reflections] = REFLECTION, faces[:reflections]
+            vertices[c, :reflections] = points[:reflections]
+            continue
+        number = _follow(reflections, target, links, met, entries, faces, points)
+        kind[c, :number], face[c, :number] = entries.kind[:number], entries.face[:number]
+        vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]
+    return kind, face, vertices, same_wall
+
+
+@njit(cache=True)
+def receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
+    """Write the receivers in view of a sequence's image to `found` and count them."""
+    source, low, high, margin, reach = view
+    count, stack[0], top = 0, 0, 1
+    while top > 0:
+        top -= 1
+        box = stack[top]
+        if _apart(boxes.low_m[box], boxes.high_m[box], bounds):
+            continue
+        if boxes.child[box] >= 0:
+            stack[top], stack[top + 1] = boxes.child[box] + 1, boxes.child[box]
+            top += 2
+            continue
+        for k in boxes.order[boxes.start[box] : boxes.stop[box]]:
+            x, y, z = rx[k, 0] - source[0], rx[k, 1] - source[1], rx[k, 2] - source[2]
+            length = np.sqrt(x * x + y * y + z * z)
+            m = margin * length
+            if (
+                length <= reach
+                and low[0] * length - m <= x <= high[0] * length + m
+                and low[1] * length - m <= y <= high[1] * length + m
+                and low[2] * length - m <= z <= high[2] * length + m
+            ):
+                found[count] = k
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def farthest(source, boxes):  # type: ignore[no-untyped-def]
+    """Distance that no receiver exceeds."""
+    total = 0.0
+    for axis in range(3):
+        total += max(source[axis] - boxes.low_m[0, axis], boxes.high_m[0, axis] - source[axis]) ** 2
+    return np.sqrt(total) + 1e-3
+
+
+@njit(cache=True)
+def bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
+    """Write what bounds the points in view of an image and beyond its last plane, no receiver being farther away.
+
+    Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
+    the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
+    the image lies within r times that distance of r times the middle.
+    """
+    source, low, high, margin, reach = view
+    reach = min(reach, farthest)
+    width, away, slope = 0.0, -planes.offset_m[p], 0.0
+    for axis in range(3):
+        width += (0.5 * (high[axis] - low[axis]) + margin) ** 2
+        away += planes.normal[p, axis] * source[axis]
+        slope += planes.normal[p, axis] * 0.5 * (low[axis] + high[axis])
+    width = np.sqrt(width)
+    near = min(abs(away) / min(1.0, abs(slope) + width), reach)
+    for axis in range(3):
+        middle, pad = 0.5 * (low[axis] + high[axis]), 0.5 * (high[axis] - low[axis]) + margin
+        ends = near * (middle - pad), near * (middle + pad), reach * (middle - pad), reach * (middle + pad)
+        bounds[0, axis] = source[axis] + min(ends) - 1e-6
+        bounds[1, axis] = source[axis] + max(ends) + 1e-6
+        bounds[2, axis], bounds[3, axis] = source[axis], middle
+    bounds[4, 0], bounds[4, 1] = width, bounds[3, 0] ** 2 + bounds[3, 1] ** 2 + bounds[3, 2] ** 2
+
+
+@njit(cache=True)
+def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
+    """Return whether no point of a box is in view."""
+    for axis in range(3):
+        if low[axis] > bounds[1, axis] or high[axis] < bounds[0, axis]:
+            return True
+    along, distance, radius = 0.0, 0.0, 0.0
+    for axis in range(3):
+        away = 0.5 * (low[axis] + high[axis]) - bounds[2, axis]
+        along += away * bounds[3, axis]
+        distance += away**2
+        radius += (high[axis] - low[axis]) ** 2
+    radius = 0.5 * np.sqrt(radius) + 1e-6
+    beside = distance - along**2 / max(1e-12, bounds[4, 1])
+    return beside > (radius + (np.sqrt(distance) + radius) * bounds[4, 0]) ** 2
+
+
+@njit(cache=True)
+def fold_line(node, target, images, face, points):  # type: ignore[no-untyped-def]
+    """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
+
+    Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
+    """
+    parent, plane, depths, sources, planes, material, largest, wavelength = images
+    normals, offsets, bins, depth = planes.normal, planes.offset_m, planes.bins, depths[node]
+    x, y, z = target[0], target[1], target[2]
+    at, power = node, 1.0
+    for k in range(depth - 1, -1, -1):
+        p = plane[at]
+        nx, ny, nz, offset = normals[p, 0], normals[p, 1], normals[p, 2], offsets[p]
+        sx, sy, sz = sources[at, 0], sources[at, 1], sources[at, 2]
+        behind, before = nx * sx + ny * sy + nz * sz - offset, nx * x + ny * y + nz * z - offset
+        if behind * before >= 0.0:  # also where an image coincides with the receiver, at a length of 0
+            return -1.0
+        length = np.sqrt((x - sx) ** 2 + (y - sy) ** 2 + (z - sz) ** 2)
+        if k == depth - 1:
+            power = (wavelength / (4.0 * np.pi * length)) ** 2
+        fraction = behind / (behind - before)
+        x, y, z = sx + fraction * (x - sx), sy + fraction * (y - sy), sz + fraction * (z - sz)
+        points[k, 0], points[k, 1], points[k, 2] = x, y, z
+        face[k] = face_at(bins, p, x, y, z)
+        if face[k] < 0:
+            return -1.0
+        power *= reflected_power(largest[material[face[k]]], (behind - before) / length)
+        at = parent[at]
+    return power
+
+
+@njit(cache=True)
+def _follow(reflections, target, links, met, entries, faces, points):  # type: ignore[no-untyped-def]
+    """Write all faces that a path with reflections meets; return their number, -1 if it crosses no or many walls."""
+    mesh, count, crossed = links.mesh, 0, 0
+    a, own = links.tx_m, np.int64(-1)
+    for k in range(reflections + 1):
+        b, other = target, np.int64(-1)
+        if k < reflections:
+            b, other = points[k], np.int64(mesh.planes.plane[faces[k]])
+        number = faces_between(mesh.tree, a, b, own, other, met)
+        if number == MOST_FACES or count + number + 1 > len(entries.face):
+            return -1
+        crossed += mark_walls(mesh, a, b, number, met, entries, count)
+        inside = number > 0 and (
+            (k > 0 and is_inside(mesh, faces[k - 1], met.face[0], a, b, 0.0, met.at[0]))
+            or (k < reflections and is_inside(mesh, met.face[number - 1], faces[k], a, b, met.at[number - 1], 1.0))
+        )
+        if inside or crossed > links.limits.walls:
+            return -1
+        count += number
+        if k < reflections:
+            entries.face[count], entries.kind[count], entries.same_wall[count] = faces[k], REFLECTION, False
+            entries.point_m[count] = b
+            count += 1
+        a, own = b, other
+    return count if crossed > 0 and _has_long_legs(entries, count, links.tx_m, target) else -1
+
+
+@njit(cache=True)
+def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
+    """Return whether no leg of a path is so short that Sionna RT drops it."""
+    for k in range(count + 1):
+        square = 0.0
+        for axis in range(3):
+            before = entries.point_m[k - 1, axis] if k > 0 else tx[axis]
+            after = entries.point_m[k, axis] if k < count else target[axis]
+            square += (after - before) ** 2
+        if square < SHORTEST_LEG_M**2:
+            return False
+    return True
+
+
+@njit(cache=True)
+def _gain_to(point, links):  # type: ignore[no-untyped-def]
+    """Gain of the transmit antenna towards a point."""
+    return gain_towards(links.gains, point[0] - links.tx_m[0], point[1] - links.tx_m[1], point[2] - links.tx_m[2])
+
+
+@njit(cache=True)
+def _power(entries, count, target, links):  # type: ignore[no-untyped-def]
+    """Power of a path between vertical antennas."""
+    planes, materials, tx = links.mesh.planes, links.mesh.materials, links.tx_m
+    first = entries.point_m[0] if count else target
+    kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
+    total = np.sqrt(kx * kx + ky * ky + kz * kz)
+    k = kx / total, ky / total, kz / total
+    e, gain = vertical_field(k), _gain_to(first, links)
+    for j in range(count):
+        here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
+        total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
+        if not entries.same_wall[j]:
+            face = entries.face[j]
+            p = planes.plane[face]
+            normal = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
+            k, e = at_slab(k, e, normal, materials, links.mesh.material[face], entries.kind[j])
+    return (links.mesh.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain

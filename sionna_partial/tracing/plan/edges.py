@@ -1,0 +1,643 @@
+"""Paths of a floor plan that are diffracted once at a vertical edge.
+
+An edge is a point in the plan. A candidate joins a path from the transmitter to an edge and a path from there to a
+receiver. On a vertical edge Keller's cone keeps the slope of a path, so that heights unfold along the whole path in the
+plan as they do without the edge.
+
+Between opaque walls, few reflections are possible before and after the edge, and beams find the paths. Through walls,
+both legs are straight lines to every edge and receiver. Arrivals, bounds and writing are the same; the two lists of
+candidates differ, as beams give pairs of edges and receivers, and lines give all.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.process import in_order, njit
+from sionna_partial.scene.floor_plan import bin_points, grow
+from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
+from sionna_partial.tracing.paths import Candidates, Wedges
+from sionna_partial.tracing.plan.beams import BeamTree, trace_beams
+from sionna_partial.tracing.plan.reflections import CrossingCandidates, unfold
+from sionna_partial.tracing.plan.room import (
+    Building,
+    Leg,
+    Room,
+    add_entry,
+    candidates_of,
+    cross_leg,
+    empty_paths,
+    gain_of_departure,
+    has_long_legs,
+    has_variant,
+    rise_of,
+    trail_of,
+    write_path,
+)
+from sionna_partial.tracing.power import (
+    Materials,
+    at_edge,
+    at_flats,
+    at_wall,
+    gain_at_azimuth,
+    most_at_edge,
+    most_at_wall,
+    power_near,
+    utd_terms,
+    wedge_angle,
+    wedge_constants,
+)
+from sionna_partial.tracing.select import Listed
+
+MAX_REFLECTIONS = 2
+"""Largest number of reflections around the diffraction, including those at floor and ceiling."""
+
+_EXTERIOR_M = 1e-5
+"""Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
+
+_NEAR_M = 1e-3
+"""Shortest leg in the plan next to an edge [m]: walls that meet there do not reflect it."""
+
+_ASIDE_M = 1e-3
+"""Distance from an edge at which a leg through walls ends: the walls that meet there are not crossed [m]."""
+
+_NEGLIGIBLE = 3e-6
+"""Rough bound of diffracted paths, relative to the reflected ones of a link, below which none is listed."""
+
+_FLAT_RAD = 1e-3
+"""Walls that meet at less than this angle from a straight line form no edge [rad]."""
+
+_EDGES_AT_ONCE = 32
+"""Number of edges whose beams are held in memory together. It does not depend on the receivers, nor does the order of
+the candidates."""
+
+_VARIANTS = 4
+"""Variants of paths through walls: at most one reflection at floor or ceiling."""
+
+
+class _Arrivals(NamedTuple):
+    """J paths from the transmitter to edges, ordered by edge.
+
+    `start` (E + 1,) gives the first of each edge, `edge` (J,) the edge, `reflections` (J,) their number, `length_m`
+    (J,) the length in the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them,
+    `material` (J, R) of those walls, `cosine` (J, R) of the angles of incidence there, `angle` (J, 4) the direction of
+    arrival as `wedge_angle` gives it, `faces` (J, 2) the cosines of the angles of incidence at 0-face and n-face, -1 in
+    the shadow, and `lit` (J,) is True where the 0-face is lit. `toward` (J, 2) are horizontal unit vectors of
+    departure, and `gain` (J,) the largest gain of the antenna there. Walls on the path leave the fraction `left` (J,)
+    of its power; `crossed` (J,) is their number.
+    """
+
+    start: NDArray[np.int64]
+    edge: NDArray[np.int32]
+    reflections: NDArray[np.int64]
+    length_m: Floats
+    walls: NDArray[np.int64]
+    points: Floats
+    material: NDArray[np.int64]
+    cosine: Floats
+    angle: Floats
+    faces: Floats
+    lit: Bools
+    toward: Floats
+    gain: Floats
+    left: Floats
+    crossed: NDArray[np.int64]
+
+
+class _Edges(NamedTuple):
+    """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
+
+    `utd` (E, 5) are the `wedge_constants`, and `material` (E, 2) is the material of both faces where the 0-face is lit,
+    and where it is not: to Sionna RT an edge is of one shape.
+    """
+
+    position_m: Floats
+    face_rad: Floats
+    exterior_rad: Floats
+    normals: Floats
+    utd: Floats
+    material: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, wedges: Wedges, wall_material: NDArray[np.int64]) -> "_Edges":
+        """Lay out wedges for the search of paths."""
+        normals, count = wedges.normal[: len(wedges.edge_m)], len(wedges.edge_m)
+        face_rad = np.arctan2(-normals[:, 0, 0], normals[:, 0, 1])
+        exterior_rad = (np.arctan2(normals[:, 1, 0], -normals[:, 1, 1]) - face_rad) % (2 * np.pi)
+        exterior_rad[exterior_rad < _FLAT_RAD] = 2 * np.pi  # the free end of a wall
+        material, constants = wall_material[wedges.face[:count] // 2], wedge_constants(exterior_rad)
+        return cls(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), constants, material)
+
+
+class _EdgeTask(NamedTuple):
+    """Beams from a group of edges, their pairs with receivers, all edges, arrivals there, and the building.
+
+    `reflections` is the largest number of reflections of a path.
+    """
+
+    tree: BeamTree
+    pairs: NDArray[np.int32]
+    group: Indices
+    edges: _Edges
+    arrivals: _Arrivals
+    building: Building
+    reflections: int
+
+
+class _Pair(NamedTuple):
+    """The number of a pair of a beam from an edge and a receiver, and the numbers of the edge and the receiver.
+
+    `left` is how many more reflections a path may have, `after` the number of reflections at walls after the edge,
+    `onward_m` the length of this leg, `departure` its direction as `wedge_angle` gives it,
+    `utd` and `material` are as in `_Edges`.
+    """
+
+    number: np.int32
+    edge: np.int64
+    rx: np.int32
+    left: np.int64
+    after: np.int64
+    onward_m: float
+    departure: tuple[float, float, float, float]
+    utd: tuple[float, float, float, float, float]
+    material: tuple[np.int64, np.int64]
+
+
+def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
+    """Find the vertical edges of the walls that diffract, with or without those where observation ended."""
+    vertex = geometry.segments.ravel()
+    away = geometry.vertices_m[geometry.segments[:, ::-1].ravel()] - geometry.vertices_m[vertex]
+    angle = np.arctan2(away[:, 1], away[:, 0])
+    order = np.lexsort([angle, vertex])
+    vertex, angle = vertex[order], angle[order]
+    start, count = np.unique(vertex, return_index=True, return_counts=True)[1:]
+    after = np.arange(len(vertex)) + 1
+    after[start + count - 1] = start
+    width = (angle[after] - angle) % (2 * np.pi)
+    width[after == np.arange(len(vertex))] = 2 * np.pi
+    wide = np.flatnonzero((width > np.pi + _FLAT_RAD) & (open_ends | ~geometry.open_end[vertex]))
+    face = (order ^ 1).astype(np.int32)  # the second of the two triangles of a wall is at its first end
+    pair = np.stack([face[wide], face[after[wide]]], axis=1)
+    first, last = angle[wide], angle[after[wide]]
+    normal = np.array([[-np.sin(first), np.cos(first)], [np.sin(last), -np.cos(last)]]).transpose(2, 0, 1)
+    return Wedges(
+        edge_m=geometry.vertices_m[vertex[wide]],
+        height_m=geometry.top_m[pair[:, 0] // 2],
+        face=np.concatenate([pair, pair[:, ::-1]]),
+        normal=np.concatenate([normal, normal[:, ::-1]]),
+    )
+
+
+class _EdgeCandidates:
+    """Paths over one vertical edge in a building."""
+
+    def __init__(self, geometry: SceneGeometry, wedges: Wedges, building: Building) -> None:
+        self._geometry, self._wedges, self._building = geometry, wedges, building
+        self._edges = _Edges.of(wedges, building.room.wall_material)
+
+    def _arrivals(self, tree: BeamTree, pairs: NDArray[np.int32], reflections: int) -> _Arrivals:
+        """Keep the pairs (beam, edge) that reach an edge from outside its wedge, with at most so many reflections."""
+        pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
+        trail = trail_of(self._geometry.plan)
+        good, *columns = _unfold_all(tree, pairs, self._edges, self._building, max(1, reflections), trail)
+        edge = pairs[good, 1]
+        start = np.searchsorted(edge, np.arange(len(self._edges.position_m) + 1))
+        return _Arrivals(start, edge, *(column[good] for column in columns))
+
+    def _candidates(
+        self, tree: BeamTree, arrivals: _Arrivals, chosen: tuple[Indices, Indices, Indices, Indices], size: int
+    ) -> Candidates:
+        """Write paths of beams from edges, receivers, arrivals and variants (C,)."""
+        paths = _write_joined(tree, self._edges, arrivals, chosen, self._building, trail_of(self._geometry.plan), size)
+        edge, lit = arrivals.edge[chosen[2]], arrivals.lit[chosen[2]]
+        wedge = np.where(lit, edge, edge + len(self._edges.position_m)).astype(np.int32)
+        opaque = self._building.limits.walls == 0
+        return candidates_of(self._geometry, chosen[1], paths, opaque=opaque, wedge=wedge, wedges=self._wedges)
+
+
+class DiffractionCandidates(_EdgeCandidates):
+    """All paths over one edge between opaque walls, with at most two reflections, `walls_a_side` at walls on each side.
+
+    The beams from the edges are traced on all cores.
+    """
+
+    name = "diffractions"
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        wedges: Wedges,
+        room: Room,
+        max_depth: int,
+        materials: Materials,
+        walls_a_side: int = MAX_REFLECTIONS,
+    ) -> None:
+        super().__init__(geometry, wedges, Building.opaque(geometry.plan, room, materials, max_depth))
+        self._reflections = min(MAX_REFLECTIONS, max_depth - 1)
+        self._walls_a_side = min(walls_a_side, self._reflections)
+
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the candidates over some edges at a time; those far below the power `found` (N,) are negligible."""
+        if self._reflections < 0 or not len(self._wedges.edge_m):
+            return
+        plan, room, edges = self._geometry.plan, self._building.room, self._edges
+        receivers, walls = bin_points(room.rx_m[:, :2]), np.array([self._walls_a_side])
+        tree_and_pairs = trace_beams(plan, bin_points(edges.position_m), room.tx_m[None, :2], walls)
+        arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
+        reached = np.flatnonzero(np.diff(arrivals.start))
+        groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
+
+        def of_group(number: int) -> Listed:
+            group = groups[number]
+            fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
+            onward = np.minimum(self._walls_a_side, self._reflections - fewest)
+            tree, pairs = trace_beams(plan, receivers, edges.position_m[group], onward)
+            task = _EdgeTask(tree, pairs, group, edges, arrivals, self._building, self._reflections)
+            pair, joined, bound, unlisted = _list_joined(task, _NEGLIGIBLE * found, trail_of(plan))
+            write = partial(self._written, task, pair, joined)
+            return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
+
+        yield from in_order(of_group, range(len(groups)))
+
+    def _written(self, task: _EdgeTask, pair: Indices, joined: NDArray[np.int32], rows: Indices) -> Candidates:
+        size, (node, rx) = task.reflections + 1, task.pairs[pair[rows]].T.copy()
+        arrival, variant = np.divmod(joined[rows], 2 * size)
+        return self._candidates(task.tree, task.arrivals, (node, rx, arrival, variant), size)
+
+
+class CrossedEdgeCandidates(_EdgeCandidates):
+    """All paths over one vertical edge, through a wall at least, without reflections at walls."""
+
+    name = "diffractions through walls"
+
+    def __init__(self, geometry: SceneGeometry, wedges: Wedges, crossing: CrossingCandidates) -> None:
+        super().__init__(geometry, wedges, crossing.building)
+        self._lowered = crossing.lowered
+
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the paths that links may need whose other indirect paths have the power `found` (N,)."""
+        count = len(self._wedges.edge_m)
+        if not count:
+            return
+        edges, building, needed = self._edges, self._building, self._building.limits.min_power(found)
+        pairs = np.stack([np.zeros(count, np.int32), np.arange(count, dtype=np.int32)], axis=1)
+        arrivals = self._arrivals(_straight_lines(building.room.tx_m[None, :2].copy()), pairs, 0)
+
+        def of_edges(first: int) -> tuple[NDArray[np.int32], Floats]:
+            some = np.arange(first, min(first + _EDGES_AT_ONCE, count))
+            return _list_crossed(some, edges, arrivals, needed, building, trail_of(building.plan))  # type: ignore[no-any-return]
+
+        chosen, power = zip(*in_order(of_edges, range(0, count, _EDGES_AT_ONCE)), strict=True)
+        columns = np.concatenate(chosen)
+        yield Listed(columns[:, 1], np.concatenate(power), partial(self._written, arrivals, columns), 1.0)
+
+    def _written(self, arrivals: _Arrivals, columns: NDArray[np.int32], rows: Indices) -> Candidates:
+        edge, rx, arrival, variant = columns[rows].T.copy()
+        size = len(trail_of(self._building.plan).surface) + 2
+        tree = _straight_lines(self._edges.position_m)
+        candidates = self._candidates(tree, arrivals, (edge, rx, arrival, variant), size)
+        possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
+        return self._lowered(candidates.rows(np.flatnonzero(possible)))
+
+
+def _straight_lines(sources_m: Floats) -> BeamTree:
+    """Return the straight lines from sources (E, 2) as beams without reflections."""
+    none = np.full(len(sources_m), -1, np.int32)
+    return BeamTree(none, none, sources_m)
+
+
+@njit(cache=True)
+def _shortest_leg_m(building):  # type: ignore[no-untyped-def]
+    """Return the shortest leg next to an edge [m]."""
+    return 20.0 * _ASIDE_M if building.limits.walls > 0 else _NEAR_M
+
+
+@njit(cache=True)
+def _unfold_all(tree, pairs, edges, building, reflections, trail):  # type: ignore[no-untyped-def]
+    """Return whether each path reaches an edge from outside its wedge, and the columns of `_Arrivals`."""
+    size, room, shortest_m = len(pairs), building.room, _shortest_leg_m(building)
+    good, count, crossed = np.zeros(size, np.bool_), np.zeros(size, np.int64), np.zeros(size, np.int64)
+    length, walls = np.zeros(size), np.zeros((size, reflections), np.int64)
+    points, cosine = np.zeros((size, reflections, 3)), np.zeros((size, reflections))
+    material, lit = np.zeros((size, reflections), np.int64), np.zeros(size, np.bool_)
+    angle, faces, toward = np.zeros((size, 4)), np.zeros((size, 2)), np.zeros((size, 2))
+    gain, left = np.ones(size), np.ones(size)
+    for i in range(size):
+        edge = pairs[i, 1]
+        target, exterior = edges.position_m[edge], edges.exterior_rad[edge]
+        count[i], length[i] = unfold(tree, pairs[i, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
+        if count[i] < 0:
+            continue
+        (x, y), (to_x, to_y) = (room.tx_m[0], room.tx_m[1]), (target[0], target[1])
+        for k in range(count[i]):
+            x, y = trail.bounce[k, 0], trail.bounce[k, 1]
+            points[i, k, 0], points[i, k, 1] = x, y
+            points[i, k, 2], cosine[i, k], walls[i, k] = trail.bounce[k, 2], trail.bounce[k, 3], trail.walls[k]
+            material[i, k] = building.material[walls[i, k]]
+        if count[i] > 0:
+            to_x, to_y = points[i, 0, 0], points[i, 0, 1]
+        x, y, to_x, to_y = x - target[0], y - target[1], to_x - room.tx_m[0], to_y - room.tx_m[1]
+        lit[i], good[i] = _outside(edges.normals[edge], x, y)
+        good[i] &= np.hypot(x, y) > shortest_m
+        if good[i] and building.limits.walls > 0:
+            entries, crossed[i] = _to_edge(building, target, length[i], length[i], trail)
+            good[i] = entries >= 0 and crossed[i] <= building.limits.walls
+            left[i] = _leg_power(trail, max(entries, 0), building)
+        from_0 = _angle_rad(edges.face_rad[edge], exterior, x, y)
+        angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = wedge_angle(from_0, exterior)
+        for k, from_face in enumerate((from_0, exterior - from_0)):
+            faces[i, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
+        away = max(np.hypot(to_x, to_y), 1e-12)
+        toward[i, 0], toward[i, 1], gain[i] = to_x / away, to_y / away, gain_at_azimuth(room.gains, to_x, to_y)
+    return good, count, length, walls, points, material, cosine, angle, faces, lit, toward, gain, left, crossed
+
+
+@njit(cache=True)
+def _leg_power(trail, count, building):  # type: ignore[no-untyped-def]
+    """Return a bound of the power that the walls of a leg leave, if it is horizontal, for any polarisation."""
+    power, table = 1.0, building.materials.transmission
+    for k in range(count):
+        if not (trail.same_wall[k] or building.plan.low[trail.surface[k]]):
+            power *= power_near(table, building.material[trail.surface[k]], trail.cosine[k])
+    return power
+
+
+@njit(cache=True)
+def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped-def]
+    """Write the walls on a line from the transmitter to an edge; return the numbers of entries and of walls."""
+    part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
+    x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
+    leg = Leg((tx_m[0], tx_m[1]), (x, y), np.int64(-1), np.int64(-1), 0.0, part * length / total)
+    return cross_leg(building.plan, building.interior, leg, np.int64(0), trail)
+
+
+@njit(cache=True)
+def _from_edge(building, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
+    """Add the walls on a line of some length from an edge to a receiver; return as `_to_edge`."""
+    part = _ASIDE_M / length
+    x, y = origin[0] + part * (target[0] - origin[0]), origin[1] + part * (target[1] - origin[1])
+    done = (total - length + _ASIDE_M) / total
+    leg = Leg((x, y), (target[0], target[1]), np.int64(-1), np.int64(-1), done, 1.0)
+    return cross_leg(building.plan, building.interior, leg, count, trail)
+
+
+@njit(cache=True)
+def _outside(normals, x, y):  # type: ignore[no-untyped-def]
+    """Return whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
+    first = normals[0] * x + normals[1] * y > _EXTERIOR_M
+    return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
+
+
+@njit(cache=True)
+def _angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
+    """Return the angle of a direction from an edge, counted from its 0-face; rounding may turn 0 into 2 pi."""
+    angle = (np.arctan2(y, x) - face_rad) % (2 * np.pi)
+    return 0.0 if angle > 0.5 * exterior_rad + np.pi else angle
+
+
+@njit(cache=True)
+def _media(building):  # type: ignore[no-untyped-def]
+    """Return tables of `Materials` for edges and walls, the material of floor and ceiling, and the wavelength."""
+    materials = building.materials
+    tables = materials.reflection, materials.transition
+    return tables, materials.largest, building.room.flat_material, materials.wavelength_m
+
+
+@njit(cache=True)
+def _strength(media, arrived, face, after, terms, path):  # type: ignore[no-untyped-def]
+    """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
+
+    `media` are as in `_media`. Reflections before and after the edge are materials, cosines and their number. `face` is
+    the material of the edge with the cosines of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical
+    parts of the direction, and the number of reflections at floor and ceiling.
+    """
+    (tables, largest, flat, _), (boundary, sine, slope, bounces) = media, path
+    material, cosine, j, count = arrived
+    field = 1.0, 0.0, 1.0
+    for k in range(count):
+        field = at_wall(largest, material[j, k], cosine[j, k], sine, slope, field)
+    field = at_edge(tables, face[0], terms, boundary, (face[1], face[2]), sine, slope, field)
+    material_after, cosine_after, count = after
+    for k in range(count):
+        field = at_wall(largest, material_after[k], cosine_after[k], sine, slope, field)
+    return at_flats(largest, flat, slope, bounces, field)
+
+
+@njit(cache=True, nogil=True)
+def _list_joined(task, negligible, trail):  # type: ignore[no-untyped-def]
+    """Join arrivals at edges and departures from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
+
+    One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
+    references at every access, on all cores.
+    """
+    tree, pairs, group, edges, arrivals, building, reflections = task
+    room, size, unlisted = building.room, reflections + 1, np.zeros(len(building.room.rx_m))
+    out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
+    material, cosine, heights = np.empty(size, np.int64), np.empty(size), _heights(room, size)
+    scratch, media = (material, cosine, np.empty((4, 3))), _media(building)
+    pieces_m, of_piece, walls, bounce = building.plan.pieces_m, building.material, trail.walls, trail.bounce
+    most = _most_of_arrivals(building.materials.largest, arrivals, edges.material, heights.max())
+    for i in range(len(pairs)):
+        root = node = pairs[i, 0]
+        while tree.parent[root] >= 0:
+            root = tree.parent[root]
+        edge, rx = group[root // 4], pairs[i, 1]
+        origin, target, exterior = edges.position_m[edge], room.rx_m[rx], edges.exterior_rad[edge]
+        after, onward = unfold(tree, node, pieces_m, target, walls, bounce)
+        x, y = (bounce[0, 0], bounce[0, 1]) if after > 0 else (target[0], target[1])
+        x, y = x - origin[0], y - origin[1]
+        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(edges.normals[edge], x, y)[1]:
+            continue
+        for k in range(after):
+            material[k], cosine[k] = of_piece[walls[k]], bounce[k, 3]
+        departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
+        face, utd = (edges.material[edge, 0], edges.material[edge, 1]), _constants(edges, edge)
+        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, departure, utd, face)
+        out, rough = _list_pair(media, room, arrivals, most, pair, heights[rx], scratch, negligible[rx], out)
+        unlisted[rx] += rough
+    listed, joined, bound, used = out
+    return listed[:used].copy(), joined[:used].copy(), bound[:used].copy(), unlisted
+
+
+@njit(cache=True)
+def _heights(room, size):  # type: ignore[no-untyped-def]
+    """Return the heights [m] that variants of paths to each receiver cover (N, V), -1 where there is none."""
+    heights = np.full((len(room.rx_m), 2 * size), -1.0)
+    for rx in range(len(room.rx_m)):
+        for variant in range(2 * size):
+            if has_variant(variant, room):
+                heights[rx, variant] = rise_of(variant, room, room.rx_m[rx]).height_m
+    return heights
+
+
+@njit(cache=True)
+def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):  # type: ignore[no-untyped-def]
+    """Add all paths of a pair, one for each arrival and variant; return the unlisted power.
+
+    Paths with a rough bound below `negligible`, which takes `most`, are not listed.
+    """
+    (_, largest, _, wavelength), (material, cosine, terms) = media, scratch
+    before, before_cosine, lit, lengths = arrivals.material, arrivals.cosine, arrivals.lit, arrivals.length_m
+    reflections, angle, faces = arrivals.reflections, arrivals.angle, arrivals.faces
+    toward, gain = arrivals.toward, arrivals.gain
+    directed, onward, after = len(room.gains.table) > 1, pair.onward_m, (material, cosine, pair.after)
+    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, heights.max())
+    pairs, joined, bound, used = out
+    unlisted, size = 0.0, len(heights)
+    for j in range(arrivals.start[pair.edge], arrivals.start[pair.edge + 1]):
+        left, length = pair.left - reflections[j], lengths[j]
+        if left < 0:
+            continue
+        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), pair.departure, terms)
+        spread, reach = _spread(wavelength, length, onward)
+        amplitude = most_after * most[j, 0] * most_at_edge(terms, np.sqrt(reach), most[j, 1], most[j, 2])
+        rough = (2 * left + 1) * amplitude**2 * spread / (length + onward) * gain[j]
+        if rough < negligible:
+            unlisted += rough
+            continue
+        face = pair.material[0] if lit[j] else pair.material[1], faces[j, 0], faces[j, 1]
+        for variant in range(2 * left + 2):
+            height = heights[variant]
+            if height < 0.0:
+                continue
+            total = np.sqrt((length + onward) ** 2 + height**2)
+            sine = (length + onward) / total
+            path = np.sqrt(reach * sine), sine, height / total, variant // 2
+            arrived = before, before_cosine, j, reflections[j]
+            strength = _strength(media, arrived, face, after, terms, path) ** 2 * spread / total
+            if directed:
+                rise = rise_of(variant, room, room.rx_m[pair.rx])
+                strength *= gain_of_departure(room, toward[j, 0], toward[j, 1], rise, length + onward)
+            pairs, joined, bound = grow(pairs, used + 1), grow(joined, used + 1), grow(bound, used + 1)
+            pairs[used], joined[used], bound[used] = pair.number, j * size + variant, strength
+            used += 1
+    return (pairs, joined, bound, used), unlisted
+
+
+@njit(cache=True)
+def _constants(edges, edge):  # type: ignore[no-untyped-def]
+    """Return the `wedge_constants` of an edge."""
+    return edges.utd[edge, 0], edges.utd[edge, 1], edges.utd[edge, 2], edges.utd[edge, 3], edges.utd[edge, 4]
+
+
+@njit(cache=True)
+def _spread(wavelength, length, onward):  # type: ignore[no-untyped-def]
+    """Return the spread of the power over an edge, to be divided by the length of the path, and 2 k L."""
+    spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
+    return spread, 4.0 * np.pi / wavelength * length * onward / (length + onward)
+
+
+@njit(cache=True)
+def _most_of_arrivals(largest, arrivals, material, highest):  # type: ignore[no-untyped-def]
+    """Return bounds (J, 3) of fields that arrive at edges, and of reflections at the two faces there."""
+    most, one = np.empty((len(arrivals.lit), 3)), np.int64(1)
+    for edge in range(len(arrivals.start) - 1):
+        for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
+            length, own = arrivals.length_m[j], material[edge] if arrivals.lit[j] else material[edge, 1:]
+            most[j, 0] = _most_at_walls(
+                largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
+            )
+            for k in range(2):
+                face = arrivals.faces[j, k : k + 1]
+                most[j, 1 + k] = _most_at_walls(largest, own, face, one, length, highest) if face[0] >= 0.0 else 1.0
+    return most
+
+
+@njit(cache=True)
+def _most_at_walls(largest, material, cosine, count, length, highest):  # type: ignore[no-untyped-def]
+    """Return a bound of the field after walls, for a path of some length that rises by `highest` at most."""
+    most, sine = 1.0, length / np.sqrt(length * length + highest * highest)
+    for k in range(count):
+        most *= most_at_wall(largest, material[k], cosine[k] * sine)
+    return most
+
+
+@njit(cache=True, nogil=True)
+def _list_crossed(group, edges, arrivals, needed, building, trail):  # type: ignore[no-untyped-def]
+    """List the strong paths over some edges: edge, receiver, arrival and variant (C, 4), and powers (C,)."""
+    room, materials, shortest_m = building.room, building.materials, _shortest_leg_m(building)
+    chosen, power, used, terms = np.empty((1024, 4), np.int32), np.empty(1024), np.int64(0), np.empty((4, 3))
+    wavelength, no_walls = materials.wavelength_m, (np.empty(0, np.int64), np.empty(0), np.int64(0))
+    media = _media(building)
+    for e in group:
+        origin, exterior, constants = edges.position_m[e], edges.exterior_rad[e], _constants(edges, e)
+        for j in range(arrivals.start[e], arrivals.start[e + 1]):
+            before, through, gain = arrivals.length_m[j], arrivals.left[j], arrivals.gain[j]
+            angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
+            arrived = arrivals.material, arrivals.cosine, j, np.int64(0)
+            own = edges.material[e, 0] if arrivals.lit[j] else edges.material[e, 1]
+            face = own, arrivals.faces[j, 0], arrivals.faces[j, 1]
+            for rx in range(len(room.rx_m)):
+                target = room.rx_m[rx]
+                x, y = target[0] - origin[0], target[1] - origin[1]
+                onward = np.hypot(x, y)
+                total = before + onward
+                too_weak = through * gain * (wavelength / (4.0 * np.pi * total)) ** 2 < needed[rx]
+                if too_weak or onward < shortest_m or not _outside(edges.normals[e], x, y)[1]:
+                    continue
+                departure = wedge_angle(_angle_rad(edges.face_rad[e], exterior, x, y), exterior)
+                utd_terms(constants, angle, departure, terms)
+                spread, reach = _spread(wavelength, before, onward)
+                level = _strength(media, arrived, face, no_walls, terms, (np.sqrt(reach), 1.0, 0.0, np.int64(0)))
+                if level**2 * spread * through / total * gain < needed[rx]:
+                    continue
+                count, crossed = _from_edge(building, origin, target, onward, total, np.int64(0), trail)
+                walls = crossed + arrivals.crossed[j]
+                if count < 0 or walls == 0 or walls > building.limits.walls:
+                    continue
+                spread *= through * _leg_power(trail, count, building)
+                for variant in range(_VARIANTS):
+                    rise = rise_of(variant, room, target)
+                    if not has_variant(variant, room) or rise.bounces > building.limits.depth - 1:
+                        continue
+                    length = np.hypot(total, rise.height_m)
+                    path = np.sqrt(reach * total / length), total / length, rise.height_m / length, rise.bounces
+                    strength = _strength(media, arrived, face, no_walls, terms, path) ** 2 * spread / length
+                    strength *= gain_of_departure(room, arrivals.toward[j, 0], arrivals.toward[j, 1], rise, total)
+                    if strength >= needed[rx]:
+                        chosen, power = grow(chosen, used + 1), grow(power, used + 1)
+                        chosen[used, 0], chosen[used, 1], chosen[used, 2], chosen[used, 3] = e, rx, j, variant
+                        power[used] = strength
+                        used += 1
+    return chosen[:used].copy(), power[:used].copy()
+
+
+@njit(cache=True, nogil=True)
+def _write_joined(tree, edges, arrivals, chosen, building, trail, size):  # type: ignore[no-untyped-def]
+    """Write chosen beams from edges, receivers, arrivals and variants (C,); paths with too short legs stay empty."""
+    node, rx, arrival, variant = chosen
+    paths, room, owner = empty_paths(len(rx), size), building.room, building.plan.owner
+    for c in range(len(rx)):
+        j, target = arrival[c], room.rx_m[rx[c]]
+        origin = edges.position_m[arrivals.edge[j]]
+        after, onward = unfold(tree, node[c], building.plan.pieces_m, target, trail.walls, trail.bounce)
+        count = _join(arrivals, j, origin, target, after, onward, building, trail)
+        if count >= 0:
+            write_path(trail, count, room, owner, target, np.int64(variant[c]), paths, c)
+    return paths
+
+
+@njit(cache=True, forceinline=True)
+def _join(arrivals, j, origin, target, after, onward, building, trail):  # type: ignore[no-untyped-def]
+    """Write all that a whole path meets in the plan; return the number of entries, -1 if Sionna RT drops the path."""
+    length, count, through_walls = arrivals.length_m[j], np.int64(0), building.limits.walls > 0
+    total, reflection = length + onward, np.int64(REFLECTION)
+    if through_walls:
+        count, _ = _to_edge(building, origin, length, total, trail)
+    for k in range(arrivals.reflections[j]):
+        x, y, fraction = arrivals.points[j, k, 0], arrivals.points[j, k, 1], arrivals.points[j, k, 2]
+        count = add_entry(trail, count, arrivals.walls[j, k], reflection, x, y, fraction * length / total)
+    count = add_entry(trail, count, np.int64(-1), np.int64(DIFFRACTION), origin[0], origin[1], length / total)
+    for k in range(after):
+        x, y, fraction = trail.bounce[k, 0], trail.bounce[k, 1], trail.bounce[k, 2]
+        count = add_entry(trail, count, trail.walls[k], reflection, x, y, (length + onward * fraction) / total)
+    if through_walls:
+        count, _ = _from_edge(building, origin, target, onward, total, count, trail)
+        if count >= 0 and not has_long_legs(trail, count, total):
+            return -1
+    return count

@@ -1,0 +1,398 @@
+"""Paths of a floor plan without diffraction: reflections between opaque walls, and paths through walls.
+
+Both are sequences of walls from `beams.py`, unfolded into the points where each wall reflects, with every possible
+number of reflections at floor and ceiling. They differ in the power that decides which of them are verified: paths
+between opaque walls have an upper bound for any polarisation, paths through walls the power of their Jones vector.
+"""
+
+from collections.abc import Iterator
+from functools import partial
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats, Indices
+from sionna_partial.process import in_order, njit
+from sionna_partial.scene.floor_plan import bin_points, grow
+from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.paths import Candidates
+from sionna_partial.tracing.plan.beams import (
+    BeamTree,
+    CrossingBeams,
+    Task,
+    first_beams,
+    first_pairs,
+    follow_beams,
+    needed_of,
+    trace_beams,
+)
+from sionna_partial.tracing.plan.room import (
+    FACES,
+    Building,
+    Leg,
+    Lowered,
+    Room,
+    add_entry,
+    candidates_of,
+    cross_leg,
+    empty_paths,
+    fraction_at_turn,
+    gain_of_departure,
+    has_long_legs,
+    has_variant,
+    height_at,
+    rise_of,
+    trail_of,
+    write_path,
+)
+from sionna_partial.tracing.power import (
+    Materials,
+    at_flats,
+    at_slab,
+    at_wall,
+    gain_at_azimuth,
+    gain_towards,
+    power_near,
+    received_power,
+    vertical_field,
+)
+from sionna_partial.tracing.select import Limits, Listed
+from sionna_partial.tracing.walls import Interior
+
+_VARIANTS = 6
+"""Variants of paths through walls: at most two reflections at floor and ceiling."""
+
+_LISTED_AT_ONCE = 200_000
+"""Number of pairs of a sequence of opaque walls and a receiver that are listed together, which limits the memory."""
+
+_BEAMS_AT_ONCE, _PAIRS_AT_ONCE = 256, 5_000
+"""Number of beams and number of pairs that one thread works on at a time."""
+
+
+@njit(cache=True)
+def unfold(tree, node, pieces_m, target, walls, bounce):  # type: ignore[no-untyped-def]
+    """Write the reflections at walls of a path: return their number, -1 without a path, and the length in the plan.
+
+    `walls` and `bounce` are as in `Trail`.
+    """
+    k, above = 0, node
+    while tree.parent[above] >= 0:
+        k, above = k + 1, tree.parent[above]
+    x, y = target[0], target[1]
+    total = np.hypot(x - tree.source_m[node, 0], y - tree.source_m[node, 1])
+    for level in range(k - 1, -1, -1):
+        sx, sy = tree.source_m[node, 0], tree.source_m[node, 1]
+        wall = pieces_m[tree.piece[node]]
+        dx, dy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+        from_source = dx * (sy - wall[0, 1]) - dy * (sx - wall[0, 0])
+        from_point = dx * (y - wall[0, 1]) - dy * (x - wall[0, 0])
+        if abs(from_source - from_point) < 1e-15 or total == 0.0:
+            return -1, total
+        fraction = from_source / (from_source - from_point)
+        x, y = sx + fraction * (x - sx), sy + fraction * (y - sy)
+        away = np.hypot(x - sx, y - sy)
+        walls[level] = tree.piece[node]
+        bounce[level, 0], bounce[level, 1], bounce[level, 2] = x, y, away / total
+        bounce[level, 3] = abs(from_source) / max(away * np.hypot(dx, dy), 1e-15)
+        node = tree.parent[node]
+    return k, total
+
+
+@njit(cache=True)
+def _departure(k, building, target, trail):  # type: ignore[no-untyped-def]
+    """Return the horizontal offset from the transmitter to the end of the first leg."""
+    x, y = (trail.bounce[0, 0], trail.bounce[0, 1]) if k > 0 else (target[0], target[1])
+    return x - building.room.tx_m[0], y - building.room.tx_m[1]
+
+
+@njit(cache=True, forceinline=True)
+def _meet(k, building, target, trail):  # type: ignore[no-untyped-def]
+    """Write all that a path with `k` reflections at walls meets in the plan.
+
+    Returns the number of entries, -1 if there is no path, and the number of walls that the path goes through.
+    """
+    count = crossed = np.int64(0)
+    start, done, own = (building.room.tx_m[0], building.room.tx_m[1]), 0.0, np.int64(-1)
+    for level in range(k + 1):
+        end, stop, other = (target[0], target[1]), 1.0, np.int64(-1)
+        if level < k:
+            end, stop = (trail.bounce[level, 0], trail.bounce[level, 1]), trail.bounce[level, 2]
+            other = trail.walls[level]
+        if building.limits.walls > 0:
+            leg = Leg(start, end, own, other, done, stop)
+            count, more = cross_leg(building.plan, building.interior, leg, count, trail)
+            crossed += more
+            if count < 0 or crossed > building.limits.walls or count >= len(trail.surface) - 1:
+                return -1, crossed
+        if level < k:
+            count = add_entry(trail, count, other, np.int64(REFLECTION), end[0], end[1], stop)
+        start, done, own = end, stop, other
+    return count, crossed
+
+
+@njit(cache=True, nogil=True)
+def _write_paths(tree, pairs, variants, building, trail, size):  # type: ignore[no-untyped-def]
+    """Write variants of pairs of a beam and a receiver, with `size` columns of interactions."""
+    paths, room, owner = empty_paths(len(pairs), size), building.room, building.plan.owner
+    for c in range(len(pairs)):
+        target = room.rx_m[pairs[c, 1]]
+        k, _ = unfold(tree, pairs[c, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
+        count, _ = _meet(k, building, target, trail)
+        write_path(trail, count, room, owner, target, np.int64(variants[c]), paths, c)
+    return paths
+
+
+class SpecularCandidates:
+    """All paths of at most `max_depth` reflections between opaque walls, floor and ceiling."""
+
+    name = "reflections"
+
+    def __init__(self, geometry: SceneGeometry, room: Room, max_depth: int, materials: Materials) -> None:
+        self._geometry = geometry
+        self._building = Building.opaque(geometry.plan, room, materials, max_depth)
+
+    def listed(self, found: Floats, *, pairs_at_once: int = _LISTED_AT_ONCE) -> Iterator[Listed]:
+        """List the candidates; none is negligible."""
+        room, plan, depth = self._building.room, self._building.plan, self._building.limits.depth
+        tree, pairs = trace_beams(plan, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
+        for start in range(0, len(pairs), pairs_at_once):
+            some = pairs[start : start + pairs_at_once]
+            pair, variant, bound = _list_variants(tree, some, self._building, trail_of(plan))
+            write = partial(self._written, tree, some, pair, variant)
+            yield Listed(some[pair, 1], bound, write, (start + len(some)) / len(pairs))
+
+    def _written(
+        self, tree: BeamTree, pairs: NDArray[np.int32], pair: Indices, variant: NDArray[np.int8], rows: Indices
+    ) -> Candidates:
+        size, trail = max(1, self._building.limits.depth), trail_of(self._building.plan)
+        pairs = pairs[pair[rows]]
+        paths = _write_paths(tree, pairs, variant[rows], self._building, trail, size)
+        return candidates_of(self._geometry, pairs[:, 1], paths, opaque=True)
+
+
+@njit(cache=True, nogil=True)
+def _list_variants(tree, pairs, building, trail):  # type: ignore[no-untyped-def]
+    """List every variant of pairs between opaque walls: number of the pair, variant and bound (C,)."""
+    room, largest, max_depth = building.room, building.materials.largest, building.limits.depth
+    rx_m, wall_material, directed = room.rx_m, building.material, len(room.gains.table) > 1
+    wavelength, pieces_m = building.materials.wavelength_m, building.plan.pieces_m
+    walls, bounce = trail.walls, trail.bounce
+    pair, variants, bound = np.empty(1024, np.int32), np.empty(1024, np.int8), np.empty(1024)
+    count = np.int64(0)
+    for i in range(len(pairs)):
+        target = rx_m[pairs[i, 1]]
+        k, length = unfold(tree, pairs[i, 0], pieces_m, target, walls, bounce)
+        if k < 0:
+            continue
+        for variant in range(2 * (max_depth - k) + 2):
+            if not has_variant(variant, room):
+                continue
+            rise = rise_of(variant, room, target)
+            total = np.hypot(length, rise.height_m)
+            sine, slope, field = length / total, rise.height_m / total, (1.0, 0.0, 1.0)
+            for level in range(k):
+                field = at_wall(largest, wall_material[walls[level]], bounce[level, 3], sine, slope, field)
+            strength = at_flats(largest, room.flat_material, slope, rise.bounces, field)
+            power = (wavelength / (4.0 * np.pi * total) * strength) ** 2
+            if directed:
+                x, y = _departure(k, building, target, trail)
+                power *= gain_of_departure(room, x, y, rise, length)
+            pair, variants, bound = grow(pair, count + 1), grow(variants, count + 1), grow(bound, count + 1)
+            pair[count], variants[count] = i, variant
+            bound[count] = power if k + rise.bounces > 0 else np.inf
+            count += 1
+    return pair[:count].copy(), variants[:count].copy(), bound[:count].copy()
+
+
+@njit(cache=True)
+def _bounds(k, length, through, building, target, least, trail, possible):  # type: ignore[no-untyped-def]
+    """Mark the variants of a path that may have the power `least`; return whether there is any."""
+    room, table, some = building.room, building.materials.reflection, False
+    x, y = _departure(k, building, target, trail)
+    through *= gain_at_azimuth(room.gains, x, y)
+    for variant in range(_VARIANTS):
+        rise = rise_of(variant, room, target)
+        possible[variant] = has_variant(variant, room) and k + rise.bounces <= building.limits.depth
+        if not possible[variant]:
+            continue
+        total = np.hypot(length, rise.height_m)
+        power = through * (building.materials.wavelength_m / (4.0 * np.pi * total)) ** 2
+        power *= power_near(table, room.flat_material, rise.height_m / total) ** rise.bounces
+        for level in range(k):
+            material = building.material[trail.walls[level]]
+            power *= power_near(table, material, trail.bounce[level, 3] * length / total)
+        possible[variant] = 1.01 * power >= least
+        some |= possible[variant]
+    return some
+
+
+@njit(cache=True, nogil=True)
+def _pair_powers(tree, pair, through, building, needed, trail):  # type: ignore[no-untyped-def]
+    """Return the power (K, V) of each variant of pairs (beam, receiver), of which walls leave at most `through` (K,).
+
+    It is 0 where there is no path that goes through a wall, or none that has the power `needed` (N,).
+    """
+    power, possible = np.zeros((len(pair), _VARIANTS)), np.empty(_VARIANTS, np.bool_)
+    for i in range(len(pair)):
+        target, least = building.room.rx_m[pair[i, 1]], needed[pair[i, 1]]
+        k, length = unfold(tree, pair[i, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
+        if k < 0 or not _bounds(k, length, through[i], building, target, least, trail, possible):
+            continue
+        count, crossed = _meet(k, building, target, trail)
+        if count < 0 or crossed == 0 or not has_long_legs(trail, count, length):
+            continue
+        for variant in range(_VARIANTS):
+            if possible[variant]:
+                rise = rise_of(variant, building.room, target)
+                power[i, variant] = _path_power(trail, count, length, rise, building, target)
+    return power
+
+
+@njit(cache=True)
+def _path_power(trail, count, length, rise, building, target):  # type: ignore[no-untyped-def]
+    """Return the power between vertical antennas of the path of a trail, with reflections at floor and ceiling."""
+    room, total = building.room, np.hypot(length, rise.height_m)
+    end = (trail.points[0, 0], trail.points[0, 1]) if count > 0 else (target[0], target[1])
+    ax, ay, done = room.tx_m[0], room.tx_m[1], 0.0
+    size = max(np.hypot(end[0] - ax, end[1] - ay), 1e-12) * total / length
+    k = (end[0] - ax) / size, (end[1] - ay) / size, rise.up * rise.height_m / total
+    e, gain = vertical_field(k), gain_towards(room.gains, k[0], k[1], k[2])
+    item = turn = np.int64(0)
+    while item < count or turn < rise.bounces:
+        fraction = fraction_at_turn(turn, room, rise)
+        if item < count and trail.points[item, 2] <= fraction:
+            ax, ay, done = trail.points[item]
+            piece = trail.surface[item]
+            above = building.plan.low[piece] and trail.kind[item] == REFRACTION
+            if above:
+                above = height_at(done, room, rise) > room.top_m[building.plan.owner[piece]]
+            if not (trail.same_wall[item] or above):
+                normal, material = _normal(building.plan, piece), building.material[piece]
+                k, e = at_slab(k, e, normal, building.materials, material, trail.kind[item])
+            item += 1
+            continue
+        bx, by, stop = target[0], target[1], 1.0
+        if item < count:
+            bx, by, stop = trail.points[item]
+        part = (fraction - done) / (stop - done) if stop > done else 0.0
+        if not _has_floor(building.interior, ax + part * (bx - ax), ay + part * (by - ay)):
+            return 0.0
+        k, e = at_slab(k, e, (0.0, 0.0, 1.0), building.materials, room.flat_material, np.int64(REFLECTION))
+        turn += 1
+    return (building.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain
+
+
+@njit(cache=True)
+def _normal(plan, piece):  # type: ignore[no-untyped-def]
+    """Return the unit vector across a piece of a wall."""
+    wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
+    wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
+    size = np.hypot(wx, wy)
+    return wy / size, -wx / size, 0.0
+
+
+@njit(cache=True)
+def _has_floor(interior, x, y):  # type: ignore[no-untyped-def]
+    """Return whether there is floor at a point, and ceiling."""
+    column, row = int(x / interior.cell_m), int(y / interior.cell_m)
+    return 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1] and interior.floor[row, column]
+
+
+class _Paths(NamedTuple):
+    """Paths: `pair` (K, 2) of beam and receiver, `variant` (K,), and `power` (K,)."""
+
+    pair: NDArray[np.int32]
+    variant: Indices
+    power: Floats
+
+    def sums(self, count: int) -> Floats:
+        """Sum up the power of each of `count` receivers."""
+        return np.bincount(self.pair[:, 1], self.power, count).astype(np.float64)
+
+
+class CrossingCandidates:
+    """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
+
+    They have at most two reflections at floor and ceiling, and are limited by `Limits`.
+    """
+
+    name = "paths through walls"
+
+    def __init__(
+        self,
+        geometry: SceneGeometry,
+        room: Room,
+        interior: Interior,
+        settings: TraceSettings,
+        materials: Materials,
+    ) -> None:
+        self._geometry = geometry
+        walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
+        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1)
+        self.building = Building.of(geometry.plan, interior, room, materials, limits)
+        self.lowered = Lowered.of(geometry, self.building, settings.max_walls)
+
+    def listed(self, found: Floats) -> Iterator[Listed]:
+        """List the paths that links may need whose indirect paths without walls have the power `found` (N,)."""
+        tree, (pair, variant, power) = self._found(found)
+        yield Listed(pair[:, 1], power, partial(self._written, tree, pair, variant), 1.0)
+
+    def _found(self, found: Floats) -> tuple[BeamTree, _Paths]:
+        """List all beams, and the paths that links need, by the number of their reflections.
+
+        The paths of few reflections decide how strong paths of more have to be.
+        """
+        room, limits, count = self.building.room, self.building.limits, len(found)
+        receivers, beams = bin_points(room.rx_m[:, :2]), first_beams(room)
+        tree, first = BeamTree(beams.parent, beams.piece, beams.window[:, :2].copy()), 0
+        straight = np.stack([np.zeros(count, np.int32), np.arange(count, dtype=np.int32)], axis=1)
+        listed = [self._paths(tree, straight, np.ones(count), np.zeros(count))]
+        total = found + listed[0].sums(count)
+        transmitted = float(self.building.materials.most_transmitted.max(initial=0.0))
+        for order in range(limits.reflections + 1):
+            weakest = limits.min_power(total)
+            needed = needed_of(weakest, room, self.building.materials.wavelength_m)
+            task = Task(order, receivers, self.building, needed, transmitted)
+            reflected, pair, through = self._followed(beams, task)
+            new = first_pairs(np.unique(beams.sequence, return_inverse=True)[1], pair, count)
+            pair = pair[new] + np.array([first, 0], np.int32)
+            listed.append(self._paths(tree, pair, through[new], weakest))
+            total += listed[-1].sums(count)
+            first, beams = len(tree.parent), reflected._replace(parent=reflected.parent + np.int32(first))
+            parent, piece = np.append(tree.parent, beams.parent), np.append(tree.piece, beams.piece)
+            tree = BeamTree(parent, piece, np.concatenate([tree.source_m, beams.window[:, :2]]))
+        return tree, _Paths(*(np.concatenate(column) for column in zip(*listed, strict=True)))
+
+    def _followed(self, beams: CrossingBeams, task: Task) -> tuple[CrossingBeams, NDArray[np.int32], Floats]:
+        """Follow beams: return the beams that walls reflect, pairs (K, 2), and bounds of the power after walls (K,)."""
+
+        def followed(first: int) -> tuple[Any, ...]:
+            stop = min(first + _BEAMS_AT_ONCE, len(beams.parent))
+            return follow_beams(beams, first, stop, task)  # type: ignore[no-any-return]
+
+        nothing = (tuple(column[:0] for column in beams), np.zeros((0, 2), np.int32), np.zeros(0))
+        parts = [nothing, *in_order(followed, range(0, len(beams.parent), _BEAMS_AT_ONCE))]
+        children, pair, through = zip(*parts, strict=True)
+        reflected = CrossingBeams(*(np.concatenate(column) for column in zip(*children, strict=True)))
+        return reflected, np.concatenate(pair), np.concatenate(through)
+
+    def _paths(self, tree: BeamTree, pair: NDArray[np.int32], through: Floats, needed: Floats) -> _Paths:
+        """Find the paths of pairs (beam, receiver) of which walls leave no more than `through` (K,)."""
+
+        def of_pairs(start: int) -> Floats:
+            rows = slice(start, start + _PAIRS_AT_ONCE)
+            trail = trail_of(self._geometry.plan)
+            return _pair_powers(tree, pair[rows], through[rows], self.building, needed, trail)  # type: ignore[no-any-return]
+
+        parts = in_order(of_pairs, range(0, len(pair), _PAIRS_AT_ONCE))
+        power = np.concatenate([np.zeros((0, _VARIANTS)), *parts])
+        which, variant = np.nonzero(power)
+        return _Paths(pair[which], variant, power[which, variant])
+
+    def _written(self, tree: BeamTree, pair: NDArray[np.int32], variant: Indices, rows: Indices) -> Candidates:
+        pair, trail, variant = pair[rows], trail_of(self._geometry.plan), variant[rows].astype(np.int8)
+        paths = _write_paths(tree, pair, variant, self.building, trail, len(trail.surface) + 2)
+        return self.lowered(candidates_of(self._geometry, pair[:, 1], paths, opaque=False))

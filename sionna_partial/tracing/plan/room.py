@@ -1,0 +1,525 @@
+"""The surfaces of a floor plan, and everything that a path between two points of it meets.
+
+Seen from above, a path is a sequence of straight legs between reflections at walls. It goes through the walls that a
+leg crosses, unless walls are opaque (`Limits.walls` is 0): a leg between opaque walls meets nothing. Unfolded, the
+height of a path changes linearly with its length in the plan, so that its reflections at floor and ceiling depend on
+this length alone. Obstacles end below the ceiling: a path crosses them, or runs above them.
+
+The variant of a path is twice its number of reflections at floor and ceiling, plus 1 if the first is at the ceiling.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.process import njit
+from sionna_partial.scene.floor_plan import Plan
+from sionna_partial.scene.scene import SceneGeometry
+from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
+from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
+from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, gain_towards
+from sionna_partial.tracing.select import Limits
+from sionna_partial.tracing.walls import Interior, group_faces, is_free_between
+
+NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
+"""Surfaces by number: no surface, floor, ceiling, a vertical edge, and from `WALLS` on walls or entries of a trail."""
+
+FACES = 40
+"""Largest number of faces of walls that a leg may cross."""
+
+_ENTRIES = 64
+"""Largest number of interactions of a path in the plan."""
+
+_REFLECTIONS = 16
+"""Largest number of reflections of a path at walls."""
+
+_MAX_LIDS = 8
+"""Largest number of tops of obstacles that a path may cross."""
+
+
+class Room(NamedTuple):
+    """Surfaces around a transmitter (3,) and receivers (N, 3), in the local frame [m].
+
+    The floor is at 0, the ceiling at `height_m`; `floor` and `ceiling` are True if they reflect. `wall_material` (S,)
+    and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls, `gains` the gains of the
+    transmit antenna.
+    """
+
+    height_m: float
+    floor: bool
+    ceiling: bool
+    tx_m: Floats
+    rx_m: Floats
+    wall_material: NDArray[np.int64]
+    flat_material: int
+    top_m: Floats
+    gains: Gains
+
+    @classmethod
+    def of(
+        cls,
+        geometry: SceneGeometry,
+        tx_m: Floats,
+        rx_m: Floats,
+        material_of_face: NDArray[np.int64],
+        gains: Gains = ISOTROPIC,
+    ) -> "Room":
+        """Take it from a scene, whose faces have these materials."""
+        flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
+        of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
+        materials = material_of_face[: 2 * len(geometry.segments) : 2], of_flats
+        return cls(float(geometry.height_m), *flats, tx_m, rx_m, *materials, geometry.top_m, gains)
+
+
+class Building(NamedTuple):
+    """A floor plan with everything that decides which paths it has.
+
+    `material` (P,) are the materials of the pieces of its walls.
+    """
+
+    plan: Plan
+    interior: Interior
+    room: Room
+    materials: Materials
+    material: NDArray[np.int64]
+    limits: Limits
+
+    @classmethod
+    def of(cls, plan: Plan, interior: Interior, room: Room, materials: Materials, limits: Limits) -> "Building":
+        """Look up the materials of pieces."""
+        return cls(plan, interior, room, materials, room.wall_material[plan.owner], limits)
+
+    @classmethod
+    def opaque(cls, plan: Plan, room: Room, materials: Materials, max_depth: int) -> "Building":
+        """Return a building whose walls are opaque."""
+        nothing = np.zeros((1, 1), np.bool_)
+        interior = Interior(nothing, nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
+        return cls.of(plan, interior, room, materials, Limits(max_depth, max_depth, 0, 1.0, 0.0))
+
+
+class Rise(NamedTuple):
+    """Heights along a path [m], unfolded: `height_m` in all, `to_first_m` to its first reflection at floor or ceiling.
+
+    `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections.
+    """
+
+    height_m: float
+    to_first_m: float
+    up: float
+    bounces: int
+
+
+@njit(cache=True)
+def has_variant(variant, room):  # type: ignore[no-untyped-def]
+    """Return whether a path can meet floor and ceiling in turn as a variant has it."""
+    bounces, first = variant // 2, FLOOR + variant % 2
+    if bounces == 0:
+        return first == FLOOR
+    if bounces == 1:
+        return room.floor if first == FLOOR else room.ceiling
+    return room.floor and room.ceiling
+
+
+@njit(cache=True)
+def rise_of(variant, room, target):  # type: ignore[no-untyped-def]
+    """Return the heights along a variant of a path."""
+    bounces, first = variant // 2, FLOOR + variant % 2
+    if bounces == 0:
+        rise = target[2] - room.tx_m[2]
+        return Rise(abs(rise), 0.0, 1.0 if rise >= 0.0 else -1.0, bounces)
+    to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
+    last_is_floor = (bounces % 2 == 1) == (first == FLOOR)
+    from_last = target[2] if last_is_floor else room.height_m - target[2]
+    height = to_first + (bounces - 1) * room.height_m + from_last
+    return Rise(height, to_first, -1.0 if first == FLOOR else 1.0, bounces)
+
+
+@njit(cache=True)
+def height_at(fraction, room, rise):  # type: ignore[no-untyped-def]
+    """Return the height of a path after a fraction of its length [m]."""
+    travelled = fraction * rise.height_m
+    if rise.bounces == 0 or travelled <= rise.to_first_m:
+        return room.tx_m[2] + rise.up * travelled
+    legs = int((travelled - rise.to_first_m) // room.height_m)
+    rest = travelled - rise.to_first_m - legs * room.height_m
+    return rest if (legs % 2 == 0) == (rise.up < 0.0) else room.height_m - rest
+
+
+@njit(cache=True)
+def fraction_at_turn(turn, room, rise):  # type: ignore[no-untyped-def]
+    """Return the fraction of a path's length at its reflection number `turn` at floor or ceiling, 2 if it has fewer."""
+    return (rise.to_first_m + turn * room.height_m) / rise.height_m if turn < rise.bounces else 2.0
+
+
+@njit(cache=True)
+def merge_heights(trail, count, room, target, rise, surface, vertices, row):  # type: ignore[no-untyped-def]
+    """Write one row in path order: the `count` entries of a trail, and the reflections at floor and ceiling."""
+    entry = turn = np.int64(0)
+    px, py, done = room.tx_m[0], room.tx_m[1], 0.0
+    for depth in range(count + rise.bounces):
+        fraction = fraction_at_turn(turn, room, rise)
+        if entry < count and trail.points[entry, 2] <= fraction:
+            px, py, done = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+            surface[row, depth] = WALLS + entry
+            vertices[row, depth, 0], vertices[row, depth, 1] = px, py
+            vertices[row, depth, 2] = height_at(done, room, rise)
+            entry += 1
+            continue
+        nx, ny, stop = target[0], target[1], 1.0
+        if entry < count:
+            nx, ny, stop = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+        part = (fraction - done) / (stop - done) if stop > done else 0.0
+        is_floor = (turn % 2 == 0) == (rise.up < 0.0)
+        surface[row, depth] = FLOOR if is_floor else CEILING
+        vertices[row, depth, 0], vertices[row, depth, 1] = px + part * (nx - px), py + part * (ny - py)
+        vertices[row, depth, 2] = 0.0 if is_floor else room.height_m
+        turn += 1
+
+
+@njit(cache=True)
+def gain_of_departure(room, x, y, rise, length):  # type: ignore[no-untyped-def]
+    """Return the gain of the antenna for a path of some length in the plan that departs with a horizontal offset."""
+    if len(room.gains.table) == 1:
+        return 1.0
+    return gain_towards(room.gains, x, y, rise.up * rise.height_m / max(length, 1e-9) * np.hypot(x, y))
+
+
+class Leg(NamedTuple):
+    """A straight leg from one point of a path to another [m], which are fractions of the path's length.
+
+    `own` and `other` are the pieces of walls that reflect it there, -1 if none does. `done` and `stop` are the
+    fractions.
+    """
+
+    start: tuple[float, float]
+    end: tuple[float, float]
+    own: np.int64
+    other: np.int64
+    done: float
+    stop: float
+
+
+class Trail(NamedTuple):
+    """Scratch of one path in the plan: its reflections, and all interactions in order from the transmitter.
+
+    `walls` are pieces that reflect it, `bounce` the points (x, y, fraction of the length) and the cosine of incidence
+    there. `surface` are pieces of walls, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a
+    further face of a wall that has been crossed, which costs nothing, and `cosine` the cosine of incidence there;
+    `points` are (x, y, fraction of the length).
+    """
+
+    walls: NDArray[np.int64]
+    bounce: Floats
+    surface: NDArray[np.int64]
+    kind: NDArray[np.int64]
+    same_wall: Bools
+    cosine: Floats
+    points: Floats
+    found: Floats
+    wall: NDArray[np.int64]
+    visit: NDArray[np.int64]
+
+
+def trail_of(plan: Plan) -> Trail:
+    """Make scratch for paths in a plan."""
+    return Trail(
+        np.empty(_REFLECTIONS, np.int64),
+        np.empty((_REFLECTIONS, 4)),
+        np.empty(_ENTRIES, np.int64),
+        np.empty(_ENTRIES, np.int64),
+        np.empty(_ENTRIES, np.bool_),
+        np.empty(_ENTRIES),
+        np.empty((_ENTRIES, 3)),
+        np.empty(_ENTRIES),
+        np.empty(_ENTRIES, np.int64),
+        np.full(len(plan.pieces_m) + 1, -1, np.int64),
+    )
+
+
+@njit(cache=True)
+def cross_leg(plan, interior, leg, count, trail):  # type: ignore[no-untyped-def]
+    """Add the faces that a leg crosses to `count` entries; return the number of entries, and of walls crossed.
+
+    The first is -1 if there are too many, or if a wall reflects a leg that came through another face of it.
+    """
+    dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
+    length = np.hypot(dx, dy)
+    if length < 1e-9:
+        return count, 0
+    n = _faces_on(plan, leg, dx, dy, length, trail)
+    if n < 0 or count + n >= len(trail.surface) - 1:
+        return -1, 0
+    if n > 0 and interior.depth_m > 0.0 and _is_reflected_inside(plan, interior, leg, n, trail):
+        return -1, 0
+    for j in range(n):
+        t, i, entry = trail.found[j], trail.wall[j], count + j
+        trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, _cosine(plan, i, dx, dy, length)
+        trail.points[entry, 0], trail.points[entry, 1] = leg.start[0] + t * dx, leg.start[1] + t * dy
+        trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
+    cosine, same_wall = trail.cosine[count : count + n], trail.same_wall[count : count + n]
+    return count + n, group_faces(interior, leg.start, leg.end, trail.found[:n], cosine, same_wall)
+
+
+@njit(cache=True)
+def _faces_on(plan, leg, dx, dy, length, trail):  # type: ignore[no-untyped-def]
+    """Write the pieces that a leg crosses, in order, and its fractions there; return their number, -1 if too many."""
+    (ax, ay), (bx, by) = leg.start, leg.end
+    x0, y0, edge, columns, rows = plan.cells.grid
+    columns, rows, n = int(columns), int(rows), 0
+    trail.visit[-1] += 1
+    stamp = trail.visit[-1]
+    low, high = min(ay, by) - 1e-6, max(ay, by) + 1e-6
+    for row in range(max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)):
+        left, right = min(ax, bx), max(ax, bx)
+        if abs(dy) > 1e-12:
+            first = ax + dx * ((y0 + row * edge - 1e-6) - ay) / dy
+            last = ax + dx * ((y0 + (row + 1) * edge + 1e-6) - ay) / dy
+            left, right = max(left, min(first, last)), min(right, max(first, last))
+        begin = max(0, int(np.floor((left - 1e-6 - x0) / edge)))
+        end = min(columns - 1, int(np.floor((right + 1e-6 - x0) / edge)))
+        if begin > end:
+            continue
+        for entry in range(plan.cells.start[row * columns + begin], plan.cells.start[row * columns + end + 1]):
+            i = plan.cells.piece[entry]
+            if trail.visit[i] == stamp:
+                continue
+            trail.visit[i] = stamp
+            if leg.own >= 0 and plan.line[i] == plan.line[leg.own]:
+                continue
+            if leg.other >= 0 and plan.line[i] == plan.line[leg.other]:
+                continue
+            t = _crossed_at(plan.pieces_m[i], ax, ay, dx, dy, length)
+            if t <= 0.0 or t >= 1.0:
+                continue
+            if n >= FACES:
+                return -1
+            at = n
+            while at > 0 and trail.found[at - 1] > t:
+                trail.found[at], trail.wall[at] = trail.found[at - 1], trail.wall[at - 1]
+                at -= 1
+            trail.found[at], trail.wall[at] = t, i
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def _crossed_at(piece, ax, ay, dx, dy, length):  # type: ignore[no-untyped-def]
+    """Return the fraction of a leg at which it crosses a piece of a wall, -1 if it does not.
+
+    A point on the leg's line counts as left of it, so that a line through a shared corner crosses one of its walls.
+    """
+    px, py, qx, qy = piece[0, 0], piece[0, 1], piece[1, 0], piece[1, 1]
+    side_p, side_q = dx * (py - ay) - dy * (px - ax), dx * (qy - ay) - dy * (qx - ax)
+    if (side_p >= 0.0) == (side_q >= 0.0):
+        return -1.0
+    u = side_p / (side_p - side_q)
+    return ((px + u * (qx - px) - ax) * dx + (py + u * (qy - py) - ay) * dy) / (length * length)
+
+
+@njit(cache=True)
+def _cosine(plan, piece, dx, dy, length):  # type: ignore[no-untyped-def]
+    """Return the cosine of the angle of incidence of a leg, seen from above."""
+    wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
+    wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
+    return abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
+
+
+@njit(cache=True)
+def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-untyped-def]
+    """Return whether the first or the last of the faces on a leg and the wall that reflects it there are one wall."""
+    dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
+    length = np.hypot(dx, dy)
+    for wall, face, t in ((leg.own, 0, 0.0), (leg.other, n - 1, 1.0)):
+        if wall < 0 or plan.low[trail.wall[face]]:
+            continue
+        first, last = min(t, trail.found[face]), max(t, trail.found[face])
+        cosine = min(_cosine(plan, wall, dx, dy, length), _cosine(plan, trail.wall[face], dx, dy, length))
+        if (last - first) * length * cosine <= interior.depth_m and not is_free_between(
+            interior, leg.start, leg.end, first, last
+        ):
+            return True
+    return False
+
+
+@njit(cache=True)
+def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
+    """Return whether no leg of a path of some length in the plan is so short that Sionna RT drops the path."""
+    previous = 0.0
+    for k in range(count):
+        if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:
+            return False
+        previous = trail.points[k, 2]
+    return (1.0 - previous) * length >= SHORTEST_LEG_M
+
+
+@njit(cache=True)
+def add_entry(trail, count, piece, kind, x, y, fraction):  # type: ignore[no-untyped-def]
+    """Add a reflection or a diffraction to `count` entries of a trail; return their number."""
+    trail.surface[count], trail.kind[count], trail.same_wall[count] = piece, kind, False
+    trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = x, y, fraction
+    return count + 1
+
+
+@njit(cache=True)
+def empty_paths(count, size):  # type: ignore[no-untyped-def]
+    """Return surfaces, kinds, vertices and `same_wall` of paths (C, D), without any interaction."""
+    vertices, same_wall = np.zeros((count, size, 3)), np.zeros((count, size), np.bool_)
+    return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
+
+
+@njit(cache=True, forceinline=True)  # copying the arguments of a call would take longer than the function
+def write_path(trail, count, room, owner, target, variant, paths, row):  # type: ignore[no-untyped-def]
+    """Write a variant of the path of a trail as one of `empty_paths`."""
+    surface, kind, vertices, same_wall = paths
+    rise = rise_of(variant, room, target)
+    merge_heights(trail, count, room, target, rise, surface, vertices, row)
+    for d in range(count + rise.bounces):
+        entry = surface[row, d] - WALLS
+        if entry < 0:
+            kind[row, d] = REFLECTION
+            continue
+        kind[row, d], same_wall[row, d] = trail.kind[entry], trail.same_wall[entry]
+        is_edge = trail.kind[entry] == DIFFRACTION
+        surface[row, d] = EDGE if is_edge else WALLS + owner[trail.surface[entry]]
+
+
+def candidates_of(
+    geometry: SceneGeometry,
+    rx: NDArray[np.integer],
+    paths: tuple[NDArray[np.int32], NDArray[np.uint8], Floats, Bools],
+    *,
+    opaque: bool,
+    wedge: NDArray[np.int32] | None = None,
+    wedges: Wedges | None = None,
+) -> Candidates:
+    """Return paths of `write_path` as candidates; paths through walls have as many columns as the longest needs."""
+    surface, kind, vertices_m, same_wall = paths
+    walls = 2 * np.arange(len(geometry.segments))
+    of_surface = np.concatenate([[-1, geometry.floor_face, geometry.ceiling_face, -1], walls]).astype(np.int32)
+    face = of_surface[surface]
+    if wedges is not None and wedge is not None:
+        face = np.where(kind == DIFFRACTION, wedges.face[wedge, :1], face)
+    candidates = Candidates(rx.astype(np.int32), kind, face, vertices_m, wedge, wedges, None if opaque else same_wall)
+    return candidates if opaque else candidates.narrowed()
+
+
+@dataclass(frozen=True)
+class Lowered:
+    """Replaces walls on candidates, which all reach the ceiling, by obstacles where walls are lower.
+
+    `walls_m` (S, 2, 2) are the walls, `corners_m` (T, 3, 2) the triangles of the tops of obstacles, `lid_m`
+    (T,) their heights and `lid_face` (T,) a face of each top in the scene.
+    """
+
+    building: Building
+    walls_m: Floats
+    corners_m: Floats
+    lid_m: Floats
+    lid_face: Indices
+    max_walls: int
+
+    @classmethod
+    def of(cls, geometry: SceneGeometry, building: Building, max_walls: int) -> "Lowered":
+        """Take the obstacles from a scene."""
+        lids, count = geometry.lids, [len(lid.triangles) for lid in geometry.lids]
+        corners_m = np.concatenate([np.zeros((0, 3, 2)), *(lid.corners_m[lid.triangles] for lid in lids)])
+        lid_m = np.repeat(np.array([lid.top_m for lid in lids], float), count)
+        return cls(
+            building,
+            geometry.walls_m,
+            corners_m,
+            lid_m,
+            np.repeat(np.array(geometry.lid_faces, np.intp), count),
+            max_walls,
+        )
+
+    def __call__(self, candidates: Candidates) -> Candidates:
+        """Remove walls below paths, and candidates that go through nothing then; add the tops of obstacles."""
+        room, interior = self.building.room, self.building.interior
+        if (room.top_m >= room.height_m).all() or not len(candidates.rx):
+            return candidates
+        wide = candidates.widened(candidates.kind.shape[1] + _MAX_LIDS)
+        kind, face, vertices_m = wide.kind.copy(), wide.face.copy(), wide.vertices_m.copy()
+        same = np.zeros(kind.shape, dtype=bool)
+        lids = self.corners_m, self.lid_m, self.lid_face
+        ends_m = room.tx_m, room.rx_m[candidates.rx]
+        walls = _lower(kind, face, vertices_m, same, (self.walls_m, room.top_m), lids, ends_m, interior)
+        lowered = replace(wide, kind=kind, face=face, vertices_m=vertices_m, same_wall=same)
+        return lowered.rows(np.flatnonzero((walls > 0) & (walls <= self.max_walls)))
+
+
+@njit(cache=True)
+def _lower(kind, face, vertices, same, walls, lids, ends, interior):  # type: ignore[no-untyped-def]
+    """Write the walls that candidates cross at their heights, in place; return the numbers (C,), -1 if too many."""
+    (tx_m, targets), (walls_m, top_m) = ends, walls
+    crossings, most = np.zeros(len(kind), np.int64), kind.shape[1]
+    old_kind, old_face, old = np.empty(most, np.uint8), np.empty(most, np.int32), np.empty((most, 3))
+    for c in range(len(kind)):
+        old_kind[:], old_face[:], old[:] = kind[c], face[c], vertices[c]
+        kind[c], face[c], vertices[c] = 0, -1, 0.0
+        here, start, begin, count, d = tx_m, tx_m, 0, 0, 0
+        while count >= 0:
+            there = old[d] if old_kind[d] > 0 else targets[c]
+            count = _add_lids(here, there, lids, kind[c], face[c], vertices[c], count)
+            crossed = old_kind[d] == REFRACTION
+            if count < 0 or count >= most - 1:
+                crossings[c] = -1
+                break
+            if not crossed:
+                crossings[c] += _group(face[c], vertices[c], same[c], (begin, count), (start, there), walls_m, interior)
+            if old_kind[d] == 0:
+                break
+            if not crossed or there[2] <= top_m[old_face[d] // 2]:
+                kind[c, count], face[c, count], vertices[c, count] = old_kind[d], old_face[d], there
+                count += 1
+            if not crossed:
+                start, begin = there, count
+            here, d = there.copy(), d + 1
+    return crossings
+
+
+@njit(cache=True)
+def _add_lids(here, there, lids, kind, face, vertices, count):  # type: ignore[no-untyped-def]
+    """Add the tops that a segment crosses to `count` entries, in order; return their number, -1 if there is no room."""
+    corners, heights, faces = lids
+    first = count
+    for i in range(len(heights)):
+        if (here[2] - heights[i]) * (there[2] - heights[i]) >= 0.0:
+            continue
+        t = (heights[i] - here[2]) / (there[2] - here[2])
+        x, y = here[0] + t * (there[0] - here[0]), here[1] + t * (there[1] - here[1])
+        inside = True
+        for k in range(3):
+            a, b = corners[i, k], corners[i, (k + 1) % 3]
+            inside &= (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) >= -1e-9
+        if not inside or (count > first and face[count - 1] == faces[i]):
+            continue
+        if count >= len(kind) - 1:
+            return -1
+        at = count
+        while at > first and abs(vertices[at - 1, 2] - here[2]) > abs(heights[i] - here[2]):
+            kind[at], face[at], vertices[at] = kind[at - 1], face[at - 1], vertices[at - 1]
+            at -= 1
+        kind[at], face[at] = REFRACTION, faces[i]
+        vertices[at, 0], vertices[at, 1], vertices[at, 2] = x, y, heights[i]
+        count += 1
+    return count
+
+
+@njit(cache=True)
+def _group(face, vertices, same, span, ends, walls_m, interior):  # type: ignore[no-untyped-def]
+    """Write which of the faces that a leg crosses are further faces of a wall; return the number of walls."""
+    (begin, end), (here, there) = span, ends
+    dx, dy = there[0] - here[0], there[1] - here[1]
+    length, cosine, found = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin), np.empty(end - begin)
+    for j in range(end - begin):
+        vertex = vertices[begin + j]
+        found[j] = np.hypot(vertex[0] - here[0], vertex[1] - here[1]) / length
+        if face[begin + j] < 2 * len(walls_m):
+            wall = walls_m[face[begin + j] // 2]
+            wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+            cosine[j] = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
+    return group_faces(interior, here, there, found, cosine, same[begin:end])

@@ -1,0 +1,207 @@
+"""Maps of vacuum robots, and the received powers that they recorded."""
+
+import copy
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+import xarray as xr
+from vacuum_files import LEFT, PIXEL_CM, ROOMS, SIZE_CM, TOP, recording, valetudo_map, write_json, write_recording
+
+import sionna_partial as sp
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError, MeasurementError
+
+SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "vacuum"
+SIZES = {
+    "3irobotix_converted_3790": (9.55, 11.25, 7, 20718),
+    "3irobotix_viomi_v7_47_cleaned_segment_ids": (4.35, 10.2, 2, 4333),
+    "dreame_d9_1093_multi_map": (6.2, 11.6, 7, 17604),
+    "roborock_S5_FW2020_with_segments": (22.9, 15.95, 8, 44832),
+}
+"""Extent along x and y [m], number of rooms, and free pixels (the sum of `pixelCount`, or of half of `pixels`)."""
+
+
+@pytest.mark.parametrize("compressed", [True, False])
+def test_map_of_a_robot(tmp_path: Path, compressed: bool) -> None:
+    partial = sp.load_map(write_json(tmp_path / "home.json", valetudo_map(compressed=compressed)))
+    marks = np.array([[*row] for row in ROOMS.split()])[::-1]  # y of the file points down
+    np.testing.assert_array_equal(partial.state, np.where(marks == "#", CellState.WALL, CellState.FREE))
+    assert partial.room is not None
+    assert partial.room_names == ("bedroom", "kitchen")
+    np.testing.assert_array_equal(partial.room, 1 * (marks == "b") + 2 * (marks == "k"))
+    assert partial.resolution_m == PIXEL_CM / 100
+    bottom_cm = SIZE_CM - PIXEL_CM * (TOP + len(marks))
+    assert partial.bounds_m == pytest.approx((PIXEL_CM * LEFT / 100, bottom_cm / 100, 12.0, bottom_cm / 100 + 3.5))
+    text = str(partial.import_report)
+    for line in ("segment 'kitchen': 25", "no_go_area: 1 (no part", "wall: 42", "charger at (5.75, 9.25) m"):
+        assert line in text
+    assert partial.state_at(np.array([5.75, 9.25])) == CellState.FREE
+
+
+@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
+def test_rooms_come_back(tmp_path: Path, name: str) -> None:
+    partial = sp.load_map(write_json(tmp_path / "home.json", valetudo_map()))
+    sp.save_map(partial, tmp_path / name)
+    assert sp.load_map(tmp_path / name) == partial
+
+
+def test_unknown_cells_and_layers(tmp_path: Path) -> None:
+    content = valetudo_map("kkk\n.#k")
+    content["layers"] += [{"type": "wall", "pixels": [LEFT, TOP]}, {"type": "wall"}]
+    partial = sp.load_map(write_json(tmp_path / "home.json", content))
+    free, wall, unknown = CellState
+    assert partial.state.tolist() == [[unknown, wall, free], [wall, free, free]]
+    assert "unknown: 1 (no floor, segment or wall)" in str(partial.import_report)
+
+
+def test_names_of_rooms(tmp_path: Path) -> None:
+    content = valetudo_map("kkbb")
+    content["layers"][0]["metaData"] = {"segmentId": "7"}
+    content["layers"][1]["metaData"]["name"] = "k\x1b[2Jitchen\n2"
+    assert sp.load_map(write_json(tmp_path / "home.json", content)).room_names == ("room 7", "k\\x1b[2Jitchen 2")
+
+
+@pytest.mark.parametrize("name", SIZES)
+def test_maps_of_real_homes(name: str) -> None:
+    if not SHARED.is_dir():
+        pytest.skip("needs the maps of the shared folder")
+    partial = sp.load_map(SHARED / f"{name}.json")
+    x_m, y_m, rooms, free = SIZES[name]
+    report = partial.import_report
+    assert report is not None
+    assert (report.extent_m, len(partial.room_names)) == (pytest.approx((x_m, y_m)), rooms)
+    assert (partial.state == CellState.FREE).sum() == free
+
+
+def spoilt(**changes: Any) -> dict[str, Any]:
+    return valetudo_map() | changes
+
+
+def with_layer(**changes: Any) -> dict[str, Any]:
+    return spoilt(layers=[*valetudo_map()["layers"], {"type": "floor", **changes}])
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ([1], "path = '*' holds no ValetudoMap: give a map in the JSON of Valetudo"),
+        (spoilt(__class="Map"), "path = '*' holds no ValetudoMap"),
+        ({"map": None}, "path = '*' holds no ValetudoMap"),
+        (spoilt(pixelSize=0), "pixelSize = 0 is not allowed: give a length in centimetres."),
+        (spoilt(pixelSize="5"), "pixelSize = '5' is not allowed"),
+        (spoilt(size=None), "size.y = None is not allowed: give a length in centimetres."),
+        (spoilt(size={"y": 1e300}), "size.y = 1e+300 is not allowed"),
+        (spoilt(layers=None), "layers = None is not allowed: give a map in the JSON of Valetudo"),
+        (spoilt(layers=[]), "layers has no pixels of a floor or a segment (none): let the robot map a room first."),
+        (spoilt(layers=[{"type": "wall", "pixels": [1, 1]}]), "layers has no pixels of a floor or a segment (wall)"),
+        (spoilt(layers=[7]), "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo writes."),
+        (spoilt(entities=3), "entities = 3 is not allowed"),
+        (with_layer(pixels=[1, 2, 3]), "layers[4].pixels has shape (3,): give whole numbers from 0 to"),
+        (with_layer(pixels=[-1, 2]), "layers[4].pixels has values from -1 to 2: give whole numbers from 0 to"),
+        (with_layer(pixels=[1.5, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
+        (with_layer(pixels=["a", 2]), "layers[4].pixels = ['a', 2] is not numeric: give whole numbers"),
+        (with_layer(pixels=[10**30, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
+        (with_layer(pixels=[10**9, 2]), "layers[4].pixels has values from 2 to 1000000000: give whole numbers"),
+        (with_layer(pixels=[10**7, 10**7]), "layers span 9999991 x 9999981 pixels, more than 100,000,000"),
+        (with_layer(compressedPixels=[1, 1, 0]), "layers[4].compressedPixels has lengths of 0 to 0: give rows of"),
+        (with_layer(compressedPixels=[1, 1, 10**8] * 9), "compressedPixels has lengths of 100000000 to 100000000"),
+    ],
+)
+def test_what_is_no_map(tmp_path: Path, content: object, message: str) -> None:
+    with pytest.raises(MapError, match=re.escape(message).replace(r"\*", ".*")):
+        sp.load_map(write_json(tmp_path / "home.json", content))
+
+
+@pytest.mark.parametrize("content", [b'{"a": ', b"", b"[" * 100_000, b"\xff\xfe", b"1" * 5000])
+def test_what_is_no_json(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "home.json"
+    path.write_bytes(content)
+    with pytest.raises(MapError, match=r"home.json' is damaged or no JSON \(.*\): export it again\.|holds no Valetudo"):
+        sp.load_map(path)
+
+
+def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    path = write_recording(tmp_path / "home.vwm")
+    partial = sp.load_map(path)
+    assert partial == sp.load_map(write_json(tmp_path / "home.json", valetudo_map()))
+    with caplog.at_level(logging.WARNING):
+        measured = sp.load_measurements(path, tx_power_dbm=20.0)
+    assert "home (00:11:22:33:44:bb): 15, home (00:11:22:33:44:aa): 8, unknown (unknown): 1): the first" in caplog.text
+    assert (len(measured), measured.tx_known.any()) == (15, False)
+    assert measured.rx[0].tolist() == pytest.approx([6.0, 8.75, 0.1])
+    assert measured.gain_db[0] == -51 - 1 - 20  # the mean of two powers
+    assert (partial.state_at(measured.rx) == CellState.FREE).sum() >= 14
+    other = sp.load_measurements(path, access_point="00:11:22:33:44:aa", tx=(6.0, 9.0, 1.0))
+    assert (len(other), other.tx[0].tolist()) == (8, [6.0, 9.0, 1.0])
+    with pytest.raises(MeasurementError, match=r"access_point = 'home' names 2 access points of .*: give the BSSID"):
+        sp.load_measurements(path, access_point="home")
+    with pytest.raises(MeasurementError, match=r"access_point = 'shop' names 0 access points"):
+        sp.load_measurements(path, access_point="shop")
+    with pytest.raises(MeasurementError, match=r"columns = .* is for a CSV and not a recording"):
+        sp.load_measurements(path, columns={"rx_x": "x"})
+    (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
+    with pytest.raises(MeasurementError, match=r"access_point = 'home' is for a recording \(\.vwm\) and not a CSV"):
+        sp.load_measurements(tmp_path / "home.csv", access_point="home")
+
+
+def test_coverage_of_rooms(tmp_path: Path) -> None:
+    """Rooms are a variable of the coverage, and rows of its area."""
+    partial = sp.load_map(write_json(tmp_path / "home.json", valetudo_map()))
+    coverage = sp.predict_map(partial, {"a": (6.0, 8.0, 1.5), "b": (10.0, 8.0, 1.5)}, spacing_m=0.5)
+    assert coverage["room"].attrs["flag_meanings"] == "none bedroom kitchen"
+    np.testing.assert_array_equal(coverage["room"], partial.room)
+    area = coverage.radio.area(-65.0)
+    assert area.floor.values.tolist() == ["observed", "all", "bedroom", "kitchen"]
+    assert area.area_m2.sel(floor="kitchen", tx="b").item() == pytest.approx(25 * 0.25)
+    kitchen, bedroom = (area.fraction.sel(floor=name).values.tolist() for name in ("kitchen", "bedroom"))
+    assert kitchen[0] > kitchen[1]
+    assert bedroom[0] < bedroom[1]
+    sp.save_coverage(coverage, tmp_path / "coverage.nc")
+    xr.testing.assert_identical(sp.load_coverage(tmp_path / "coverage.nc"), coverage)
+    states = coverage["link_state"].isel(tx=0)
+    assert states.isnull().any()
+    assert states.plot().get_clim()[1] <= sp.LinkState.NLOS
+    plt.close("all")
+
+
+def test_position_of_an_access_point(tmp_path: Path) -> None:
+    """The powers of a recording and its map are in one frame, so that a transmitter is found where it is."""
+    content = recording()
+    partial = sp.load_map(write_json(tmp_path / "home.json", content["map"]))
+    rng, tx = np.random.default_rng(0), (10.6, 8.6, 1.5)
+    x_cm, y_cm = rng.uniform(560, 1140, 20), rng.uniform(1060, 1290, 20)
+    rx = np.column_stack([x_cm / 100, SIZE_CM / 100 - y_cm / 100, np.full(20, 0.1)])
+    good = partial.radios_can_stand(rx)
+    gain_db = sp.trace_links(partial, tx, rx[good]).gain_db
+    content["measurements"] = [
+        {"x": x, "y": y, "wifi": 0, "data": [gain + 18.0]}
+        for x, y, gain in zip(x_cm[good], y_cm[good], gain_db, strict=True)
+    ]
+    path = write_json(tmp_path / "home.vwm", content)
+    coverage = sp.predict_map(partial, None, measurements=path, spacing_m=1.0)
+    np.testing.assert_allclose(coverage.attrs["transmitter_m"][:2], tx[:2], atol=1.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"measurements": []}, "has no measurements: let the robot drive while Valeronoi records."),
+        ({"measurements": None}, "is damaged or no recording of Valeronoi ("),
+        ({"measurements": [{"x": 1, "y": 2, "wifi": 9, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
+        ({"measurements": [{"x": 1, "y": 2, "wifi": -2, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
+        ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx[0, 0] = nan is not allowed"),
+        ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": ["-5"]}]}, "gain_db[0] = nan is not allowed"),
+        ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": [40]}]}, "gain_db[0] = 40 is not allowed"),
+        ({"wifis": {}}, "is damaged or no recording of Valeronoi ("),
+        ({"map": {}}, "holds no ValetudoMap"),
+    ],
+)
+def test_what_is_no_recording(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    content = copy.deepcopy(recording()) | changes
+    with pytest.raises(MeasurementError, match=re.escape(message)):
+        sp.load_measurements(write_json(tmp_path / "home.vwm", content))
