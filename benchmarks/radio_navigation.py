@@ -31,7 +31,8 @@ from scipy.special import ndtr
 import sionna_partial as sp
 from sionna_partial.settings import SensorSettings
 from sionna_partial.tracing.simulation import clear_of_walls
-from sionna_partial.worlds.robot import Camera, _Router
+from sionna_partial.worlds.camera import Camera
+from sionna_partial.worlds.robot import _Router
 
 THRESHOLD_DB, FLOOR_DB, NOISE_DB = -100.0, -130.0, 2.0
 SPEED_M_S, RADIUS_M, PLAN_M, LEAST_M = 0.5, 0.15, 1.0, 4.0

@@ -61,6 +61,9 @@ NetworkKind = Literal["paper", "paths", "map"]
 Objective = Literal["coverage", "percentile"]
 """Objective of a placement: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
 
+Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
+"""Mappers whose rule makes a robot's map of noisy readings."""
+
 Policy = Literal["random", "coverage"]
 """Policy by which an exploring robot chooses frontiers."""
 
@@ -177,7 +180,7 @@ WALL_MATERIALS = {
 below; coated glass is glass with the conductivity of its metal film."""
 
 DRYWALL = WALL_MATERIALS["drywall"]
-"""The default material."""
+"""Material of a trace where none is known."""
 
 
 @dataclass(frozen=True)
@@ -186,9 +189,11 @@ class SceneSettings(Checked):
 
     Parameters
     ----------
-    material : Material or str
+    material : Material, str or None
         Material of walls, floor and ceiling, or of those parts of a mesh that name none; or its name, as of
-        `Material.named`.
+        `Material.named`. With None it is the material of the map, if the map has one. Otherwise it is unknown where
+        paths go through walls, and predictions average over the candidates of `WallMaterials`; the trace itself has
+        drywall, as it has where walls are opaque.
     bridge_gap_m : float
         Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
         closed, and 0.11 m.
@@ -212,11 +217,16 @@ class SceneSettings(Checked):
     'observed'
     """
 
-    material: Material = DRYWALL
+    material: Material | None = None
     bridge_gap_m: Annotated[float, Within(0.0, 1.0)] = 0.5
     floor_extent: Literal["observed", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
+
+    @property
+    def traced_material(self) -> Material:
+        """`material`, or drywall in place of None."""
+        return DRYWALL if self.material is None else self.material
 
 
 @dataclass(frozen=True)
@@ -308,19 +318,27 @@ class SensorSettings(Checked):
     Parameters
     ----------
     range_noise_m : float
-        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It blurs walls:
-        the map weighs the readings of each cell, as an occupancy grid does.
+        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It makes walls
+        ragged: see `fusion`.
     drift_m_per_m : float
         Odometry drift per metre travelled [1], at most 1, in a direction that is drawn once. What is seen later is
         mapped off its true position, and walls that are seen again may appear twice.
     missed_wall_fraction : float
         Fraction of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces
-        do. Their cells stay unknown, and the floor up to them is seen; nothing is seen through them.
+        do. Rays to them are dropped: their cells stay unknown, and nothing is seen through them.
     field_of_view_deg : float
         Horizontal angle [degree], in (0, 360], centred on the heading of the robot. The default is the camera of Active
         Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
         Largest range [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
+    heading_noise_deg : float
+        Standard deviation of the heading that the map assumes for a picture [degree], independent from picture to
+        picture, at most 180.
+    missed_return_fraction : float
+        Fraction of rays that return no reading [1], at random. With any error, those that graze a wall return none.
+    fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
+        Mapper whose rule and default parameters decide from the readings which cells are walls (`FUSIONS`); "vacuum"
+        thins walls, too. Without errors all agree, and the map is true.
 
     Raises
     ------
@@ -339,11 +357,15 @@ class SensorSettings(Checked):
     missed_wall_fraction: Fraction = 0.0
     field_of_view_deg: Annotated[float, Within(0.0, 360.0, open_low=True)] = 90.0
     range_m: Annotated[float, Within(0.0, 100.0, open_low=True)] = 3.2
+    heading_noise_deg: Annotated[float, Within(0.0, 180.0)] = 0.0
+    missed_return_fraction: Fraction = 0.0
+    fusion: Fusion = "slam_toolbox"
 
     @property
     def is_exact(self) -> bool:
         """Return whether it makes no errors."""
-        return self.range_noise_m == self.drift_m_per_m == self.missed_wall_fraction == 0.0
+        errors = (self.range_noise_m, self.drift_m_per_m, self.heading_noise_deg)
+        return not any((*errors, self.missed_wall_fraction, self.missed_return_fraction))
 
 
 SHORT_LINK_M = 25.0
@@ -355,11 +377,13 @@ MIXED_SENSORS = {
     "range_noise_m": (0.0, 0.05),
     "drift_m_per_m": (0.0, 0.02),
     "missed_wall_fraction": (0.0, 0.1),
+    "heading_noise_deg": (0.0, 0.5),
+    "missed_return_fraction": (0.0, 0.1),
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
-The range is drawn uniformly on a logarithmic scale, the field of view of cameras uniformly, and errors more often small
-than large (the square of a uniform number).
+The range is drawn uniformly on a logarithmic scale, the field of view of cameras and the mapper uniformly, and errors
+more often small than large (the square of a uniform number).
 """
 
 
@@ -391,7 +415,7 @@ class DatasetSettings(Checked):
         Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
         buildings most links between uniformly drawn positions are long, and in outage.
     scene : SceneSettings
-        Conversion of maps to scenes.
+        Conversion of maps to scenes; without a material the walls are of drywall.
     trace : TraceSettings
         Settings of the traces on the complete and on the partial maps.
 
@@ -431,7 +455,7 @@ class DatasetSettings(Checked):
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
         remedy = "give SensorSettings(...), or 'mixed'."
         require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
-        self.scene.material.require_frequency(self.trace.frequency_hz)
+        self.scene.traced_material.require_frequency(self.trace.frequency_hz)
 
 
 @dataclass(frozen=True)

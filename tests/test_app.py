@@ -28,12 +28,12 @@ from websockets.typing import Origin
 
 import sionna_partial as sp
 from sionna_partial.app import session as app_session
+from sionna_partial.app.files import FILES, stored_map
 from sionna_partial.app.jobs import Status
 from sionna_partial.app.page import Page
 from sionna_partial.app.picture import Picture
 from sionna_partial.app.radio import PRESETS, RadioSettings, Transmitter
-from sionna_partial.app.session import FILES, Session
-from sionna_partial.app.uploads import stored_map
+from sionna_partial.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 

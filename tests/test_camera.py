@@ -10,7 +10,7 @@ from scipy import ndimage
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SensorSettings
-from sionna_partial.worlds.robot import Camera, view_corners_m
+from sionna_partial.worlds.camera import FUSIONS, Camera, _fuse, view_corners_m
 
 NOWHERE = np.empty((0, 2), dtype=np.intp)
 EXACT, LIDAR = SensorSettings(), SensorSettings(field_of_view_deg=360.0)
@@ -111,12 +111,10 @@ def test_many_noisy_looks_find_the_wall():
     assert (many.seen[3, 6:14] == CellState.FREE).all()
 
 
-def test_a_missed_wall_hides_what_is_behind_it():
+def test_rays_to_a_missed_wall_are_dropped():
     eye = camera(corridor(), SensorSettings(missed_wall_fraction=1.0))
     eye.look(3.5, 3.5, 0.0, (0.0, 0.0), NOWHERE)
-    assert (eye.seen != CellState.WALL).all()
-    assert (eye.seen[3, 4:21] == CellState.FREE).all()
-    assert (eye.seen[:, 21:] == CellState.UNKNOWN).all()
+    assert (eye.seen == CellState.UNKNOWN).all()
 
 
 def test_where_the_robot_stands_is_free_whatever_was_seen():
@@ -126,6 +124,90 @@ def test_where_the_robot_stands_is_free_whatever_was_seen():
     assert eye.seen[3, 21] == CellState.WALL
     eye.look(3.5, 3.5, 180.0, (0.0, 0.0), under)
     assert eye.seen[3, 21] == CellState.FREE
+
+
+def fused(fusion, hits, passes):
+    """State of a cell in which so many rays of each picture ended, and that so many crossed."""
+    all_hits, all_passes = np.zeros((2, 1, 1), dtype=np.int32)
+    seen = np.full((1, 1), CellState.UNKNOWN, dtype=np.uint8)
+    for hit, passed in zip(hits, passes, strict=True):
+        counts = (np.full((1, 1), number, dtype=np.int32) for number in (hit, passed))
+        _fuse(all_hits, all_passes, *counts, FUSIONS[fusion], seen)
+    return seen[0, 0]
+
+
+FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
+
+
+@pytest.mark.parametrize(
+    ("fusion", "hits", "passes", "state"),
+    [
+        ("exact", [1], [0], WALL),
+        ("exact", [0], [1], FREE),
+        ("slam_toolbox", [1], [0], UNKNOWN),  # two passes, of the ray and of its hit
+        ("slam_toolbox", [0], [2], UNKNOWN),
+        ("slam_toolbox", [0], [3], FREE),
+        ("slam_toolbox", [1, 0], [0, 1], WALL),  # 1 / 3
+        ("slam_toolbox", [1, 0], [0, 7], WALL),  # 1 / 9
+        ("slam_toolbox", [1, 0], [0, 8], FREE),  # 1 / 10
+        ("slam_toolbox", [0, 1], [8, 0], FREE),
+        ("gmapping", [1], [0], WALL),
+        ("gmapping", [1], [2], WALL),  # 1 / 3
+        ("gmapping", [1], [3], FREE),  # 1 / 4
+        ("vacuum", [2, 0], [0, 6], FREE),
+        ("cartographer", [5], [100], WALL),  # one hit
+        ("cartographer", [1, 0, 0, 0, 0, 0], [0, 9, 9, 9, 9, 9], WALL),  # 0.2007 - 5 * 0.0400
+        ("cartographer", [1, 0, 0, 0, 0, 0, 0], [0, 1, 1, 1, 1, 1, 1], FREE),
+        ("cartographer", [0, 0], [1, 1], FREE),
+    ],
+)
+def test_rules_of_mappers(fusion, hits, passes, state):
+    assert fused(fusion, hits, passes) == state
+
+
+@pytest.mark.parametrize(("fusion", "cells"), [("slam_toolbox", 24), ("gmapping", 24), ("cartographer", 15)])
+def test_open_space_is_cleared_as_far_as_the_mapper_does(fusion, cells):
+    sensor = SensorSettings(0.001, field_of_view_deg=90.0, range_m=8.0, fusion=fusion)
+    eye = camera(np.zeros((121, 121), dtype=np.uint8), sensor, resolution_m=1 / 3)
+    for _ in range(3):
+        eye.look(60.5, 60.5, 0.0, (0.0, 0.0), NOWHERE)
+    assert np.flatnonzero(eye.seen[60] == FREE).tolist() == list(range(60, 61 + cells))
+
+
+def test_grazed_walls_and_lost_rays_return_nothing():
+    truth = surrounded(np.zeros((40, 60), dtype=np.uint8))
+    truth[30] = WALL  # 4 degrees from the first ray
+    for sensor, seen in (
+        (SensorSettings(0.001, field_of_view_deg=1.0, range_m=8.0), False),
+        (SensorSettings(field_of_view_deg=1.0, range_m=8.0), True),
+    ):
+        eye = camera(truth, sensor)
+        for _ in range(3):
+            eye.look(5.5, 28.5, 4.0, (0.0, 0.0), NOWHERE)
+        assert (eye.seen == WALL).any() == seen
+    eye = camera(truth, SensorSettings(missed_return_fraction=1.0))
+    eye.look(5.5, 28.5, 90.0, (0.0, 0.0), NOWHERE)
+    assert (eye.seen == UNKNOWN).all()
+
+
+def test_errors_of_the_heading_turn_the_map():
+    """A wall across the view, 20 cells ahead, is mapped some cells beside its row."""
+    truth = surrounded(np.zeros((60, 60), dtype=np.uint8))
+    truth[29:32, 45] = WALL
+    eye = camera(truth, SensorSettings(heading_noise_deg=20.0, field_of_view_deg=60.0, fusion="gmapping"), seed=2)
+    eye.look(25.5, 30.5, 0.0, (0.0, 0.0), NOWHERE)
+    rows, columns = np.nonzero(eye.seen == WALL)
+    assert np.hypot(rows - 30, columns - 25) == pytest.approx(20.0, abs=1.5)
+    assert np.abs(rows - 30).min() > 1
+
+
+def test_vacuum_robots_thin_walls():
+    """Three layers of wall beside free cells: the first stays, what is behind is unknown."""
+    eye = camera(surrounded(np.zeros((12, 30), dtype=np.uint8)), SensorSettings(0.01, fusion="vacuum"), 0.05)
+    eye.seen[:6], eye.seen[6:9] = FREE, WALL
+    assert eye.map[:6].tolist() == eye.seen[:6].tolist()
+    assert (eye.map[6, 1:-1] == WALL).all()
+    assert (eye.map[7:, 1:-1] == UNKNOWN).all()
 
 
 class TestViewCorners:

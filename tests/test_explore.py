@@ -2,6 +2,7 @@ import functools
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,7 +18,8 @@ from sionna_partial.exploration.explore import Exploration, explore, explore_tra
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import SensorSettings
+from sionna_partial.prediction.features import LEAST_NOISE
+from sionna_partial.settings import Fusion, SensorSettings
 from sionna_partial.worlds.homes import make_home
 from sionna_partial.worlds.robot import FORWARD_M, TURN_DEG
 
@@ -269,6 +271,21 @@ class TestSensor:
         assert 0.1 < (off_m > 0).mean() < 0.9
         assert off_m.max() < 0.3
         assert np.quantile(off_m, 0.9) < 0.16
+
+    def test_wall_noise_grows_with_range_noise(self, home):
+        noises_m = (0.0, 0.01, 0.02, 0.03, 0.05)
+        for drift in (0.0, 0.002):
+            lidars = (SensorSettings(noise_m, drift, field_of_view_deg=360.0, range_m=12.0) for noise_m in noises_m)
+            found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
+            assert found == sorted(found), drift
+            assert found[0] <= LEAST_NOISE + 100 * drift
+            assert found[2] > 0.5
+            assert found[-1] > found[2] + 0.02
+        assert home.wall_noise == 0.0
+
+    @pytest.mark.parametrize("fusion", get_args(Fusion))
+    def test_without_errors_all_mappers_make_the_true_map(self, home, fusion):
+        assert explore(home, (20,), 3, sensor=SensorSettings(fusion=fusion)) == explore(home, (20,), 3)
 
     def test_drift_grows_with_the_distance_travelled(self, home):
         exploration = explore_trajectory(home, (60,), 3, sensor=SensorSettings(drift_m_per_m=0.02))

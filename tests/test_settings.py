@@ -53,6 +53,8 @@ RANGES = {
     (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
     (SensorSettings, "missed_wall_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "missed_return_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
+    (SensorSettings, "heading_noise_deg"): ("[0, 180]", (0, 180.0), (-0.1, 180.1)),
     (SensorSettings, "field_of_view_deg"): ("(0, 360]", (1e-9, 90, 360.0), (0, -0.1, 360.1)),
     (SensorSettings, "range_m"): ("(0, 100]", (1e-9, 3.2, 100), (0, -0.1, 100.1)),
     (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28e9, 1e12), (0, -28e9, 1.1e12)),
@@ -258,7 +260,7 @@ class TestPredictorSettings:
 
 def test_materials_by_name() -> None:
     assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete", thickness_m=0.2))  # type: ignore[arg-type]
-    assert Material.named("drywall") == SceneSettings().material == Material() == Material(thickness_m=0.1)
+    assert Material.named("drywall") == SceneSettings().traced_material == Material() == Material(thickness_m=0.1)
     assert replace(Material(), conductivity_s_m=0.2).conductivity_exponent == Material().conductivity_exponent > 0.0
     assert Material(4.0, 0.05).conductivity_exponent == Material(itu="brick").conductivity_exponent == 0.0
     assert repr(Material.named("brick")) == "Material(itu='brick', thickness_m=0.11)"

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.app.answer import Answer
+from sionna_partial.app.files import FILES
 from sionna_partial.app.picture import LAYERS, Picture
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
-from sionna_partial.app.session import FILES, MORE_STEPS, ROUNDING_M, Session
+from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
+from sionna_partial.app.files import MOST_BYTES
 from sionna_partial.app.radio import MOST_TRANSMITTERS, RadioSettings, Transmitter, require_name
-from sionna_partial.app.uploads import MOST_BYTES
 from sionna_partial.checks import require
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, unzipped, zipped

@@ -5,8 +5,9 @@ import logging
 import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
@@ -20,7 +21,15 @@ from sionna_partial.files import SCENE_FILES
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import HOME_KINDS, MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, HomeKind, SensorSettings
+from sionna_partial.settings import (
+    HOME_KINDS,
+    MIXED_SENSORS,
+    SHORT_LINK_M,
+    DatasetSettings,
+    Fusion,
+    HomeKind,
+    SensorSettings,
+)
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home
@@ -202,7 +211,8 @@ def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
     values["range_m"] = float(np.exp(rng.uniform(*np.log(MIXED_SENSORS["range_m"]))))
     if rng.random() < _LIDAR_FRACTION:
         values["field_of_view_deg"] = 360.0
-    return SensorSettings(**values)
+    fusions = get_args(Fusion)
+    return SensorSettings(**values, fusion=fusions[rng.integers(len(fusions))])
 
 
 def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
@@ -283,7 +293,8 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
 def _traced(
     partial: PartialMap, tx_m: list[Floats], rx_m: list[Floats], settings: DatasetSettings
 ) -> list[TracedLinks]:
-    simulation = Simulation(partial, settings.trace, settings.scene)
+    scene_settings = replace(settings.scene, material=settings.scene.traced_material)
+    simulation = Simulation(partial, settings.trace, scene_settings)
     return [simulation.links(*ends, polarisations=1, progress=False) for ends in zip(tx_m, rx_m, strict=True)]
 
 

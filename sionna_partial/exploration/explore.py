@@ -243,7 +243,7 @@ def explore_trajectory(
                 reached.append(step)
                 state = np.full_like(padded, _UNKNOWN)
                 if step:
-                    state[row0:row1, column0:column1] = robot.seen
+                    state[row0:row1, column0:column1] = robot.map
                 states.append(state[margin:-margin, margin:-margin])
             is_last = len(reached) == len(steps)
             if step % _REPORT_STEPS == 0 or is_last:

@@ -40,6 +40,7 @@ from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls
+from sionna_partial.worlds.camera import unknown_in_view
 from sionna_partial.worlds.robot import (
     FORWARD_M,
     ROBOT_RADII_M,
@@ -47,7 +48,6 @@ from sionna_partial.worlds.robot import (
     Frontier,
     Robot,
     find_frontiers,
-    unknown_in_view,
     wide_frontiers,
 )
 

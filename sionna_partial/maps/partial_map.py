@@ -327,7 +327,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_noise(self) -> float:
-        """Degree to which range noise thickened and roughened the walls, 0 (exact) to 1."""
+        """Range noise of the walls, from their thickness where they are rough: 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
 
     @cached_property

@@ -41,7 +41,7 @@ from sionna_partial.plots.style import (
     sheet_columns,
     window_m,
 )
-from sionna_partial.worlds.robot import view_corners_m
+from sionna_partial.worlds.camera import view_corners_m
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
 """Time of a frame of an animation, and of its last one [ms]."""
