@@ -335,6 +335,15 @@ def unzipped(content: bytes, most: int) -> dict[str, bytes]:
     return found
 
 
+def zipped(contents: Mapping[str, bytes]) -> bytes:
+    """Return files by name as a zip archive; equal files give equal bytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for name, content in contents.items():
+            archive.writestr(zipfile.ZipInfo(name), content)
+    return stream.getvalue()
+
+
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Give a library a path to write to, and move the file to `path` when all went well.

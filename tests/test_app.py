@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from bokeh.document import Document
 from browser import CHROMIUM, Tab, chromium
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
@@ -28,8 +29,13 @@ from websockets.typing import Origin
 import sionna_partial as sp
 from sionna_partial.app import session as app_session
 from sionna_partial.app.files import FILES, stored_map
-from sionna_partial.app.session import Session, Transmitter
+from sionna_partial.app.jobs import Status
+from sionna_partial.app.page import Page
+from sionna_partial.app.picture import Picture
+from sionna_partial.app.radio import PRESETS, RadioSettings, Transmitter
+from sionna_partial.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
+from sionna_partial.files import unzipped, zipped
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -246,6 +252,65 @@ def test_the_warning_of_the_predictor_stays_with_the_settings(window: Window) ->
     assert window.session.warnings == []
 
 
+class TestPresets:
+    def test_it_fills_the_fields_of_all_transmitters_present_and_new(self, window: Window) -> None:
+        session = window.session
+        session.put([("", 1.0, 1.0)])
+        assert session.preset == ""
+        session.use_preset("Wi-Fi 5 GHz")
+        session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+        assert window.settle() == "Ready."
+        assert [each.eirp_dbm for each in session.transmitters.values()] == [23.0, 23.0]
+        assert (session.settings.frequency_hz, session.settings.threshold_dbm) == (5.21e9, -67.0)
+        assert session.preset == "Wi-Fi 5 GHz"
+        assert session.answer is not None
+        assert session.answer.thresholds("tx1", -67.0) == {
+            "power_mean_dbm": -67.0,
+            "gain_mean_db": -90.0,
+            "snr_mean_db": 21.0,
+        }
+        session.change("tx2", eirp_dbm=10.0)
+        assert session.preset == ""
+
+    def test_scales_follow_the_threshold_and_servers_have_names(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.change("tx2", new_name="hall")
+        window.settle()
+        picture = Picture()
+        picture.show_answer(window.session.answer, "", -67.0, truth=False)
+        power, server = (picture.parts[name][1] for name in ("power_mean_dbm", "best_server"))
+        assert power.ticker.ticks == [-97.0, -87.0, -77.0, -67.0, -57.0, -47.0, -37.0, -27.0]
+        assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
+        assert server.major_label_overrides == {0: "tx1", 1: "hall"}
+        assert (len(server.color_mapper.palette), server.color_mapper.high) == (2, 1.5)
+
+    @pytest.mark.parametrize("name", PRESETS)
+    def test_each_is_a_setting_and_names_itself(self, name: str) -> None:
+        assert RadioSettings(**PRESETS[name]._asdict()).preset == name
+
+    def test_the_page_shows_the_material_that_was_found(self, window: Window) -> None:
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        answer = window.session.answer
+        assert answer is not None
+        page = Page(Document(), "/files/key")
+        page.session.open_map(PARTIAL, "room.yaml")
+        page.session.set(material="brick", threshold_dbm=-67.0)
+        page.session.answer = replace(answer, coverage=answer.coverage.assign_attrs(wall_material="brick .69"))
+        page.session.status = Status("Ready.")
+        page.show()
+        assert "Ready. Walls: brick .69." in page.message.text
+        assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
+        assert page.links.text.count("<a ") == len(FILES)
+        page.session.close()
+
+    def test_materials(self) -> None:
+        assert RadioSettings().scene_settings == sp.SceneSettings()
+        assert RadioSettings(material="brick").scene_settings.material == sp.Material.named("brick")
+        with pytest.raises(SettingsError, match="material = 'cheese'"):
+            RadioSettings(material="cheese")
+
+
 class TestRobot:
     def test_prediction_meets_the_truth(self, window: Window) -> None:
         window.session.open_example("apartment")
@@ -282,6 +347,7 @@ class TestFiles:
             "tif": b"II*",
             "yaml": b"PK",
             "pdf": b"%PDF",
+            "project": b"PK",
         }
         for kind in FILES:
             content = window.session.file(kind)
@@ -295,7 +361,7 @@ class TestFiles:
         sp.save_map(PARTIAL, "room.yaml")
         window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
         window.session.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        window.session.set(frequency_hz=5.2e9, through_walls=False)
+        window.session.set(frequency_hz=5.2e9, through_walls=False, material="brick")
         window.settle()
         names: dict[str, Any] = {}
         exec(window.session.python(), names)
@@ -453,6 +519,54 @@ class TestUploads:
         assert window.session.partial is PARTIAL
 
 
+class TestProjects:
+    def saved(self, window: Window) -> bytes:
+        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        window.session.change("tx2", new_name="hall", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+        window.session.use_preset("60 GHz (WiGig)")
+        window.session.measured = sp.Measurements((1.0, 1.0, 1.5), [(1.5, 2.5, 1.5)], [-60.0], sensitivity_db=-120.0)
+        return window.session.file("project")
+
+    def test_saved_and_opened(self, window: Window) -> None:
+        before, content = window.session, self.saved(window)
+        other = Window()
+        other.session.upload_map([("mine.zip", content)])
+        assert other.settle() == "Ready."
+        after = other.session
+        assert (after.partial, after.title) == (before.partial, before.title)
+        assert (after.transmitters, after.settings) == (before.transmitters, before.settings)
+        assert after.measured is not None
+        assert (after.measured.rx.tolist(), after.measured.sensitivity_db) == ([[1.5, 2.5, 1.5]], -120.0)
+        assert after.file("project") == content
+        other.session.close()
+
+    @pytest.mark.parametrize(
+        ("old", "new", "message"),
+        [
+            (b'"version": 1', b'"version": 2', "version = 2"),
+            (b'"hall"', b'"<b>"', "name = '<b>'"),
+            (b"60480000000.0", b"1e99", "frequency_hz"),
+            (b'"tr38901"', b'"/etc/passwd"', "pattern"),
+            (b'"material": ""', b'"material": "cheese"', "material"),
+            (b'"x_m": 3.0', b'"x_m": NaN', "x_m"),
+            (b'"x_m": 3.0', b'"y": 3.0', "damaged"),
+            (b'"gain_db"', b'"gain"', "damaged"),
+            (b'"title"', b'"titles"', "damaged"),
+            (b'"title"', b"[" * 100_000, "damaged"),
+        ],
+    )
+    def test_what_is_refused_changes_nothing(self, window: Window, old: bytes, new: bytes, message: str) -> None:
+        contents = unzipped(self.saved(window), 10**7)
+        assert old in contents["project.json"]
+        contents["project.json"] = contents["project.json"].replace(old, new, 1)
+        window.settle()
+        before = window.session.transmitters
+        window.session.upload_map([("mine.zip", zipped(contents))])
+        assert message in window.settle()
+        assert window.session.status.is_error
+        assert window.session.transmitters is before
+
+
 @pytest.fixture(scope="module")
 def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """Address of an app with a room, in a process of its own."""
@@ -568,10 +682,37 @@ def press(tab: Tab, label: str) -> None:
     tab.run(f"{there}; {button}.click() }})()")
 
 
+def box(tab: Tab, selector: str) -> list[float]:
+    """Return left, top, right and bottom of an element in the window."""
+    edges = "['left', 'top', 'right', 'bottom'].map(edge => box[edge])"
+    found = tab.run(
+        f"(() => {{ const box = document.querySelector({selector!r}).getBoundingClientRect(); return {edges} }})()"
+    )
+    assert isinstance(found, list)
+    return found
+
+
+def check_layout(tab: Tab) -> None:
+    """The plot with its colour bar, the controls and the downloads fit the window, and stay where they are."""
+    before = box(tab, "#plot")
+    tab.run(
+        f"{_MODEL}('message').text = 'A long text. '.repeat(99), {_MODEL}('warnings').text = 'A note.<br>'.repeat(9), 0"
+    )
+    tab.run("new Promise(done => setTimeout(done, 300))")
+    assert box(tab, "#plot") == before
+    for selector in ("#status", "#plot", "#summary", "#files", "#controls"):
+        left, top, right, bottom = box(tab, selector)
+        assert 0.0 <= left < right <= 1400.0
+        assert 0.0 <= top < bottom <= 950.0
+    drawn = tab.run(f"(({{width, height}}) => [width, height])(Bokeh.index.get({_MODEL}('picture')).bbox)")
+    assert drawn == pytest.approx([before[2] - before[0], before[3] - before[1]], abs=2.0)
+    assert tab.run("[document.documentElement.scrollWidth, document.documentElement.scrollHeight]") == [1400, 950]
+
+
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
 def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
     with chromium(tmp_path) as open_tab:
-        tab = open_tab(url)
+        tab = open_tab(url, 1400, 950)
         tab.wait(f"{_MODEL}('message').text.includes('Click on the map')")
         tab.wait(f"Bokeh.index.get({_MODEL}('picture')).frame.bbox.width > 100")
         tab.click(*pixel(tab, 1.0, 1.0))
@@ -594,6 +735,7 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         assert tab.run(f"{_MODEL}('picture').x_range.end") < 6.0  # the axes stay with the map
         tab.wait(f"{_MODEL}('python').value != {json.dumps(before)} && {_READY}")
         assert tab.run(f"{_MODEL}('points').data.name.length") == 1
+        check_layout(tab)
         links = re.findall('href="([^"]+)"', tab.run(f"{_MODEL}('links').text"))
         assert {link.rpartition("/")[2] for link in links} == {*FILES}
         picture, end = url.rpartition("/")[0] + links[0], time.monotonic() + 60.0

@@ -1,9 +1,7 @@
 """Files of a window: uploaded maps, whose names are not trusted, and downloads of an answer."""
 
-import io
 import re
 import tempfile
-import zipfile
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
@@ -22,7 +20,7 @@ from sionna_partial.constants import (
 )
 from sionna_partial.errors import MapError
 from sionna_partial.export import save_coverage, save_network
-from sionna_partial.files import unzipped
+from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
@@ -50,6 +48,7 @@ FILES = {
     "tif": "coverage.tif",
     "yaml": "radio_map.zip",
     "pdf": "report.pdf",
+    "project": "project.zip",
 }
 """Kinds of files that can be downloaded, and their names."""
 
@@ -114,13 +113,5 @@ def coverage_file(
             save_network(network, path)
         else:
             save_coverage(coverage.isel(tx=0) if kind == "yaml" else coverage, path)
-        return path.read_bytes() if kind != "yaml" else _zipped(sorted(Path(folder).iterdir()))
-
-
-def _zipped(paths: Sequence[Path]) -> bytes:
-    """Return files as a zip; equal files give equal bytes."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in paths:
-            archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes())
-    return stream.getvalue()
+        made = {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}
+        return made[path.name] if kind != "yaml" else zipped(made)

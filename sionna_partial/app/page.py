@@ -9,41 +9,31 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
 
+from sionna_partial.app.answer import Answer
 from sionna_partial.app.files import FILES
-from sionna_partial.app.session import MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
-from sionna_partial.constants import CellState
+from sionna_partial.app.picture import LAYERS, Picture
+from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
+from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import extent_m, outside
-from sionna_partial.plots.coverage_viewer import STATES, add_layer, radio_layers, server_codes
+from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
 
-_LAYERS = radio_layers(MOST_TRANSMITTERS)
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
 _AIM = 0.06
-_WALLS = {"": "opaque from 24 GHz on", "opaque": "opaque", "through": "paths go through"}
+_WALLS = {"": "below 24 GHz", "opaque": "never", "through": "always"}
 _COMPUTED_FOR = {"": "the partial map", "1": "the whole home (truth)"}
-_MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
 _PROBABILITY = 0.9
 _STRONGEST = "the strongest"
-_FILE_NAMES = {"png": "PNG", "html": "HTML", "nc": "NetCDF", "tif": "GeoTIFF", "yaml": "ROS map", "pdf": "Report (PDF)"}
-
-_TOOLTIPS = (
-    ("x, y", "$x{0.00} m, $y{0.00} m"),
-    ("likeliest state", "@link_state{custom}"),
-    ("LOS, NLOS, outage", "@p_los{0.00}, @p_nlos{0.00}, @p_outage{0.00}"),
-    ("path gain", "@gain_mean_db{0.0} ± @gain_std_db{0.0} dB"),
-    ("received power", "@power_mean_dbm{0.0} dBm"),
-    ("SNR", "@snr_mean_db{0.0} dB"),
-    ("P(above threshold)", "@p_above{0.00}"),
-)
-_HOVERED = ("p_los", "p_nlos", "p_outage")
-
-_UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
+_FILE_NAMES = {
+    "png": "PNG",
+    "html": "HTML",
+    "nc": "NetCDF",
+    "tif": "GeoTIFF",
+    "yaml": "ROS map",
+    "pdf": "Report (PDF)",
+    "project": "Project",
+}
 
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
@@ -74,7 +64,9 @@ class Page:
         self.session = Session(document.add_next_tick_callback, self.show)
         self._is_showing = False
         self._drawn: dict[str, Any] = {}
-        self._make_picture()
+        self.picture = Picture()
+        self.picture.points.on_change("data", self._on_points)
+        self.picture.points.selected.on_change("indices", self._on_selected)
         self._make_choices()
         self._make_controls()
         for name, model in self._roots().items():
@@ -83,64 +75,6 @@ class Page:
         document.js_on_event("connection_lost", CustomJS(args={"message": self.message}, code=_LOST))
 
     # Widgets
-
-    def _make_picture(self) -> None:
-        from bokeh.models import ColumnDataSource, CustomJS, DataRange1d, HoverTool, LinearColorMapper, PointDrawTool
-        from bokeh.plotting import figure
-
-        self._ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
-        self._values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *_LAYERS, *_HOVERED)})
-        self._points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
-        self._aims = ColumnDataSource({"xs": [], "ys": []})
-        self._routes = ColumnDataSource({"xs": [], "ys": []})
-        self._measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
-        self._poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
-        plot: Any = figure(
-            x_range=DataRange1d(range_padding=0.02),
-            y_range=DataRange1d(range_padding=0.02),
-            match_aspect=True,
-            sizing_mode="scale_width",
-            aspect_ratio=1.2,
-            x_axis_label="x [m]",
-            y_axis_label="y [m]",
-            tools="pan,wheel_zoom,box_zoom,reset",
-            active_drag=None,
-            active_scroll=None,
-            background_fill_color="#d9dce0",
-        )
-        self.plot = plot
-        plot.toolbar.logo, plot.grid.visible = None, False
-        where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
-        colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
-        walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
-        ground = plot.image(image="cells", source=self._ground, color_mapper=colours, **where)
-        plot.x_range.renderers = plot.y_range.renderers = [ground]  # the axes stay with the map, whatever is drawn
-        geometry = {"source": self._values, **where}
-        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
-        self._parts = {
-            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below")
-            for name, layer in _LAYERS.items()
-        }
-        plot.image(image="cells", source=self._ground, color_mapper=walls, **where)
-        plot.scatter("x", "y", source=self._measured, size=7, fill_color="colour", line_color="black")
-        plot.multi_line("xs", "ys", source=self._routes, line_color="black", line_dash="dashed", line_width=2)
-        plot.scatter("x", "y", source=self._poses, marker="triangle", angle="angle", size=15, **_MARK)
-        plot.text("x", "y", text="rank", source=self._poses, x_offset=9, **_LABEL)
-        plot.multi_line("xs", "ys", source=self._aims, line_color="black", line_width=4)
-        look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
-        points = plot.scatter("x", "y", source=self._points, marker="star", **look)
-        plot.text("x", "y", text="name", source=self._points, x_offset=13, **_LABEL)
-        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
-        hover = HoverTool(
-            renderers=[parts[0] for parts in self._parts.values()],
-            tooltips=[*_TOOLTIPS],
-            formatters={"@link_state": _state_words()},
-        )
-        plot.add_tools(hover, tool)
-        plot.toolbar.active_tap = tool
-        plot.js_on_event("tap", CustomJS(args={"points": self._points}, code=_UNSELECT))
-        self._points.on_change("data", self._on_points)
-        self._points.selected.on_change("indices", self._on_selected)
 
     def _make_choices(self) -> None:
         from bokeh.models.widgets.inputs import Select
@@ -208,9 +142,16 @@ class Page:
             )
         }
         self.walls = self._on(
-            Select(title="Walls", options=list[Any](_WALLS.items()), value=""),
+            Select(title="Paths through walls", options=list[Any](_WALLS.items()), value=""),
             lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),
         )
+        materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
+        self.material = self._on(
+            Select(title="Material of walls", name="material", options=materials),
+            lambda name: self.session.set(material=name),
+        )
+        presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
+        self.preset = self._on(Select(title="Band", name="preset", options=presets), self._use_preset)
         self.radio = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[000]"),
@@ -225,7 +166,7 @@ class Page:
             )
         }
         self.measured_text = Div(name="measured_text", sizing_mode="stretch_width")
-        self.links = Div(name="links", sizing_mode="stretch_width", stylesheets=[_LINKS])
+        self.links = Div(sizing_mode="stretch_width", stylesheets=[_LINKS])
         self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
 
     def _roots(self) -> dict[str, Any]:
@@ -245,7 +186,7 @@ class Page:
         session = self.session
         upload_map, upload_csv, copy = (
             self._button(name)
-            for name in ("Open a map file\u2026", "Learn from measurements (CSV)\u2026", "Copy as Python")
+            for name in ("Open a map or project\u2026", "Learn from measurements (CSV)\u2026", "Copy as Python")
         )
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
@@ -256,9 +197,11 @@ class Page:
         frequency, bandwidth, height, spacing = self.radio.values()
         return {
             "status": wide(row(self.message, self.cancel), self.warnings),
-            "choices": wide(pair(self.layer, self.which), pair(self.threshold, self.truth)),
-            "picture": self.plot,  # nothing above it changes its height with an answer: a drag would miss
+            "layers": pair(self.layer, self.which),
+            "choices": pair(self.threshold, self.truth),
+            "picture": self.picture.plot,  # nothing above it changes its height with an answer: a drag would miss
             "summary": self.summary,
+            "links": self.links,
             "map": wide(self.example, upload_map, self.map_text),
             "transmitters": wide(
                 pair(self.chosen, self.name),
@@ -271,7 +214,9 @@ class Page:
                 ),
                 self._button("Place it for me", lambda: session.place(), button_type="primary"),
             ),
-            "radio": wide(pair(frequency, bandwidth), self.walls, pair(height, spacing)),
+            "radio": wide(
+                self.preset, pair(frequency, bandwidth), pair(self.walls, self.material), pair(height, spacing)
+            ),
             "robot": wide(
                 self.more,
                 self._button("Best next views", lambda: session.find_views()),
@@ -279,7 +224,7 @@ class Page:
                 self.measured_text,
                 self.forget,
             ),
-            "files": wide(self.links, self.python, copy),
+            "repeat": wide(self.python, copy),
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
@@ -319,11 +264,15 @@ class Page:
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
         """Choose the transmitter that is clicked or dragged. To clear the selection here would end a drag."""
         if new and not self._is_showing:
-            self._choose(self._points.data["name"][new[-1]])
+            self._choose(self.picture.points.data["name"][new[-1]])
 
     def _open_example(self, name: str) -> None:
         if name:
             self.session.open_example(name)
+
+    def _use_preset(self, name: str) -> None:
+        if name:
+            self.session.use_preset(name)
 
     def _choose(self, name: str) -> None:
         if name in self.session.transmitters:
@@ -351,7 +300,7 @@ class Page:
             self._show_transmitters()
             self._show_measured()
             self._show_answer()
-            self._once("views", (self.session.views,), self._show_views)
+            self._once("views", (self.session.views,), lambda: self.picture.show_views(self.session.views))
         finally:
             self._is_showing = False
 
@@ -366,6 +315,9 @@ class Page:
         text = html.escape(status.message)
         if status.fraction is not None:
             text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'
+        answer = self.session.answer
+        if answer is not None and status.fraction is None and "wall_material" in answer.coverage.attrs:
+            text += f" Walls: {html.escape(str(answer.coverage.attrs['wall_material']))}."
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None
@@ -376,10 +328,8 @@ class Page:
         partial, session = self.session.partial, self.session
         if partial is None:
             return
-        cells = hatched_pixels(partial)
         x0, y0, x1, y1 = partial.bounds_m
-        self._ground.data = {"cells": [cells], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
-        self.plot.aspect_ratio = min(max((x1 - x0) / (y1 - y0), 0.7), 1.8)
+        self.picture.show_map(partial)
         seen = "complete" if partial.is_complete else f"{partial.observed_fraction:.0%} observed"
         size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m, cells of {partial.resolution_m:g} m"
         robot = f"; robot after {session.steps} steps" if session.home is not None else ""
@@ -399,8 +349,8 @@ class Page:
             "name": names,
             "colour": colours[: len(names)],
         }
-        if not _are_drawn(rows, self._points.data):
-            self._points.data = rows
+        if not _are_drawn(rows, self.picture.points.data):
+            self.picture.points.data = rows
         self.chosen.options, self.chosen.value = [*names], session.chosen
         self.name.value = session.chosen
         chosen = session.transmitters.get(session.chosen)
@@ -412,7 +362,7 @@ class Page:
         for field in self.aims.values():  # an isotropic antenna points nowhere
             field.disabled |= self.pattern.value == "iso"
         aims = self._aimed()
-        self._once("aims", (repr(aims),), functools.partial(setattr, self._aims, "data", aims))
+        self._once("aims", (repr(aims),), functools.partial(setattr, self.picture.aims, "data", aims))
         self.name.disabled = chosen is None
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
         if self.which.options != options:  # of several transmitters, first the sum at a receiver
@@ -424,6 +374,9 @@ class Page:
         for name, unit in (("frequency_hz", 1e9), ("bandwidth_hz", 1e6), ("rx_height_m", 1.0), ("spacing_m", 1.0)):
             self.radio[name].value = getattr(settings, name) / unit
         self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
+        self.material.value, self.preset.value = settings.material, session.preset
+        if self.threshold.value != settings.threshold_dbm:
+            self.threshold.value = settings.threshold_dbm
         self.python.value = session.python()
 
     def _show_measured(self) -> None:
@@ -435,7 +388,7 @@ class Page:
     def _show_points(self) -> None:
         rx_m, used = self.session.measured_points()
         colours = [_USED if each else _UNUSED for each in used]
-        self._measured.data = {"x": rx_m[:, 0], "y": rx_m[:, 1], "colour": colours}
+        self.picture.measured.data = {"x": rx_m[:, 0], "y": rx_m[:, 1], "colour": colours}
         unused = f", {(~used).sum()} of them not used (white)" if not used.all() else ""
         self.measured_text.text = f"{len(used)} measured points{unused}"
 
@@ -453,68 +406,34 @@ class Page:
     def _options(self, transmitters: int) -> list[Any]:
         return [
             (name, layer.title)
-            for name, layer in _LAYERS.items()
+            for name, layer in LAYERS.items()
             if transmitters > 1 or name not in ("sinr_mean_db", "best_server")
         ]
 
     def _show_answer(self) -> None:
         answer, name, threshold_dbm = self.session.answer, self.which.value, self.session.settings.threshold_dbm
         self._once("answer", (answer, name, threshold_dbm, self.truth.value), self._show_values)
-        for layer, parts in self._parts.items():
+        for layer, parts in self.picture.parts.items():
             for part in parts:
                 part.visible = layer == self.layer.value
-        title = _LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
+        kinds = [*FILES] if answer is not None and answer.is_final else ["project"]
+        links = (
+            f'<a href="{self._files_url}/{kind}" download="{FILES[kind]}">{_FILE_NAMES[kind]}</a>' for kind in kinds
+        )
+        self.links.text = " ".join(links) if self.session.partial is not None else ""
+        title = LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
         if answer is not None and not answer.is_final:
             title += " (coarse)"
         elif answer is not None and self.truth.value:
             title += ", the whole home" if answer.truth is not None else ", the partial map"
-        self.plot.title.text = "Map" if answer is None else title
+        self.picture.plot.title.text = "Map" if answer is None else title
 
     def _show_values(self) -> None:
-        answer, session = self.session.answer, self.session
-        if answer is None:
-            self._values.data = {name: [] for name in self._values.data}
-            self.summary.text = self.links.text = ""
-            return
-        one = answer.layers_of(self.which.value, session.settings.threshold_dbm, truth=bool(self.truth.value))
-        x0, x1, y0, y1 = extent_m(one)
-        valid = (one["valid"].to_numpy() == 1) & ~outside(one)
-        row, column = np.indices(valid.shape)
-        if valid.any():  # a wall thinner than a cell leaves none without a value, for the eye alone
-            apart, (row, column) = distance_transform_edt(~valid, return_indices=True)
-            valid = apart < 2.0
-        columns: dict[str, Any] = {"x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
-        for name in (*self._parts, *_HOVERED):
-            values = one[name].to_numpy() if name in one else np.full(valid.shape, np.nan)
-            columns[name] = [np.where(valid, values[row, column], np.nan).astype(np.float32)]
-        self._values.data = columns
-        self._parts["best_server"][1].major_label_overrides = dict(
-            enumerate(map(str, answer.coverage["tx"].to_numpy()))
-        )
-        self.summary.text = _summary(answer, session.settings.threshold_dbm)
-        links = (
-            f'<a href="{self._files_url}/{kind}" download="{FILES[kind]}">{_FILE_NAMES[kind]}</a>' for kind in FILES
-        )
-        self.links.text = " ".join(links) if answer.is_final else ""
-
-    def _show_views(self) -> None:
-        views = self.session.views or ()
-        self._routes.data = {"xs": [view.path_m[:, 0] for view in views], "ys": [view.path_m[:, 1] for view in views]}
-        self._poses.data = {
-            "x": [view.position_m[0] for view in views],
-            "y": [view.position_m[1] for view in views],
-            "angle": [math.radians(view.heading_deg - 90.0) for view in views],
-            "rank": [str(number) for number in range(1, len(views) + 1)],
-        }
+        answer, threshold_dbm = self.session.answer, self.session.settings.threshold_dbm
+        self.picture.show_answer(answer, self.which.value, threshold_dbm, truth=bool(self.truth.value))
+        self.summary.text = "" if answer is None else _summary(answer, threshold_dbm)
 
 
-_LABEL: dict[str, Any] = {
-    "text_baseline": "middle",
-    "text_font_size": "13px",
-    "background_fill_color": "white",
-    "background_fill_alpha": 0.75,
-}
-_MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
 _USED, _UNUSED = "#ee6677", "#ffffff"
 """Colours of measured points."""
 
@@ -530,22 +449,6 @@ def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
     return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
-def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown; 3 is a hatch."""
-    merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
-    ny, nx = (math.ceil(n / merge) for n in partial.shape)
-    padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
-    padded[: partial.shape[0], : partial.shape[1]] = partial.state
-    blocks = padded.reshape(ny, merge, nx, merge)
-    free = np.where((blocks == CellState.FREE).any(axis=(1, 3)), CellState.FREE, CellState.UNKNOWN)
-    cells = np.where((blocks == CellState.WALL).any(axis=(1, 3)), CellState.WALL, free).astype(np.uint8)
-    finer = max(1, round(_FEWEST_PIXELS / max(cells.shape)))
-    cells = cells.repeat(finer, axis=0).repeat(finer, axis=1)
-    row, column = np.indices(cells.shape)
-    stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
-    return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
-
-
 def _summary(answer: Answer, threshold_dbm: float) -> str:
     """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
     area = answer.coverage.radio.area(threshold_dbm, probability=_PROBABILITY, eirp_dbm=answer.eirp_dbm)["fraction"]
@@ -558,9 +461,3 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
     return text + " Hatched: not observed."
-
-
-def _state_words() -> Any:
-    from bokeh.models import CustomJSHover
-
-    return CustomJSHover(code=f"return {STATES!r}[value] ?? 'no receiver'")

@@ -4,25 +4,26 @@ import functools
 import itertools
 import logging
 import math
-import re
 import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path, PurePath
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
 
+from sionna_partial.app.answer import Answer
 from sionna_partial.app.files import FILES, coverage_file, uploaded_map
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
+from sionna_partial.app.project import Project, project_file, uploaded_project
+from sionna_partial.app.radio import FINEST_M, MOST_TRANSMITTERS, PRESETS, RadioSettings, Transmitter, require_name
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Checked, Progress, Within, reason_of, require, require_choice
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
+from sionna_partial.checks import Progress, reason_of, require, require_choice
+from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
@@ -40,13 +41,8 @@ from sionna_partial.measurements.measurements import (
     nearest_transmitters,
 )
 from sionna_partial.placement.placement import place_transmitter
-from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.resources import demo_homes, scenes_folder
-from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
-
-MOST_TRANSMITTERS = 10
-"""Number of transmitters of one window."""
 
 ROUNDING_M = 0.006
 """Distance up to which a position of the picture is the same as a rounded one [m]."""
@@ -54,91 +50,9 @@ ROUNDING_M = 0.006
 FIRST_STEPS, MORE_STEPS = 100, 50
 """Steps of the simulated robot when an example is opened, and at each request."""
 
-_FINEST_M, _MOST_RECEIVERS, _NEAREST_CELLS = 0.15, 30_000, 1000
+_MOST_RECEIVERS, _NEAREST_CELLS = 30_000, 1000
 
 _log = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class Transmitter(Checked):
-    """Position of a transmitter [m], its power [dBm], and its antenna, whose gain is added."""
-
-    x_m: Annotated[float, Within(-1e6, 1e6)]
-    y_m: Annotated[float, Within(-1e6, 1e6)]
-    z_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
-    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
-    antenna: Antenna = field(default_factory=Antenna)
-
-    @property
-    def position_m(self) -> tuple[float, float, float]:
-        """World x, y and z [m]."""
-        return self.x_m, self.y_m, self.z_m
-
-
-@dataclass(frozen=True)
-class RadioSettings(Checked):
-    """Settings of the prediction."""
-
-    frequency_hz: Annotated[float, Within(*FREQUENCIES_HZ)] = CARRIER_FREQUENCY_HZ
-    through_walls: bool | None = None
-    rx_height_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
-    spacing_m: Annotated[float, Within(0.02, 10.0)] = _FINEST_M
-    bandwidth_hz: Annotated[float, Within(1e3, 1e11)] = 100e6
-    threshold_dbm: Annotated[float, Within(-200.0, 100.0)] = -80.0
-
-    @property
-    def trace_settings(self) -> TraceSettings:
-        """The settings of the trace."""
-        return TraceSettings(self.frequency_hz, refraction=self.through_walls)
-
-
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Coverage of all transmitters on (tx, y, x), of several their network, and the same in the home as it is."""
-
-    coverage: xr.Dataset
-    eirp_dbm: Floats
-    settings: RadioSettings
-    is_final: bool
-    network: xr.Dataset | None = None
-    truth: xr.Dataset | None = None
-
-    def layers_of(self, name: str, threshold_dbm: float, *, truth: bool = False) -> xr.Dataset:
-        """Return the variables (y, x) of `predict_map` and `radio` of a transmitter, or of the strongest for "".
-
-        `power_mean_dbm`, `snr_mean_db`, `p_above` (the received power exceeds the threshold), and of several
-        transmitters `sinr_mean_db` and `best_server`.
-        """
-        coverage = self.truth if truth and self.truth is not None else self.coverage
-        radio, eirp_dbm = coverage.radio, self.eirp_dbm
-        power = radio.power(eirp_dbm=eirp_dbm)
-        snr = radio.snr(eirp_dbm=eirp_dbm, bandwidth_hz=self.settings.bandwidth_hz)
-        every = coverage.assign(power.data_vars).assign(snr.data_vars)
-        best = np.nan_to_num(power["power_mean_dbm"].to_numpy(), nan=-np.inf).argmax(axis=0)
-        names = [str(each) for each in coverage["tx"].to_numpy()]
-        at = xr.DataArray(best, dims=("y", "x")) if name not in names else names.index(name)
-        one = every.isel(tx=at)
-        columns = {each: one[each].to_numpy() for each in (*DISTRIBUTION, *COMPONENTS)}
-        threshold_db = np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0)[at]
-        above = LinkPrediction(**columns).probability_above(threshold_db)
-        found: dict[str, Any] = {"p_above": (("y", "x"), above)}
-        if self.network is not None:
-            found |= {"best_server": (("y", "x"), best), "sinr_mean_db": self.network["sinr_mean_db"]}
-        return one.assign(found)
-
-    def agreement(self) -> tuple[float, float] | None:
-        """Return the fraction of correct link states on the free floor of the home, and the RMSE of the gain [dB]."""
-        if self.truth is None:
-            return None
-        here = (self.truth["valid"] & self.coverage["valid"]).to_numpy() == 1
-        here &= self.truth["cell_state"].to_numpy() == CellState.FREE
-        states, gains_db = (
-            [each[name].to_numpy()[here] for each in (self.coverage, self.truth)]
-            for name in ("link_state", "gain_mean_db")
-        )
-        if not here.any():
-            return None
-        return float((states[0] == states[1]).mean()), math.sqrt(float(np.mean((gains_db[0] - gains_db[1]) ** 2)))
 
 
 class Session:
@@ -260,16 +174,28 @@ class Session:
         self.begin(work)
 
     def upload_map(self, files: Sequence[tuple[str, bytes]]) -> None:
-        """Read a map of files (name, content)."""
+        """Read a map, or a project, of files (name, content)."""
         title = next((PurePath(name).name for name, _ in files), "")
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, f"reading {title}")
             with collected_warnings() as warnings:
-                partial = uploaded_map(files)
-            yield functools.partial(self.open_map, partial, title, warnings)
+                project = uploaded_project(files)
+                partial = uploaded_map(files) if project is None else project.partial
+            if project is None:
+                yield functools.partial(self.open_map, partial, title, warnings)
+            else:
+                placed = {name: _placed(partial, each) for name, each in project.transmitters.items()}
+                yield functools.partial(self._open_project, replace(project, transmitters=placed), warnings)
 
         self.begin(work)
+
+    def _open_project(self, project: Project, warnings: Sequence[str]) -> None:
+        self._take_map(project.partial, project.title, ['partial = sp.load_map("map.npz")  # of project.zip'])
+        self.home, self._warnings["map"] = None, [*warnings]
+        self.settings = project.settings or self.settings
+        self.measured = project.measured if project.transmitters else None
+        self._take_transmitters({**project.transmitters})
 
     def _take_map(self, partial: PartialMap, title: str, python: list[str]) -> None:
         self.partial, self.title, self._python_map = partial, title, python
@@ -279,7 +205,7 @@ class Session:
         if not low_m < self.settings.rx_height_m < high_m:
             self.settings = replace(self.settings, rx_height_m=self._usual_height_m())
         steps = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / _MOST_RECEIVERS) / 0.05)
-        self.settings = replace(self.settings, spacing_m=max(_FINEST_M, round(0.05 * steps, 2)))
+        self.settings = replace(self.settings, spacing_m=max(FINEST_M, round(0.05 * steps, 2)))
 
     # Transmitters and settings
 
@@ -293,7 +219,7 @@ class Session:
             name = name if old else self._new_name([*self.transmitters, *found])
             x_m, y_m = round(float(x_m), 2), round(float(y_m), 2)
             if old is None:
-                self.chosen, found[name] = name, Transmitter(x_m, y_m, self._usual_height_m())
+                self.chosen, found[name] = name, replace(self._new_transmitter(), x_m=x_m, y_m=y_m)
             elif max(abs(x_m - old.x_m), abs(y_m - old.y_m)) > ROUNDING_M:
                 self.chosen, found[name] = name, replace(old, x_m=x_m, y_m=y_m)
             else:
@@ -305,6 +231,9 @@ class Session:
         """Return the height of a new transmitter [m]: the default, or the middle of rooms that do not contain it."""
         low_m, high_m = self._map().height_range_m
         return DEFAULT_HEIGHT_M if low_m < DEFAULT_HEIGHT_M < high_m else round((low_m + high_m) / 2.0, 2)
+
+    def _new_transmitter(self) -> Transmitter:
+        return Transmitter(0.0, 0.0, self._usual_height_m(), self.settings.eirp_dbm)
 
     def add(self) -> None:
         """Put a transmitter into the free cell that is nearest to the middle of all free cells."""
@@ -318,8 +247,7 @@ class Session:
         """Change a transmitter, and its name."""
         require_choice("transmitter", name, self.transmitters)
         new_name = name if new_name is None else new_name.strip()
-        good = re.fullmatch(r"[A-Za-z][\w-]{0,30}", new_name, re.ASCII)
-        require(bool(good), "name", new_name, "give a letter, then letters, digits, _ or -, up to 31 in all.")
+        require_name(new_name)
         require(new_name == name or new_name not in self.transmitters, "name", new_name, "another one has it.")
         changed = replace(self.transmitters[name], **values)
         self.chosen = new_name if self.chosen == name else self.chosen
@@ -334,6 +262,19 @@ class Session:
         """Take a transmitter away."""
         self._take_transmitters({each: old for each, old in self.transmitters.items() if each != name})
 
+    def use_preset(self, name: str) -> None:
+        """Take frequency, bandwidth, threshold and power of a preset, the power for all transmitters."""
+        require_choice("preset", name, PRESETS)
+        values = PRESETS[name]._asdict()
+        self.transmitters = {each: replace(old, eirp_dbm=values["eirp_dbm"]) for each, old in self.transmitters.items()}
+        self.set(**values)
+
+    @property
+    def preset(self) -> str:
+        """Name of the preset that settings and transmitters have, "" for none."""
+        same = all(each.eirp_dbm == self.settings.eirp_dbm for each in self.transmitters.values())
+        return self.settings.preset if same else ""
+
     def set(self, **values: Any) -> None:
         """Change settings; all but the threshold are of the prediction."""
         self.settings = replace(self.settings, **values)
@@ -344,7 +285,7 @@ class Session:
 
     def _take_transmitters(self, transmitters: dict[str, Transmitter]) -> None:
         """Predict for transmitters; one that is in a wall or outside the map moves to the nearest free cell."""
-        placed = {name: self._placed(each) for name, each in transmitters.items()}
+        placed = {name: _placed(self._map(), each) for name, each in transmitters.items()}
         self._warnings["act"] = [
             f"{name} cannot be at ({old.x_m:g}, {old.y_m:g}): ({new.x_m:g}, {new.y_m:g}) is the nearest free cell."
             for (name, old), new in zip(transmitters.items(), placed.values(), strict=True)
@@ -359,18 +300,6 @@ class Session:
                 f"The measurements are not used any more: no transmitter is within {SAME_TX_M:g} m of theirs."
             )
         self.predict()
-
-    def _placed(self, transmitter: Transmitter) -> Transmitter:
-        """Return a transmitter where it can be, itself if that is where it is; its height must be right."""
-        partial, at_m = self._map(), np.array(transmitter.position_m)
-        if partial.radios_can_stand(at_m[None])[0]:
-            return transmitter
-        free_m = nearest_free_m(partial, at_m[:2], _NEAREST_CELLS)
-        allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
-        if not allowed.any():
-            partial.require_positions("the transmitter", at_m)
-        x_m, y_m = free_m[allowed.argmax()].round(3).tolist()
-        return replace(transmitter, x_m=x_m, y_m=y_m)
 
     def _are_ours(self, measured: Measurements) -> Bools:
         """Return whether each of the measured links (N,) is of a transmitter of this window."""
@@ -451,7 +380,7 @@ class Session:
     def place(self) -> None:
         """Move the chosen transmitter, or put the first one, to where it covers most."""
         partial, settings, name = self._map(), self.settings, self.chosen
-        old = self.transmitters.get(name, Transmitter(0.0, 0.0, self._usual_height_m()))
+        old = self.transmitters.get(name, self._new_transmitter())
         threshold_db = float(np.clip(settings.threshold_dbm - old.eirp_dbm, GAIN_FLOOR_DB + 1.0, 0.0))
 
         def take(position_m: Floats) -> None:
@@ -520,8 +449,9 @@ class Session:
     def _model(self, of: str, partial: PartialMap, settings: RadioSettings) -> LinkModel:
         """Return the warm model of the map, or of the home; called by jobs alone."""
         model, warnings = self._models.get(of, (None, []))
-        if model is None or model.simulation.trace_settings != settings.trace_settings:
-            model, warnings = self._models[of] = LinkModel(partial, trace_settings=settings.trace_settings), []
+        wanted = settings.trace_settings, settings.scene_settings
+        if model is None or (model.simulation.trace_settings, model.simulation.scene_settings) != wanted:
+            model, warnings = self._models[of] = LinkModel(partial, None, *wanted), []
         with collected_warnings(warnings):  # the predictor's is logged once for a model, whichever job comes first
             model.update(partial)
             _ = model.predictor_of_map
@@ -587,8 +517,10 @@ class Session:
     # Files
 
     def file(self, kind: str) -> bytes:
-        """Return the newest answer as a file of one of `FILES`."""
+        """Return the newest answer, or the project, as a file of one of `FILES`."""
         require_choice("kind", kind, FILES)
+        if kind == "project":
+            return project_file(Project(self._map(), self.title, self.transmitters, self.settings, self.measured))
         answer = self.answer
         if answer is None or self._is_outdated or not answer.is_final:
             raise SettingsError(
@@ -606,6 +538,7 @@ class Session:
         trace = [f"frequency_hz={settings.frequency_hz!r}"]
         trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
         given.append(f"trace_settings=sp.TraceSettings({', '.join(trace)})")
+        given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
         given += ['measurements="measured.csv"'] if self.measured is not None else []
         antennas = [each.antenna for each in self.transmitters.values()]
         if any(each != Antenna() for each in antennas):
@@ -619,3 +552,16 @@ class Session:
             'coverage.radio.save("coverage.nc")',
         ]
         return "\n".join(lines) + "\n"
+
+
+def _placed(partial: PartialMap, transmitter: Transmitter) -> Transmitter:
+    """Return a transmitter where it can be, itself if that is where it is; its height must be right."""
+    at_m = np.array(transmitter.position_m)
+    if partial.radios_can_stand(at_m[None])[0]:
+        return transmitter
+    free_m = nearest_free_m(partial, at_m[:2], _NEAREST_CELLS)
+    allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
+    if not allowed.any():
+        partial.require_positions("the transmitter", at_m)
+    x_m, y_m = free_m[allowed.argmax()].round(3).tolist()
+    return replace(transmitter, x_m=x_m, y_m=y_m)

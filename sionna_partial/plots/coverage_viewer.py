@@ -158,6 +158,12 @@ def server_codes(count: int) -> list[str]:
     return [to_hex(cmap(number)) for number in range(count)]
 
 
+def level_codes(below: int, above: int) -> list[str]:
+    """Return colours for so many steps below and above a threshold, with a break between them, for a browser."""
+    steps = [*np.linspace(0.0, 0.3, below), *np.linspace(0.6, 1.0, above)]
+    return [to_hex(colour) for colour in colormaps["viridis"](steps)]
+
+
 def _empty_plot(coverage: xr.Dataset) -> Any:
     from bokeh.models import BoxZoomTool, Range1d
     from bokeh.plotting import figure

@@ -1,0 +1,184 @@
+"""The plot of the page: map, layers with their colour bars, transmitters, measured points, next views."""
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+from sionna_partial.app.answer import LEVELS, Answer
+from sionna_partial.app.radio import MOST_TRANSMITTERS
+from sionna_partial.constants import CellState
+from sionna_partial.exploration.next_views import NextViews
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.coverage_plot import extent_m, outside
+from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes, radio_layers, server_codes
+
+LAYERS = radio_layers(MOST_TRANSMITTERS)
+"""Layers by the name of their variable."""
+
+_UNSELECT = "points.selection_manager.clear()"
+"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
+
+_HOVERED = ("p_los", "p_nlos", "p_outage")
+_MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
+_STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
+"""Step of the scales of levels [dB], and number of steps below and above the threshold."""
+
+_TOOLTIPS = (
+    ("x, y", "$x{0.00} m, $y{0.00} m"),
+    ("most probable state", "@link_state{custom}"),
+    ("LOS, NLOS, outage", "@p_los{0.00}, @p_nlos{0.00}, @p_outage{0.00}"),
+    ("path gain", "@gain_mean_db{0.0} ± @gain_std_db{0.0} dB"),
+    ("received power", "@power_mean_dbm{0.0} dBm"),
+    ("SNR", "@snr_mean_db{0.0} dB"),
+    ("P(above threshold)", "@p_above{0.00}"),
+)
+_LABEL: dict[str, Any] = {
+    "text_baseline": "middle",
+    "text_font_size": "13px",
+    "background_fill_color": "white",
+    "background_fill_alpha": 0.75,
+}
+_MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
+
+
+class Picture:
+    """Plot of one window."""
+
+    def __init__(self) -> None:
+        from bokeh.models import (
+            ColumnDataSource,
+            CustomJS,
+            DataRange1d,
+            FixedTicker,
+            HoverTool,
+            LinearColorMapper,
+            PointDrawTool,
+        )
+        from bokeh.plotting import figure
+
+        self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
+        self.values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)})
+        self.points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
+        self.aims = ColumnDataSource({"xs": [], "ys": []})
+        self.routes = ColumnDataSource({"xs": [], "ys": []})
+        self.measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
+        self.poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
+        plot: Any = figure(
+            x_range=DataRange1d(range_padding=0.02),
+            y_range=DataRange1d(range_padding=0.02),
+            match_aspect=True,
+            sizing_mode="stretch_both",
+            x_axis_label="x [m]",
+            y_axis_label="y [m]",
+            tools="pan,wheel_zoom,box_zoom,reset",
+            active_drag=None,
+            active_scroll=None,
+            background_fill_color="#d9dce0",
+        )
+        self.plot = plot
+        plot.toolbar.logo, plot.grid.visible = None, False
+        where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
+        colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
+        walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
+        known = plot.image(image="cells", source=self.ground, color_mapper=colours, **where)
+        plot.x_range.renderers = plot.y_range.renderers = [known]  # the axes stay with the map, whatever is drawn
+        geometry = {"source": self.values, **where}
+        words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
+        self.parts = {
+            name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below") for name, layer in LAYERS.items()
+        }
+        for name, (_, bar) in self.parts.items():
+            bar.title = bar.title or LAYERS[name].title  # one height of all bars: the map stays where it is
+            if name in LEVELS:
+                bar.ticker = FixedTicker()
+        plot.image(image="cells", source=self.ground, color_mapper=walls, **where)
+        plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
+        plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
+        plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
+        plot.text("x", "y", text="rank", source=self.poses, x_offset=9, **_LABEL)
+        plot.multi_line("xs", "ys", source=self.aims, line_color="black", line_width=4)
+        look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
+        points = plot.scatter("x", "y", source=self.points, marker="star", **look)
+        plot.text("x", "y", text="name", source=self.points, x_offset=13, **_LABEL)
+        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
+        hover = HoverTool(
+            renderers=[parts[0] for parts in self.parts.values()],
+            tooltips=[*_TOOLTIPS],
+            formatters={"@link_state": _state_words()},
+        )
+        plot.add_tools(hover, tool)
+        plot.toolbar.active_tap = tool
+        plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
+
+    def show_map(self, partial: PartialMap) -> None:
+        """Draw the cells of a map."""
+        x0, y0, x1, y1 = partial.bounds_m
+        cells = hatched_pixels(partial)
+        self.ground.data = {"cells": [cells], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+
+    def show_answer(self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool) -> None:
+        """Draw the layers of a transmitter, or of the strongest for "", with scales that follow the threshold."""
+        if answer is None:
+            self.values.data = {column: [] for column in self.values.data}
+            return
+        one = answer.layers_of(name, threshold_dbm, truth=truth)
+        x0, x1, y0, y1 = extent_m(one)
+        valid = (one["valid"].to_numpy() == 1) & ~outside(one)
+        row, column = np.indices(valid.shape)
+        if valid.any():  # a wall thinner than a cell leaves none without a value, for the eye alone
+            apart, (row, column) = distance_transform_edt(~valid, return_indices=True)
+            valid = apart < 2.0
+        columns: dict[str, Any] = {"x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+        for layer in (*LAYERS, *_HOVERED):
+            values = one[layer].to_numpy() if layer in one else np.full(valid.shape, np.nan)
+            columns[layer] = [np.where(valid, values[row, column], np.nan).astype(np.float32)]
+        self.values.data = columns
+        self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
+
+    def _show_scales(self, thresholds: dict[str, float], names: list[str]) -> None:
+        """Let scales of levels change colour in steps of 5 dB, with a break at the threshold; servers have names."""
+        for name, threshold in thresholds.items():
+            _, bar = self.parts[name]
+            low, high = threshold - _BELOW * _STEP_DB, threshold + _ABOVE * _STEP_DB
+            bar.ticker.ticks = np.arange(low, high + 1.0, 2.0 * _STEP_DB).tolist()
+            bar.color_mapper.update(palette=level_codes(_BELOW, _ABOVE), low=low, high=high)
+            bar.title = f"{LAYERS[name].label.partition(';')[0]}; colours break at {threshold:g}"
+        _, bar = self.parts["best_server"]
+        bar.ticker.ticks, bar.major_label_overrides = [*range(len(names))], dict(enumerate(names))
+        bar.color_mapper.update(palette=server_codes(MOST_TRANSMITTERS)[: len(names)], high=len(names) - 0.5)
+
+    def show_views(self, views: NextViews | None) -> None:
+        """Draw the next views of a robot, and the ways to them."""
+        shown = views or ()
+        self.routes.data = {"xs": [view.path_m[:, 0] for view in shown], "ys": [view.path_m[:, 1] for view in shown]}
+        self.poses.data = {
+            "x": [view.position_m[0] for view in shown],
+            "y": [view.position_m[1] for view in shown],
+            "angle": [math.radians(view.heading_deg - 90.0) for view in shown],
+            "rank": [str(number) for number in range(1, len(shown) + 1)],
+        }
+
+
+def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
+    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown; 3 is a hatch."""
+    merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
+    ny, nx = (math.ceil(n / merge) for n in partial.shape)
+    padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
+    padded[: partial.shape[0], : partial.shape[1]] = partial.state
+    blocks = padded.reshape(ny, merge, nx, merge)
+    free = np.where((blocks == CellState.FREE).any(axis=(1, 3)), CellState.FREE, CellState.UNKNOWN)
+    cells = np.where((blocks == CellState.WALL).any(axis=(1, 3)), CellState.WALL, free).astype(np.uint8)
+    finer = max(1, round(_FEWEST_PIXELS / max(cells.shape)))
+    cells = cells.repeat(finer, axis=0).repeat(finer, axis=1)
+    row, column = np.indices(cells.shape)
+    stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
+    return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
+
+
+def _state_words() -> Any:
+    from bokeh.models import CustomJSHover
+
+    return CustomJSHover(code=f"return {STATES!r}[value] ?? 'no receiver'")

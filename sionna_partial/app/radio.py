@@ -1,0 +1,97 @@
+"""Transmitters and radio settings of a window, and presets of common bands."""
+
+import re
+from dataclasses import dataclass, field
+from typing import Annotated, NamedTuple
+
+from sionna_partial.checks import Checked, Within, require, require_choice
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings
+from sionna_partial.tracing.antennas import Antenna
+
+MOST_TRANSMITTERS = 10
+"""Number of transmitters of one window."""
+
+FINEST_M = 0.15
+"""Default spacing of receivers [m]."""
+
+MATERIALS = ("", *WALL_MATERIALS)
+"""Materials of walls that can be chosen; "" is unknown."""
+
+
+class Preset(NamedTuple):
+    """Usual values of a band: centre of a channel, power of a transmitter with its antenna, and useful threshold."""
+
+    frequency_hz: float
+    bandwidth_hz: float
+    eirp_dbm: float
+    threshold_dbm: float
+
+
+PRESETS = {
+    "Wi-Fi 2.4 GHz": Preset(2.442e9, 20e6, 20.0, -67.0),
+    "Wi-Fi 5 GHz": Preset(5.21e9, 80e6, 23.0, -67.0),
+    "Wi-Fi 6 GHz": Preset(6.185e9, 160e6, 23.0, -67.0),
+    "private 5G, 3.7 GHz": Preset(3.75e9, 100e6, 24.0, -75.0),
+    "5G, 26 GHz": Preset(26.5e9, 100e6, 30.0, -80.0),
+    "5G, 28 GHz": Preset(28e9, 100e6, 30.0, -80.0),
+    "60 GHz (WiGig)": Preset(60.48e9, 2160e6, 30.0, -68.0),
+}
+"""Channels 7, 42 and 47 with the powers that Europe allows indoors (ETSI EN 300 328, EN 301 893, EN 303 687) and the
+-67 dBm that vendors of Wi-Fi ask for; typical indoor cells; channel 2 with the sensitivity of MCS 1 (IEEE 802.11ad)."""
+
+
+@dataclass(frozen=True)
+class Transmitter(Checked):
+    """Position of a transmitter [m], its power [dBm], and its antenna, whose gain is added."""
+
+    x_m: Annotated[float, Within(-1e6, 1e6)]
+    y_m: Annotated[float, Within(-1e6, 1e6)]
+    z_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
+    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
+    antenna: Antenna = field(default_factory=Antenna)
+
+    @property
+    def position_m(self) -> tuple[float, float, float]:
+        """World x, y and z [m]."""
+        return self.x_m, self.y_m, self.z_m
+
+
+def require_name(name: str) -> None:
+    """Raise a SettingsError for a text that cannot be the name of a transmitter."""
+    good = re.fullmatch(r"[A-Za-z][\w-]{0,30}", name, re.ASCII)
+    require(bool(good), "name", name, "give a letter, then letters, digits, _ or -, up to 31 in all.")
+
+
+@dataclass(frozen=True)
+class RadioSettings(Checked):
+    """Settings of the prediction, and the power of new transmitters [dBm]; the material "" is unknown."""
+
+    frequency_hz: Annotated[float, Within(*FREQUENCIES_HZ)] = CARRIER_FREQUENCY_HZ
+    through_walls: bool | None = None
+    rx_height_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
+    spacing_m: Annotated[float, Within(0.02, 10.0)] = FINEST_M
+    bandwidth_hz: Annotated[float, Within(1e3, 1e11)] = 100e6
+    threshold_dbm: Annotated[float, Within(-200.0, 100.0)] = -80.0
+    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
+    material: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("material", self.material, MATERIALS)
+
+    @property
+    def trace_settings(self) -> TraceSettings:
+        """The settings of the trace."""
+        return TraceSettings(self.frequency_hz, refraction=self.through_walls)
+
+    @property
+    def scene_settings(self) -> SceneSettings:
+        """The settings of the scene, by default where the material is unknown."""
+        return SceneSettings(material=WALL_MATERIALS[self.material]) if self.material else SceneSettings()
+
+    @property
+    def preset(self) -> str:
+        """Name of the preset with these values, "" for none."""
+        own = Preset(*(getattr(self, name) for name in Preset._fields))
+        return next((name for name, preset in PRESETS.items() if preset == own), "")
