@@ -3,13 +3,16 @@
 Each FOLDER holds map.yaml (others with --map) and measurements.csv with the columns tx, tx_x ... rx_z, frequency_hz and
 power_dbm, as ../shared/measured/bleflat does. Of each transmitter 60 random points are taken, N of them are given, and
 the powers at the others are predicted, 20 times; the offset of powers is not known. The table has the root mean square
-error [dB], averaged over transmitters, how often the 90 % interval of the prediction holds the power, and how many of
-the points, which all received, it calls likelier in outage than not.
+error (RMSE) and the continuous ranked probability score (CRPS), averaged over transmitters [dB], the fraction of powers
+in the central 90 % interval of the prediction, and the fraction of points, all of which received, with
+P(outage) > 0.5. The last table is the mean over folders of the figures of each baseline minus ours.
 
-    python benchmarks/reality.py ../shared/measured/bleflat
+    python benchmarks/reality.py ../shared/measured/bleflat ../shared/measured/ble_floor
 
 Baselines: path loss with fitted exponent; multi-wall (COST 231), whose loss per wall comes from the other transmitters
-of the floor; a Gaussian process about the path loss (Matern 3/2 over the receiver's position).
+of the floor; a Gaussian process about each of the two (Matern 3/2 over the receiver's position); the traced gain.
+Without given powers (N = 0), their constants are those of the other transmitters, which give the offset. Their
+predictions are Gaussian, with the standard deviation of their own errors for the other transmitters.
 "ours, alone" does without the links of the floor's other transmitters.
 """
 
@@ -22,41 +25,57 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import ndtr
 
 import sionna_partial as sp
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction.unobserved import walled_lengths_m
 from sionna_partial.tracing.simulation import clear_of_walls
 
 Floats = NDArray[np.float64]
-NUMBERS, DRAWS, POINTS = (5, 10, 20), 20, 60
+NUMBERS, POINTS = (0, 5, 10, 20), 60
+FIGURES = "RMSE [dB]", "CRPS [dB]", "in 90 %", "P(out) > .5"
 EXPONENT, EXPONENT_STD, NOISE_DB, OFFSET_STD_DB = 2.0, 0.5, 6.0, 8.0
 COLUMNS = "tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "power_dbm"
-WITHIN_90 = 1.6449
+NO_INFORMATION_DB = 30.0
 
 
 def main() -> None:
-    """Measure, and print a table for each floor."""
+    """Measure, and print a table for each floor, and the mean lead over the baselines."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="+")
     parser.add_argument("--map", default="map.yaml", help="name of the map in each folder")
-    parser.add_argument("--material", default="drywall")
+    parser.add_argument("--material", default="unknown", help="of the walls; unknown is the default of SceneSettings")
     parser.add_argument("--opaque-walls", action="store_true")
     parser.add_argument("--half", action="store_true", help="hide each half of the plan in turn: left, right, ...")
+    parser.add_argument("--transmitters", type=int, help="number of transmitters that are read of each floor")
+    parser.add_argument("--draws", type=int, default=20)
     arguments = parser.parse_args()
+    scene = sp.SceneSettings(**{} if arguments.material == "unknown" else {"material": arguments.material})
+    leads = defaultdict(list)
     for folder in arguments.folders:
-        partial, links, frequency_hz = read_floor(folder, arguments.map)
-        settings = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
-        tables = []
-        for seen in halves(partial) if arguments.half else [partial]:
-            simulation = sp.Simulation(seen, settings, sp.SceneSettings(material=arguments.material))
-            tables.append(Floor(seen, links, simulation).table())
-        print(f"\n{folder.name}, {arguments.map}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters")
-        print("| | " + " | ".join(f"N = {number}" for number in NUMBERS) + " |\n" + "|---" * (len(NUMBERS) + 1) + "|")
-        for method in tables[0]:
-            values = np.mean([table[method] for table in tables], axis=0)
-            print(f"| {method} | " + " | ".join(f"{value:.2f}" for value in values) + " |")
+        partial, links, frequency_hz = read_floor(folder, arguments.map, arguments.transmitters)
+        if not links:
+            print(f"\n{folder.name}: no transmitter with a known position and {POINTS} powers")
+            continue
+        trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
+        maps = halves(partial) if arguments.half else [partial]
+        tables = [Floor(each, links, sp.Simulation(each, trace, scene)).table(arguments.draws) for each in maps]
+        table = {method: np.mean([each[method] for each in tables], axis=0) for method in tables[0]}
+        print_table(f"{folder.name}, {arguments.map}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
+        for method, figures in table.items():
+            leads[method].append(figures[:2] - table["ours"][:2])
+    print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
+
+
+def print_table(title: str, table: dict[str, Floats]) -> None:
+    """Print the first figures (F, N) of each method."""
+    columns = [f"{name}, N = {number}" for name in FIGURES[: len(table["ours"])] for number in NUMBERS]
+    print(f"\n{title}\n\n| | {' | '.join(columns)} |\n{'|---' * (len(columns) + 1)}|")
+    for method, figures in table.items():
+        cells = [f"{value:.2f}" if np.isfinite(value) else "" for value in figures.ravel()]
+        print(f"| {method} | {' | '.join(cells)} |", flush=True)
 
 
 def halves(partial: sp.PartialMap) -> list[sp.PartialMap]:
@@ -64,18 +83,20 @@ def halves(partial: sp.PartialMap) -> list[sp.PartialMap]:
     rows, columns = np.nonzero(partial.state != CellState.UNKNOWN)
     of_cell = np.indices(partial.shape)
     hidden = [
-        sign * (each - np.median(known)) > 0.0
-        for each, known in zip(of_cell, (rows, columns), strict=True)
+        sign * (index - np.median(known)) > 0.0
+        for index, known in zip(of_cell, (rows, columns), strict=True)
         for sign in (-1, 1)
     ]
-    return [replace(partial, state=np.where(each, np.uint8(CellState.UNKNOWN), partial.state)) for each in hidden]
+    return [replace(partial, state=np.where(mask, np.uint8(CellState.UNKNOWN), partial.state)) for mask in hidden]
 
 
-def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats], float]:
-    """Return the map, the rows (N, 7) of each transmitter, and the frequency [Hz]."""
+def read_floor(
+    folder: Path, name: str, transmitters: int | None = None
+) -> tuple[sp.PartialMap, dict[str, Floats], float]:
+    """Return the map, the rows (N, 7) of the first transmitters, and the frequency [Hz]."""
     partial = sp.load_map(folder / name)
     with (folder / "measurements.csv").open(encoding="utf-8") as stream:
-        rows = list(csv.DictReader(stream))
+        rows = [row for row in csv.DictReader(stream) if row["tx_x"]]
     of_tx = defaultdict(list)
     for row in rows:
         of_tx[row.get("tx") or row["sensor"]].append([float(row[column]) for column in COLUMNS])
@@ -84,107 +105,132 @@ def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats
         stands = clear_of_walls(partial, values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
         if stands.sum() >= POINTS:
             links[tx] = values[stands]
-    return partial, links, float(rows[0].get("frequency_hz") or 2.44e9)
+    links = dict(list(links.items())[:transmitters])
+    return partial, links, float((rows and rows[0].get("frequency_hz")) or 2.44e9)
 
 
 class Floor:
     """All that the methods need of one floor, computed once."""
 
     def __init__(self, partial: sp.PartialMap, links: dict[str, Floats], simulation: sp.Simulation) -> None:
-        self.partial, self.links, self.simulation = partial, links, simulation
+        self.partial, self.links = partial, links
         self.frequency_hz = simulation.trace_settings.frequency_hz
         self.through_walls = simulation.trace_settings.through_walls
         model = sp.LinkModel(simulation)
-        self.free_db, self.walls, self.prior = {}, {}, {}
+        self.free_db, self.walls, self.prior, self.traced_db = {}, {}, {}, {}
         for tx, rows in links.items():
             tx_m, rx_m = rows[0, :3], rows[:, 3:6]
             distance_m = np.maximum(np.linalg.norm(rx_m - tx_m, axis=1), 0.1)
             self.free_db[tx] = 20.0 * np.log10(SPEED_OF_LIGHT_M_S / self.frequency_hz / (4.0 * np.pi * distance_m))
             self.walls[tx] = walls_between(partial, tx_m, rx_m)
-            traced = simulation.links(tx_m, rx_m)
-            self.prior[tx] = model.predict(tx_m, rx_m), traced.gain_db
+            traced_db = simulation.links(tx_m, rx_m).gain_db
+            self.traced_db[tx] = np.maximum(traced_db, traced_db[traced_db > -150.0].min() - 10.0)
+            self.prior[tx] = model.predict(tx_m, rx_m)
+        self.fitted = {tx: self.fit(tx, np.arange(len(rows))) for tx, rows in links.items()}
 
-    def table(self) -> dict[str, list[float]]:
-        """Return the mean over transmitters of each method's figures, by how many points are given."""
-        sums: dict[str, list[list[float]]] = defaultdict(list)
+    def table(self, draws: int) -> dict[str, Floats]:
+        """Return the mean over transmitters of the figures (4, N) of each method."""
+        shape = len(NUMBERS), draws, POINTS
+        errors: dict[str, dict[str, Floats]] = defaultdict(lambda: defaultdict(lambda: np.full(shape, np.nan)))
+        found: dict[str, dict[str, Floats]] = defaultdict(lambda: defaultdict(lambda: np.full((4, *shape), np.nan)))
         for tx in self.links:
-            for method, values in self.errors(tx).items():
-                sums[method].append(values)
-        return {method: np.mean(values, axis=0).tolist() for method, values in sums.items()}
+            for row, number in enumerate(NUMBERS):
+                for draw in range(draws):
+                    order = np.random.default_rng(draw).permutation(len(self.links[tx]))[:POINTS]
+                    known, rest = order[:number], order[number:]
+                    for method, power in self.baselines(tx, known, rest).items():
+                        errors[method][tx][row, draw, number:] = power - self.links[tx][rest, 6]
+                    for method, figures in self.ours(tx, known, rest).items():
+                        found[method][tx][:, row, draw, number:] = figures
+        for method, of_tx in errors.items():
+            for tx, error_db in of_tx.items():
+                others = [of_tx[other] for other in self.others(tx)]
+                std_db = np.sqrt(np.nanmean(np.square(others), axis=(0, 2, 3)))[:, None, None] + 0.0 * error_db
+                gaussian = np.ones((1, *error_db.shape)), error_db[None], std_db[None]
+                found[method][tx][:3] = error_db, *scores(gaussian, np.zeros(1))
+        return {method: np.mean([means(each) for each in of_tx.values()], axis=0) for method, of_tx in found.items()}
 
-    def errors(self, tx: str) -> dict[str, list[float]]:
-        """Return the figures of one transmitter."""
-        loss_db, mean_offset_db = self.loss_elsewhere(tx)
-        others = [self.fitted(each, np.arange(len(self.links[each]))) for each in self.links if each != tx]
-        found: dict[str, list[float]] = defaultdict(list)
-        for number in NUMBERS:
-            draws = defaultdict(list)
-            for draw in range(DRAWS):
-                order = np.random.default_rng(draw).permutation(len(self.links[tx]))[:POINTS]
-                for method, value in self.one_draw(tx, order, number, loss_db, mean_offset_db, others).items():
-                    draws[method].append(value)
-            for method, values in draws.items():
-                found[method].append(float(np.mean(values)))
+    def others(self, tx: str) -> list[str]:
+        """Return the other transmitters of the floor; this one if there are none."""
+        return [other for other in self.links if other != tx] or [tx]
+
+    def loss_elsewhere(self, tx: str) -> float:
+        """Fit the loss of a wall to the other transmitters [dB]."""
+        walls = np.concatenate([self.walls[other] - self.walls[other].mean() for other in self.others(tx)])
+        rest = [self.links[other][:, 6] - self.free_db[other] for other in self.others(tx)]
+        centred = np.concatenate([values - values.mean() for values in rest])
+        return max(0.0, -float(walls @ centred) / max(float(walls @ walls), 1e-9))
+
+    def baselines(self, tx: str, known: NDArray[np.int64], rest: NDArray[np.int64]) -> dict[str, Floats]:
+        """Return the powers that each baseline predicts [dBm]."""
+        power, rx_m, loss_db = self.links[tx][:, 6], self.links[tx][:, 3:6], self.loss_elsewhere(tx)
+        fits = [path_loss(self.free_db[o], self.links[o][:, 6], (-30.0, EXPONENT / 2.0)) for o in self.others(tx)]
+        slope = path_loss(self.free_db[tx][known], power[known], np.mean(fits, axis=0))
+        predicted = {"path loss": slope[0] + slope[1] * self.free_db[tx]}
+        through = {each: self.free_db[each] - loss_db * self.walls[each] for each in self.links}
+        for name, gain_db in {"multi-wall": through, "trace": self.traced_db}.items():
+            mean_db = float(np.mean([np.mean(self.links[o][:, 6] - gain_db[o]) for o in self.others(tx)]))
+            predicted[name] = gain_db[tx] + offset(power[known] - gain_db[tx][known], mean_db)
+        for name, without in (("path loss", "path loss"), ("direct line through walls", "multi-wall")):
+            residual_db = process(rx_m[known], (power - predicted[without])[known], rx_m)
+            predicted[f"{name} + Gaussian process"] = predicted[without] + residual_db
+        return {name: values[rest] for name, values in predicted.items()}
+
+    def ours(self, tx: str, known: NDArray[np.int64], rest: NDArray[np.int64]) -> dict[str, tuple[Floats, ...]]:
+        """Return errors [dB], scores [dB], and whether the interval holds and an outage is probable, of our methods."""
+        power, found = self.links[tx][rest, 6], {}
+        for name, others in {"ours": self.others(tx), "ours, alone": ()}.items():
+            if len(known) or others:
+                fitted = self.fit(tx, known, [self.fitted[other] for other in others if other != tx])
+                after = fitted.update(self.links[tx][rest, 3:6], self.prior[tx].take(rest))
+                weights, means_db, stds_db = after.by_state
+                if not len(known):
+                    stds_db = np.hypot(stds_db, np.std([self.fitted[other].offset_db for other in others]))
+                parts = weights, means_db + fitted.offset_db, stds_db
+                error_db = after.gain_mean_db + fitted.offset_db - power
+                found[name] = error_db, *scores(parts, power), weights[LinkState.OUTAGE] > 0.5
         return found
 
-    def loss_elsewhere(self, tx: str) -> tuple[float, float]:
-        """Fit the loss of a wall [dB], and the mean offset [dB], to the other transmitters."""
-        others = [each for each in self.links if each != tx] or [tx]
-        walls = np.concatenate([self.walls[each] - self.walls[each].mean() for each in others])
-        rest = [self.links[each][:, 6] - self.free_db[each] for each in others]
-        centred = np.concatenate([each - each.mean() for each in rest])
-        loss_db = max(0.0, -float(walls @ centred) / max(float(walls @ walls), 1e-9))
-        offsets = [np.mean(each + loss_db * self.walls[other]) for each, other in zip(rest, others, strict=True)]
-        return loss_db, float(np.mean(offsets))
-
-    def fitted(self, tx: str, known: NDArray[np.int64], others: Sequence[Assimilation] = ()) -> Assimilation:
-        """Assimilate some of the powers of a transmitter."""
-        rows, (prior, _) = self.links[tx], self.prior[tx]
+    def fit(self, tx: str, known: NDArray[np.int64], others: Sequence[Assimilation] = ()) -> Assimilation:
+        """Assimilate some of the powers of a transmitter; without any, one that says nothing stands for them."""
+        rows, std_db = self.links[tx], None if len(known) else NO_INFORMATION_DB
+        known = known if len(known) else np.zeros(1, dtype=np.int64)
         return Assimilation.fit(
             self.partial,
             rows[0, :3],
-            sp.Measurements(rows[0, :3], rows[known, 3:6], rows[known, 6]),
-            prior.take(known),
+            sp.Measurements(rows[0, :3], rows[known, 3:6], rows[known, 6], std_db),
+            self.prior[tx].take(known),
             frequency_hz=self.frequency_hz,
             through_walls=self.through_walls,
             others=others,
         )
 
-    def one_draw(
-        self,
-        tx: str,
-        order: NDArray[np.int64],
-        number: int,
-        loss_db: float,
-        offset_db: float,
-        others: Sequence[Assimilation],
-    ) -> dict[str, float]:
-        """Return the error of each method, and the predicted one of the prediction, with some points given."""
-        known, rest = order[:number], order[number:]
-        rows, free_db = self.links[tx], self.free_db[tx]
-        power, rx_m = rows[:, 6], rows[:, 3:6]
-        slope = path_loss(free_db[known], power[known], offset_db)
-        loss = slope[0] + slope[1] * free_db
-        multi_wall = free_db - loss_db * self.walls[tx]
-        prior, traced_db = self.prior[tx]
-        received = np.maximum(traced_db, traced_db[traced_db > -150.0].min() - 10.0)
-        shifts = {"multi-wall": multi_wall, "trace": received}
-        guesses = {name: each[rest] + offset(power[known] - each[known], offset_db) for name, each in shifts.items()}
-        ours = {}
-        for name, given in {"ours": others, "ours, alone": ()}.items():
-            fitted = self.fitted(tx, known, given)
-            after = fitted.update(rx_m[rest], prior.take(rest))
-            ours[name] = after.gain_mean_db + fitted.offset_db, after.gain_std_db, after.p_outage
-        guesses |= {
-            "path loss": loss[rest],
-            "path loss + Gaussian process": loss[rest] + process(rx_m[known], (power - loss)[known], rx_m[rest]),
-        }
-        guesses |= {name: mean_db for name, (mean_db, _, _) in ours.items()}
-        errors = {name: float(np.sqrt(np.mean((each - power[rest]) ** 2))) for name, each in guesses.items()}
-        for name, (mean_db, std_db, p_outage) in ours.items():
-            errors[f"{name}: 90 % interval holds"] = float(np.mean(np.abs(mean_db - power[rest]) <= WITHIN_90 * std_db))
-            errors[f"{name}: P(outage) > .5"] = float(np.mean(p_outage > 0.5))
-        return errors
+
+def means(found: Floats) -> Floats:
+    """Return the RMSE, CRPS and fractions (4, N) of errors, scores and truth values (4, N, draws, points)."""
+    with np.errstate(invalid="ignore"):
+        of_draw = np.nansum([found[0] ** 2, *found[1:]], axis=-1) / np.isfinite(found).sum(axis=-1)
+    return np.concatenate([np.sqrt(of_draw[:1]), of_draw[1:]]).mean(axis=-1)
+
+
+def scores(parts: tuple[Floats, Floats, Floats], truth: Floats) -> tuple[Floats, Floats]:
+    """Return the CRPS of Gaussian mixtures (K, ...), and whether their central 90 % intervals hold the truth.
+
+    The score is E|x - truth| - E|x - x'| / 2 (Grimit et al. 2006, equation 5).
+    """
+
+    def mean_distance(mean: Floats, std: Floats) -> Floats:
+        """Return E|x| of normal distributions."""
+        z = mean / np.maximum(std, 1e-9)
+        distance: Floats = mean * (2.0 * ndtr(z) - 1.0) + 2.0 * std * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+        return distance
+
+    weights, centres, stds = parts
+    pairs = mean_distance(centres[:, None] - centres, np.hypot(stds[:, None], stds))
+    half = 0.5 * (weights[:, None] * weights * pairs).sum(axis=(0, 1))
+    below = (weights * ndtr((truth - centres) / np.maximum(stds, 1e-9))).sum(axis=0)
+    holds = np.where(np.isfinite(below), (below >= 0.05) & (below <= 0.95), np.nan)
+    return (weights * mean_distance(truth - centres, stds)).sum(axis=0) - half, holds
 
 
 def walls_between(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:
@@ -200,23 +246,23 @@ def walls_between(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:
     return counts
 
 
-def path_loss(free_db: Floats, power: Floats, offset_db: float) -> Floats:
-    """Fit offset and exponent / 2 by regularised least squares."""
+def path_loss(free_db: Floats, power: Floats, mean: Floats | tuple[float, float]) -> Floats:
+    """Fit offset [dB] and exponent / 2 by least squares, regularised by their prior means."""
     design = np.stack([np.ones(len(power)), free_db], axis=1) / NOISE_DB
     prior = np.diag([1.0 / OFFSET_STD_DB, 2.0 / EXPONENT_STD])
-    target = prior @ [offset_db, EXPONENT / 2.0]
+    target = prior @ mean
     solved: Floats = np.linalg.lstsq(np.vstack([design, prior]), np.append(power / NOISE_DB, target), rcond=None)[0]
     return solved
 
 
 def offset(residual_db: Floats, mean_db: float) -> float:
     """Return the offset's posterior mean [dB]."""
-    weight = len(residual_db) / NOISE_DB**2
-    return float((weight * residual_db.mean() + mean_db / OFFSET_STD_DB**2) / (weight + 1.0 / OFFSET_STD_DB**2))
+    weight, prior = 1.0 / NOISE_DB**2, 1.0 / OFFSET_STD_DB**2
+    return float((weight * residual_db.sum() + mean_db * prior) / (weight * len(residual_db) + prior))
 
 
 def process(known_m: Floats, residual_db: Floats, points_m: Floats) -> Floats:
-    """Return the mean of a Gaussian process with the length, signal and noise that the residuals make likeliest."""
+    """Return the mean of a Gaussian process with the length, signal and noise that the residuals make most probable."""
 
     def kernel(first: Floats, second: Floats, length_m: float) -> Floats:
         apart = np.sqrt(3.0) * np.linalg.norm(first[:, None] - second[None], axis=-1) / length_m

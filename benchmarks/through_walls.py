@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
+from sionna_partial.prediction.wall_materials import COMMON
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import write_scene_of
 from sionna_partial.tracing.paths import SolvedPaths
@@ -39,13 +40,20 @@ def main() -> None:
     """Measure, and print a table for each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", type=Path, nargs="*")
-    parser.add_argument("--only", choices=["stock", "time", "weak", "wall", "mesh"])
+    parser.add_argument("--only", choices=["stock", "time", "material", "weak", "wall", "mesh"])
     parser.add_argument("--receivers", type=int, default=20, help="of each map, for stock Sionna RT")
     parser.add_argument("--rays", type=int, default=1_000_000)
     parser.add_argument("--seed", type=int, default=0)
     arguments = parser.parse_args()
     maps = dict(_maps(arguments.maps))
-    parts = {"stock": against_stock, "time": relative_time, "weak": left_out, "wall": one_wall, "mesh": as_meshes}
+    parts = {
+        "stock": against_stock,
+        "time": relative_time,
+        "material": unknown_material,
+        "weak": left_out,
+        "wall": one_wall,
+        "mesh": as_meshes,
+    }
     for name, part in parts.items():
         if arguments.only in (None, name):
             part(maps, arguments)
@@ -205,6 +213,30 @@ def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace)
                 f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {len(rx_m)} | {seconds[0]:.1f} | "
                 f"{seconds[1] / seconds[0]:.1f} | {gain} |"
             )
+
+
+def unknown_material(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+    """Compare the time of predictions with walls of an unknown material and of named ones, and gains under each."""
+    print("\n| map | GHz | material | receivers | named [s] | unknown, times as long | nearest candidate is off [dB] |")
+    print("|---|---|---|---|---|---|---|")
+    for name, partial in maps.items():
+        for frequency_hz in (2.4e9, 5e9):
+            tx_m, rx_m = ends(partial, 1000, arguments.seed)
+            found = {}
+            for material in (None, *COMMON):
+                settings = sp.TraceSettings(frequency_hz), sp.SceneSettings(material=material)
+                sp.LinkModel(partial, None, *settings).predict(tx_m, rx_m[:50])
+                model = sp.LinkModel(partial, None, *settings)
+                model.predict(tx_m, rx_m[:2])
+                start = time.process_time()
+                found[material] = model.predict(tx_m, rx_m), time.process_time() - start
+            unknown, seconds = found.pop(None)
+            for material, (prediction, named_s) in found.items():
+                off = [np.mean((each.gain_mean_db - prediction.gain_mean_db) ** 2) for each in unknown.by_material[0]]
+                print(
+                    f"| {name} | {frequency_hz / 1e9:g} | {material} | {len(rx_m)} | {named_s:.2f} | "
+                    f"{seconds / named_s:.2f} | {np.sqrt(min(off)):.1f} |"
+                )
 
 
 def left_out(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:

@@ -198,6 +198,8 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
     elif hint is str:
         require(isinstance(value, str), name, value, "give a text.")
+    elif NoneType in arguments and is_dataclass(arguments[0]):
+        return None if value is None else _checked(name, value, arguments[0])
     elif isinstance(hint, type) and is_dataclass(hint):
         if isinstance(value, str) and hasattr(hint, "named"):
             value = hint.named(value)

@@ -35,6 +35,7 @@ from sionna_partial.prediction.predictor import (
     warm_predictor,
 )
 from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.prediction.windows import map_windows
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
@@ -149,7 +150,7 @@ class LinkModel:
     def predictor(self) -> AnyPredictor:
         """The predictor of links that are not complete."""
         if self.by_mean_losses:
-            return MeanLosses(self._networks, self.partial)
+            return MeanLosses(self._networks, self.partial, self.simulation.trace_settings.max_walls)
         return self._networks
 
     @property
@@ -229,7 +230,12 @@ class LinkModel:
         context = not complete.all() and (settings is None or settings.networks != "paper")
         for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
             windows = self._windows_around(tx_m) if context else None
-            found.append(features_of_paths(self.partial, tx_m, rx_m, paths, self.simulation.resolved, windows))
+            ends, unknown = (tx_m, rx_m), self.simulation.material_unknown
+            found.append(
+                features_of_paths(
+                    self.partial, *ends, paths, self.simulation.resolved, windows, material_unknown=unknown
+                )
+            )
         phi = LinkFeatures.concatenate(found)
         return phi, self.predict_features(phi, complete), complete
 
@@ -242,11 +248,31 @@ class LinkModel:
         return self._windows[key]
 
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
-        """Predict links from their features; the trace is the prediction of those that are complete."""
-        trace = LinkPrediction.of_trace(phi)
+        """Predict links from their features; the trace is the prediction of those that are complete.
+
+        Where the material of walls is unknown, this is the mixture over its candidates, with the residuals of traces.
+        Networks predict with the traced material.
+        """
+        if phi.path_power is None:
+            return self._predict_under([phi], complete)[0]
+        parts = self._predict_under(self.wall_materials.under(phi), complete)
+        return LinkPrediction.over_materials(parts, self.wall_materials.prior, RESIDUAL_DB)
+
+    def _predict_under(self, features: Sequence[LinkFeatures], complete: Bools) -> list[LinkPrediction]:
+        """Predict links under each candidate."""
+        traces = [LinkPrediction.of_trace(phi) for phi in features]
         if complete.all():
-            return trace
-        return self.predictor.predict(phi).where(complete, trace)
+            return traces
+        if isinstance(self.predictor, MeanLosses):
+            predicted = self.predictor.predict_each(features)
+        else:
+            predicted = [self.predictor.predict(features[0])] * len(features)
+        return [one.where(complete, trace) for one, trace in zip(predicted, traces, strict=True)]
+
+    @property
+    def wall_materials(self) -> WallMaterials:
+        """The candidates for an unknown material of walls."""
+        return WallMaterials.at(self.simulation.trace_settings.frequency_hz)
 
     def links(
         self,
@@ -310,7 +336,7 @@ def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settin
         then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
     elif settings.max_depth < _LEAST_DEPTH:
         then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
-    elif scene_settings.material.itu == "metal":
+    elif scene_settings.traced_material.itu == "metal":
         then, now = "on walls that transmit", "on walls of metal"
     else:
         return

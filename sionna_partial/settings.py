@@ -180,7 +180,7 @@ WALL_MATERIALS = {
 below; coated glass is glass with the conductivity of its metal film."""
 
 DRYWALL = WALL_MATERIALS["drywall"]
-"""The default material."""
+"""Material of a trace where none is known."""
 
 
 @dataclass(frozen=True)
@@ -189,9 +189,11 @@ class SceneSettings(Checked):
 
     Parameters
     ----------
-    material : Material or str
+    material : Material, str or None
         Material of walls, floor and ceiling, or of those parts of a mesh that name none; or its name, as of
-        `Material.named`.
+        `Material.named`. With None it is the material of the map, if the map has one. Otherwise it is unknown where
+        paths go through walls, and predictions average over the candidates of `WallMaterials`; the trace itself has
+        drywall, as it has where walls are opaque.
     bridge_gap_m : float
         Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
         closed, and 0.11 m.
@@ -215,11 +217,16 @@ class SceneSettings(Checked):
     'observed'
     """
 
-    material: Material = DRYWALL
+    material: Material | None = None
     bridge_gap_m: Annotated[float, Within(0.0, 1.0)] = 0.5
     floor_extent: Literal["observed", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
+
+    @property
+    def traced_material(self) -> Material:
+        """`material`, or drywall in place of None."""
+        return DRYWALL if self.material is None else self.material
 
 
 @dataclass(frozen=True)
@@ -408,7 +415,7 @@ class DatasetSettings(Checked):
         Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
         buildings most links between uniformly drawn positions are long, and in outage.
     scene : SceneSettings
-        Conversion of maps to scenes.
+        Conversion of maps to scenes; without a material the walls are of drywall.
     trace : TraceSettings
         Settings of the traces on the complete and on the partial maps.
 
@@ -448,7 +455,7 @@ class DatasetSettings(Checked):
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
         remedy = "give SensorSettings(...), or 'mixed'."
         require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
-        self.scene.material.require_frequency(self.trace.frequency_hz)
+        self.scene.traced_material.require_frequency(self.trace.frequency_hz)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -91,7 +92,7 @@ AMONG = np.random.default_rng(0).uniform((0.4, 0.3, 0.2), (7.6, 5.7, 2.8), (10, 
 OPAQUE = replace(SPECULAR, samples_per_tx=100_000)
 BENT = all_paths(max_depth=3, open_ends=True, samples_per_tx=100_000)
 LOW = replace(OPAQUE, max_depth=2, wall_depth_m=0.0)
-THROUGH = {"weakest": 1e-3, "material": BRICK}
+THROUGH: dict[str, Any] = {"weakest": 1e-3, "material": BRICK}
 
 CASES = {
     "plan": Case(_room, OPAQUE, INSIDE, PLACES[5::29], 300, found=0.999),
@@ -145,7 +146,7 @@ def test_no_path_of_stock_is_missing(name: str) -> None:
     power = np.bincount(shot.path_rx, shot.power, len(links.rx))
     rows = np.flatnonzero(compared & (shot.power > case.weakest * power[shot.path_rx]))
     assert len(rows) >= case.count
-    assert np.mean([has(links, shot, path, case.power) for path in rows]) >= case.found
+    assert np.mean([has(links, shot, path, case.power) for path in rows.tolist()]) >= case.found
     for kind, on in ((REFRACTION, case.settings.through_walls), (DIFFRACTION, case.settings.diffraction is not False)):
         assert (links.interactions == kind).any() == on
     if case.compared is all_of_them and not case.settings.through_walls:

@@ -27,8 +27,8 @@ from websockets.typing import Origin
 
 import sionna_partial as sp
 from sionna_partial.app import session as app_session
-from sionna_partial.app.session import FILES, Session, Transmitter
-from sionna_partial.app.uploads import stored_map
+from sionna_partial.app.files import FILES, stored_map
+from sionna_partial.app.session import Session, Transmitter
 from sionna_partial.errors import MapError, PositionError, SettingsError
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)

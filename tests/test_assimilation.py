@@ -197,7 +197,7 @@ def test_contradictions_count_as_noise():
 def test_thousands_of_measurements_are_averaged_where_they_are_dense():
     many = np.column_stack([RNG.uniform(0.6, 4.2, 5000), RNG.uniform(0.6, 3.0, 5000), np.full(5000, 1.5)])
     measured = fitted(many, -90.0 + 3.0 * RNG.standard_normal(5000))
-    assert len(measured._weights) <= MOST_POINTS
+    assert len(measured._fits[0].weights) <= MOST_POINTS
     assert np.abs(measured.update(LEFT, prior(30)).gain_mean_db + 90.0).max() < 4.0
 
 

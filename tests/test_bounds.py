@@ -95,7 +95,7 @@ class TestLevels:
             assert count == 1 or row[count - 1 :].sum() > most
 
     def test_a_link_without_paths_may_miss_what_no_receiver_notices(self) -> None:
-        assert missing_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)])
+        assert missing_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)], abs=0.0)
 
 
 @pytest.mark.parametrize("walls", [ROOM, np.concatenate([ROOM, SPLINTERS])], ids=["room", "splinters"])

@@ -13,6 +13,7 @@ from scipy.stats import norm
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage.dataset import ATTRIBUTES, WALL_PARTS, require_coverage
+from sionna_partial.coverage.job import transmitter_positions
 from sionna_partial.coverage.link_budget import schemes
 from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
@@ -530,3 +531,14 @@ def test_other_files_are_not_loaded(tmp_path, content):
     xr.Dataset({"p_los": ("x", [0.5])}).to_netcdf(tmp_path / "coverage.nc", engine="h5netcdf")
     with pytest.raises(SettingsError, match="coverage lacks p_los"):
         load_coverage(tmp_path / "coverage.nc")
+
+
+def test_unnamed_transmitters_are_counted_from_one():
+    partial, here, far = map_of(PICTURE), (0.6, 3.6, 1.5), (900.0, 1.0, 1.5)
+    names, tx_m = transmitter_positions(partial, [here, here])
+    assert (names, len(tx_m)) == (["tx1", "tx2"], 2)
+    for tx, name in (([here, far], "tx2"), ({"hall": here, "door": far}, "door")):
+        with pytest.raises(PositionError, match=rf"^{name} = \(900\.0, .* is outside the map"):
+            transmitter_positions(partial, tx)
+    with pytest.raises(PositionError, match=r"^tx2 = \(900\.0, .* is outside the map"):
+        trace_links(partial, [here, far], [(0.8, 3.6, 1.5)])

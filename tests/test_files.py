@@ -12,7 +12,7 @@ from pathlib import Path
 import h5py
 import pytest
 
-from sionna_partial.app.uploads import stored_map
+from sionna_partial.app.files import stored_map
 from sionna_partial.channels.files import load_channels
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import load_coverage

@@ -51,8 +51,9 @@ ROOMS = {
     "prediction": (
         *("unobserved", "windows", "features", "inputs"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
+        "wall_materials",
     ),
-    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
+    "measurements": ("measurements", "recordings", "wall_evidence", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job", "coverage.predict"),
     "channels": (
         *("responses", "beams", "files"),
@@ -69,7 +70,7 @@ ROOMS = {
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("jobs", "uploads", "session", "page", "server"),
+    "app": ("jobs", "files", "session", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "live", "app"),
     "command": ("__main__",),
 }

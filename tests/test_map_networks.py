@@ -88,6 +88,7 @@ class TestLinkInputs:
         found = inputs(phi)
         assert all(np.isfinite(column).all() for column in found.values())
         assert max(abs(column[0]) for column in found.values()) < 7.0
+        assert all(-2.0 <= column[0] <= 0.5 for name, column in found.items() if name.endswith("_above_free"))
 
     @pytest.mark.parametrize("cell", [FREE, UNKNOWN])
     def test_which_states_the_map_leaves_possible(self, cell):

@@ -8,9 +8,12 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.unseen_walls import (
     CELL_M,
+    DISPERSION,
+    LONGEST_M,
     WEIGHTS_FILE,
     UnseenWalls,
     corrected,
+    count_probabilities,
     map_image,
     walls_met,
     walls_per_m,
@@ -78,6 +81,29 @@ def test_the_corner_of_the_grid_does_not_matter(origin_m):
         assert density.per_m.numpy().tobytes() == first.per_m.numpy().tobytes()
         assert density.origin_m.tobytes() == first.origin_m.tobytes()
         np.testing.assert_allclose(density.counts(phi), first.counts(phi), rtol=1e-5)
+
+
+def test_the_number_of_walls_is_negative_binomial():
+    """The mean is kept, and the variance is larger than a Poisson distribution's."""
+    walls = np.array([0.0, 0.3, 1.0, 3.0, 6.0])
+    probabilities = count_probabilities(walls)
+    count = np.arange(len(probabilities))[:, None]
+    np.testing.assert_allclose(probabilities.sum(axis=0), 1.0)
+    np.testing.assert_allclose((count * probabilities).sum(axis=0), walls, atol=2e-3)
+    variance = ((count - walls) ** 2 * probabilities).sum(axis=0)
+    np.testing.assert_allclose(variance, walls + DISPERSION * walls**2, rtol=5e-3)
+    assert probabilities[0, 0] == 1.0
+
+
+def test_long_lines_have_as_many_walls_on_a_metre_as_the_longest_of_the_training():
+    partial = sp.PartialMap(np.full((40, 4000), CellState.UNKNOWN, dtype=np.uint8), 0.1)
+    density = UnseenWalls.shipped().of_map(partial)
+    model = sp.LinkModel(partial, trace_settings=sp.TraceSettings(5e9, max_depth=0))
+    lengths_m = np.array([0.5, 1.0, 2.0, 4.0]) * LONGEST_M
+    phi = model.features((5.0, 2.0, 1.5), [(5.0 + length_m, 2.0, 1.5) for length_m in lengths_m])
+    per_m = density.counts(phi) / lengths_m
+    assert per_m[0] > per_m[1]
+    np.testing.assert_allclose(per_m[2:], per_m[1], rtol=0.1)
 
 
 def test_a_grown_map_is_read_again():

@@ -12,12 +12,21 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.shards import LinkTraces, settings_for
-from sionna_partial.prediction.features import mean_wall_loss_db
+from sionna_partial.evaluation.metrics import measure
+from sionna_partial.prediction.features import LinkFeatures, mean_wall_loss_db
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.unseen_walls import WALL_LOSSES
+from sionna_partial.prediction.unseen_walls import (
+    DISPERSION,
+    LARGEST_LOSS_DB,
+    LOSS_OF_WALL,
+    SEEN_STD_DB,
+    UNSEEN_STD,
+    WALL_LOSSES,
+)
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
+DRYWALL = sp.SceneSettings(material="drywall")
 
 
 def half_seen() -> sp.PartialMap:
@@ -56,7 +65,7 @@ def test_walls_of_a_map_count_by_their_cells() -> None:
 
 
 def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
-    model = sp.LinkModel(half_seen(), trace_settings=WIFI)
+    model = sp.LinkModel(half_seen(), trace_settings=WIFI, scene_settings=DRYWALL)
     phi = model.features((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
     found = model.predict((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
     assert phi.unobserved_distance_m[0] == 0.0
@@ -75,13 +84,56 @@ def test_outages_stay() -> None:
     assert (found.p_outage.item(), found.gain_mean_db.item(), found.gain_std_db.item()) == (1.0, -150.0, 0.0)
 
 
+def some_links(count: int, wall_loss_db: float = 5.0) -> LinkFeatures:
+    """Return equal links that are traced in LOS, with walls of some loss."""
+    phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
+    phi = phi.take(np.zeros(count, dtype=np.int64))
+    assert phi.context is not None
+    return replace(phi, context=replace(phi.context, wall_loss_db=np.full(count, wall_loss_db)))
+
+
+def test_nothing_is_uncertain_about_walls_where_none_are_unseen() -> None:
+    phi, walls = some_links(2), np.zeros(2)
+    phi = replace(phi, link_state=np.array([LinkState.LOS, LinkState.NLOS], dtype=np.uint8))
+    found = LinkPrediction.of_mean_losses(phi, walls)
+    assert found.p_los.tolist() == [1.0, 0.0]
+    assert found.p_outage.tolist() == [0.0, 0.0]
+    np.testing.assert_allclose(found.gain_mean_db, phi.gain_db)
+    np.testing.assert_allclose(found.gain_std_db, SEEN_STD_DB)
+
+
+def test_links_through_more_walls_than_a_path_may_cross_are_often_in_outage() -> None:
+    phi, walls = some_links(6, 2.0), np.array([0.0, 1.0, 4.0, 8.0, 16.0, 24.0])
+    few, default, most = (LinkPrediction.of_mean_losses(phi, walls, max_walls) for max_walls in (4, 8, 16))
+    for found in (few, default, most):
+        np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0)
+        assert (np.diff(found.p_outage) >= 0.0).all()
+    assert default.p_outage[1] < 1e-3
+    assert 0.1 < default.p_outage[4] < 0.5
+    assert (few.p_outage[2:] > default.p_outage[2:]).all()
+    assert (default.p_outage[2:] > most.p_outage[2:]).all()
+
+
+@pytest.mark.parametrize("mean", [0.5, 3.0, 8.0])
+def test_intervals_hold_gains_behind_walls_of_unknown_number(mean: float) -> None:
+    rng, phi = np.random.default_rng(1), some_links(4000)
+    walls = np.full(4000, mean)
+    count = rng.poisson(walls * rng.gamma(1.0 / DISPERSION, DISPERSION, 4000))
+    loss_db = LOSS_OF_WALL * 5.0 * count
+    gain_db = phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB)
+    gain_db += rng.normal(size=4000) * np.hypot(SEEN_STD_DB, UNSEEN_STD * 5.0 * np.sqrt(count))
+    state = np.where(count == 0, LinkState.LOS, LinkState.NLOS).astype(np.uint8)
+    found = LinkPrediction.of_mean_losses(phi, walls, max_walls=16)
+    assert 0.85 < measure(found, state, gain_db).coverage_90 < 0.97
+
+
 def test_the_default_through_walls() -> None:
     """The default predictor below 24 GHz, named in the coverage; a predictor that was asked for predicts."""
     tx, options = (1.0, 2.0, 1.5), {"spacing_m": 0.5, "trace_settings": WIFI}
     coverage = sp.predict_map(half_seen(), tx, **options)
     assert coverage.attrs["predictor"] == WALL_LOSSES
     assert coverage.attrs["walls"] == "through walls"
-    assert float(coverage.p_outage.max()) == 0.0
+    assert float(coverage.p_outage.max()) < 1e-3
     opaque = sp.predict_map(half_seen(), tx, spacing_m=0.5, trace_settings=replace(WIFI, refraction=False))
     assert opaque.attrs["predictor"] == "map"
     assert sp.predict_map(half_seen(), tx, predictor="paper", **options).attrs["predictor"] == "paper"
@@ -92,7 +144,7 @@ def test_measured_powers_through_walls() -> None:
     home, tx, rng = all_seen(), (1.0, 2.0, 1.5), np.random.default_rng(0)
     rx = np.column_stack([rng.uniform(0.5, 7.5, 60), rng.uniform(0.5, 3.5, 60), np.full(60, 1.4)])
     rx = rx[(np.abs(rx[:, 0] - 4.05) > 0.2) & (np.linalg.norm(rx - tx, axis=1) > 0.3)]
-    model = sp.LinkModel(home, trace_settings=WIFI)
+    model = sp.LinkModel(home, trace_settings=WIFI, scene_settings=DRYWALL)
     power_dbm = model.predict(tx, rx).gain_mean_db + 17.0 + 2.0 * rng.standard_normal(len(rx))
     prior = model.predict(tx, rx[:20])
     assert (prior.gain_std_db == 0.0).any()

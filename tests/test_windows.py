@@ -178,8 +178,11 @@ class TestTransmitterWindow:
         assert (channel(window, "seen")[np.ix_(near, near)] == 1.0).all()
 
     def test_detours(self):
-        """None in the open, long out of a closed room, and in between where a route around is known."""
-        state = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE)
+        """None in the open or off a wall at the transmitter, long out of a closed room, shorter through a door."""
+        state, half = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE), WINDOW_CELLS // 2
+        state[half - 1 : half + 1, half - 1 : half + 1] = WALL
+        assert not channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour").any()
+        state[:] = FREE
         partial = PartialMap(state, CELL_M, (-HALF_M, -HALF_M))
         open_detour = channel(transmitter_window(partial, TX_M), "detour")
         assert not open_detour.any()

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 
-from sionna_partial.app.session import FILES, MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
+from sionna_partial.app.files import FILES
+from sionna_partial.app.session import MORE_STEPS, MOST_TRANSMITTERS, ROUNDING_M, Answer, Session
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap

@@ -1,13 +1,11 @@
 """One window of the app without its page: map, transmitters, settings, jobs that can be cancelled, newest answer."""
 
 import functools
-import io
 import itertools
 import logging
 import math
 import re
 import tempfile
-import zipfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -19,8 +17,8 @@ from typing import Annotated, Any
 import numpy as np
 import xarray as xr
 
+from sionna_partial.app.files import FILES, coverage_file, uploaded_map
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
-from sionna_partial.app.uploads import uploaded_map
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Checked, Progress, Within, reason_of, require, require_choice
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
@@ -30,7 +28,6 @@ from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
-from sionna_partial.export import save_coverage, save_network
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, nearest_free_m
@@ -43,7 +40,6 @@ from sionna_partial.measurements.measurements import (
     nearest_transmitters,
 )
 from sionna_partial.placement.placement import place_transmitter
-from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.settings import FREQUENCIES_HZ, TraceSettings
@@ -57,16 +53,6 @@ ROUNDING_M = 0.006
 
 FIRST_STEPS, MORE_STEPS = 100, 50
 """Steps of the simulated robot when an example is opened, and at each request."""
-
-FILES = {
-    "png": "coverage.png",
-    "html": "coverage.html",
-    "nc": "coverage.nc",
-    "tif": "coverage.tif",
-    "yaml": "radio_map.zip",
-    "pdf": "report.pdf",
-}
-"""Kinds of files that can be downloaded, and their names."""
 
 _FINEST_M, _MOST_RECEIVERS, _NEAREST_CELLS = 0.15, 30_000, 1000
 
@@ -608,15 +594,8 @@ class Session:
             raise SettingsError(
                 "there is no coverage yet: put a transmitter on the map, and wait for the fine picture."
             )
-        if kind == "pdf":
-            return report_pdf(answer.coverage, answer.eirp_dbm, answer.settings.threshold_dbm)
-        with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-            path = Path(folder) / f"coverage.{kind}"
-            if kind == "yaml" and answer.network is not None:
-                save_network(answer.network, path)
-            else:
-                save_coverage(answer.coverage.isel(tx=0) if kind == "yaml" else answer.coverage, path)
-            return path.read_bytes() if kind != "yaml" else _zipped(sorted(Path(folder).iterdir()))
+        threshold_dbm = answer.settings.threshold_dbm
+        return coverage_file(kind, answer.coverage, answer.network, answer.eirp_dbm, threshold_dbm)
 
     def python(self) -> str:
         """Return the lines that compute the same coverage."""
@@ -640,12 +619,3 @@ class Session:
             'coverage.radio.save("coverage.nc")',
         ]
         return "\n".join(lines) + "\n"
-
-
-def _zipped(paths: Sequence[Path]) -> bytes:
-    """Return files as a zip; equal files give equal bytes."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
-        for path in paths:
-            archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes())
-    return stream.getvalue()

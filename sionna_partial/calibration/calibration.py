@@ -194,6 +194,10 @@ def calibrate_materials(
     where the line of sight, or half of the power without one, runs through observed space. Outages contain no
     information on the material. The likelihood, the prior and their limits are explained in `docs/calibration.md`.
 
+    Predictions from measurements (`predict_map`) do not need it below 24 GHz: they average over materials by their
+    evidence, which suits tens of powers with an unknown offset. Calibrate from a hundred or more path gains, where
+    reflections are to be right, or channels and gradients are wanted, which have one material.
+
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel

@@ -160,7 +160,7 @@ def start_materials(
     partial: PartialMap, start: Material | None, scene_settings: SceneSettings, frequency_hz: float
 ) -> dict[str, Material]:
     """Return the materials of a scene by their names there, with constants in place of formulas."""
-    materials = partial.environment.scene_materials(scene_settings.material)
+    materials = partial.environment.scene_materials(scene_settings.traced_material)
     materials = {name: start or each for name, each in materials.items()}
     for material in materials.values():
         material.require_frequency(frequency_hz)

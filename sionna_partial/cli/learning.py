@@ -88,7 +88,7 @@ def dataset(
         seed=seed,
         sensor="mixed" if mixed_sensors else sensor,
         short_link_fraction=short_links,
-        scene=SceneSettings(material=opt.parse_material(material)),
+        scene=SceneSettings(material=opt.parse_material(material) if material else None),
         trace=TraceSettings(frequency_hz=frequency),
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES

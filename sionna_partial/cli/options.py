@@ -39,7 +39,10 @@ MAP_HELP = (
     "Valetudo JSON, or picture."
 )
 _BAND_HELP = "Of a mesh or point cloud: z between which its surfaces are walls [m]."
-_MATERIAL_HELP = "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: drywall."
+_MATERIAL_HELP = (
+    "drywall or an ITU material, or permittivity,conductivity[S/m],thickness[m]. Default: unknown below 24 GHz, "
+    "drywall above."
+)
 
 
 def parse_frequency(text: str) -> float:
@@ -216,10 +219,10 @@ def parse_position(text: str) -> tuple[float, ...]:
 
 
 def parse_material(text: str) -> Material:
-    """Material from a name, as of `Material.named`, or "permittivity,conductivity,thickness"; the default for ""."""
+    """Return the material of a name, as of `Material.named`, or of "permittivity,conductivity,thickness"."""
     words = text.split(",")
-    if not text or len(words) == 1:
-        return Material.named(text or "drywall")
+    if len(words) == 1:
+        return Material.named(text)
     if len(words) != 3 or not all(map(_is_number, words)):
         raise typer.BadParameter(
             f"--material {text!r} is neither a name nor permittivity,conductivity,thickness: "
@@ -272,7 +275,10 @@ def settings_of(
 ) -> dict[str, Any]:
     """Return settings of scene and trace by the names of arguments; with diffraction where it is the default."""
     trace = TraceSettings(frequency, max_depth, None if diffraction else False, refraction=through_walls)
-    return {"scene_settings": SceneSettings(material=parse_material(material)), "trace_settings": trace}
+    return {
+        "scene_settings": SceneSettings(material=parse_material(material) if material else None),
+        "trace_settings": trace,
+    }
 
 
 def _read_map(

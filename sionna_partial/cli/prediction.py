@@ -103,6 +103,8 @@ def predict(
                     (folder / name).write_bytes(figure_png(figure))
                 else:
                     sp.save_coverage(coverage, folder / name)
+    if "wall_material" in coverage.attrs:
+        typer.echo(f"walls: {coverage.attrs['wall_material']}, mean loss {coverage.attrs['wall_loss_db']:.1f} dB")
     opt.print_files(out, names)
     if budget:
         typer.echo(_covered(coverage, budget) + (f"; open {out / PICTURE}" if PICTURE in names else ""))
@@ -151,8 +153,8 @@ def export_scene(
     partial: opt.PartialMap,
 ) -> None:
     """Write a map as a scene folder that stock Sionna RT loads."""
-    settings = SceneSettings(material=opt.parse_material(material))
-    settings.material.require_frequency(frequency)
+    settings = SceneSettings(material=opt.parse_material(material) if material else None)
+    settings.traced_material.require_frequency(frequency)
     scene = sp.export_scene(partial, out, settings, frequency_hz=frequency)
     opt.print_files(scene.parent, [scene.name])
 

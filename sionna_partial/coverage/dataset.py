@@ -302,7 +302,7 @@ def _require_values(coverage: xr.Dataset) -> None:
     for name, attributes in ATTRIBUTES.items():
         values = coverage[name].to_numpy()
         if "flag_values" in attributes:
-            good = np.isin(values, attributes["flag_values"]) | (np.isnan(values) & ~valid)
+            good = np.isin(values, attributes["flag_values"]) | np.isnan(values)
             remedy = f"it is one of {[*attributes['flag_values']]}."
         elif "units" in attributes:
             low, high = _RANGES["std" if "_std_" in name else attributes["units"]]

@@ -100,8 +100,8 @@ class CoverageJob:
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
     """Assimilated measurements of other transmitters, for each transmitter."""
 
-    def coverage(self, transmitter: Transmitter, report: Progress) -> xr.Dataset:
-        """Predict the coverage map of a transmitter."""
+    def coverage(self, transmitter: Transmitter, report: Progress) -> tuple[xr.Dataset, Floats]:
+        """Predict the coverage map of a transmitter, and the probabilities (K,) of the materials of walls."""
         model, measured, grid = self.model, transmitter.measured, transmitter.grid
         posterior = None
         if transmitter.position_m is None:
@@ -123,10 +123,13 @@ class CoverageJob:
             "spacing_m": float(self.spacing_m),
             "receivers": self.receivers,
         }
-        if measured is not None:
+        if measured is not None and len(measured):
             attributes |= _measurement_attributes(measured, source)
         coverage = coverage_map(model.partial, grid, values, attributes)
-        return coverage if posterior is None else with_posterior(coverage, posterior)
+        weights = model.wall_materials.prior if model.simulation.material_unknown else np.ones(1)
+        if source.assimilations:
+            weights = source.weights @ [fitted.material_weights for fitted in source.assimilations]
+        return coverage if posterior is None else with_posterior(coverage, posterior), weights
 
     def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
         """Return the job with the measurements of other transmitters assimilated, each alone.
@@ -169,11 +172,13 @@ class CoverageJob:
                 "with probability %.2f powers were measured and no path gains: give gains if their offset is known",
                 p_any,
             )
-        assimilations = []
-        if transmitter.measured is not None:
+        assimilations, measured, others = [], transmitter.measured, self.others.get(transmitter.name, ())
+        if measured is None and others:
+            measured = Measurements(position_m, np.zeros((0, 3)), np.zeros(0))
+        if measured is not None:
             for at_m, p in zip(tx_m, p_powers, strict=True):
-                options = {"p_powers": p, "others": self.others.get(transmitter.name, ())}
-                assimilations.append(self._assimilated(at_m, transmitter.measured, transmitter.antenna, **options))
+                options = {"p_powers": p, "others": others}
+                assimilations.append(self._assimilated(at_m, measured, transmitter.antenna, **options))
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
     def _averaged(self, source: _Source, rx_m: Floats, report: Progress) -> Iterator[PredictedLinks]:
@@ -205,7 +210,7 @@ class CoverageJob:
         self, tx_m: Floats, rx_m: Floats, antenna: Antenna, *, at_rx: bool = False
     ) -> tuple[LinkPrediction, Floats, Floats]:
         """Predict the links to any number of receivers (N, 3) [m] without the antenna, its gain, and P(indoor)."""
-        parts_m = [rx_m[start : start + self.block] for start in range(0, len(rx_m), self.block)]
+        parts_m = [rx_m[start : start + self.block] for start in range(0, max(len(rx_m), 1), self.block)]
         blocks = [self.model.links(tx_m, part_m, no_progress, antenna, at_rx=at_rx) for part_m in parts_m]
         antenna_db = np.concatenate([links.antenna_db for links in blocks])
         p_indoor = np.concatenate([links.p_indoor for links in blocks])
@@ -223,7 +228,11 @@ class CoverageJob:
         def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats, Floats]:
             return self._prior(tx_m, rx_m, transmitter.antenna, at_rx=True)
 
-        return locate_transmitter(partial, measured, allowed, predict, part_of(report, 0.0, LOCATING_FRACTION))
+        part, through_walls = (
+            part_of(report, 0.0, LOCATING_FRACTION),
+            self.model.simulation.trace_settings.through_walls,
+        )
+        return locate_transmitter(partial, measured, allowed, predict, part, through_walls=through_walls)
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
         """Predict the measured links of a transmitter at (3,) [m], and fit the process to them."""
@@ -252,15 +261,20 @@ def predict_coverage(
     """
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, grid["rx_height_m"], grid["spacing_m"])
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
-    maps = []
+    maps, weights = [], []
     with reporting(progress) as report:
         report(0.0, "building the scene")
         job = CoverageJob(model, block=block, **grid).with_others(transmitters, measurements)
         for number, transmitter in enumerate(transmitters):
             part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
-            maps.append(job.coverage(transmitter, part))
+            coverage, of_materials = job.coverage(transmitter, part)
+            maps.append(coverage)
+            weights.append(of_materials)
         report(1.0, "done")
-    return maps[0] if names is None else join_transmitters(maps, names)
+    coverage = maps[0] if names is None else join_transmitters(maps, names)
+    if model.simulation.material_unknown:
+        coverage.attrs |= model.wall_materials.attributes(np.mean(weights, axis=0))
+    return coverage
 
 
 def _transmitters(

@@ -77,7 +77,9 @@ def predict_map(
     measurements : Measurements, mapping, data frame or path, optional
         Gains that were measured of this transmitter (see `Measurements`), which improve the prediction of other
         receivers (`Assimilation`). Those of transmitters farther than 0.5 m from `tx` are
-        not used where walls are opaque; through walls they teach the loss of walls and the offset of powers.
+        not used where walls are opaque; through walls they teach the material of walls and the offset of powers.
+        Where the material is unknown, the attribute `wall_material` of the map has its probabilities, and
+        `wall_loss_db` the expected loss of a wall.
     receivers : {"indoor", "anywhere"}
         Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
     memory_gb : float

@@ -5,7 +5,7 @@ import logging
 import math
 import os
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import get_args
 
@@ -293,7 +293,8 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
 def _traced(
     partial: PartialMap, tx_m: list[Floats], rx_m: list[Floats], settings: DatasetSettings
 ) -> list[TracedLinks]:
-    simulation = Simulation(partial, settings.trace, settings.scene)
+    scene_settings = replace(settings.scene, material=settings.scene.traced_material)
+    simulation = Simulation(partial, settings.trace, scene_settings)
     return [simulation.links(*ends, polarisations=1, progress=False) for ends in zip(tx_m, rx_m, strict=True)]
 
 

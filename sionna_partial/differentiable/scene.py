@@ -117,6 +117,8 @@ class DifferentiableScene:
         Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls on complete maps, and on
         others with a predictor that was trained on such paths.
     scene_settings : SceneSettings, optional
+        Where the material of walls is unknown, they are of drywall here: the distribution is not averaged over
+        materials. Give the material that the measurements show, as the attribute `wall_material` of a coverage map.
 
     Raises
     ------

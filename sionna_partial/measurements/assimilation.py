@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
-from scipy.special import log_ndtr
+from scipy.special import log_ndtr, logsumexp
 
 from sionna_partial.arrays import Bools, Floats, States, grid_edges, read_only
 from sionna_partial.checks import float_array, require, require_number, require_type
@@ -23,6 +23,16 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.wall_evidence import (
+    FADINGS_DB,
+    LIKELY_STD_DB,
+    OTHERS_WEIGHT,
+    OWN_WEIGHT,
+    STDS_DB,
+    Residuals,
+    log_std_prior,
+    mean_square,
+)
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import FREQUENCIES_HZ
@@ -75,12 +85,15 @@ class Kind(NamedTuple):
     exact: bool
     """Whether what is certain without measurements stays so, as no trace is for a real radio."""
 
-    def learnt(self, others: Sequence[Assimilation]) -> Kind:
-        """Return what is expected of a transmitter given others of the same building, whose means scatter."""
+    def learnt(self, others: Sequence[tuple[Floats, Floats]]) -> Kind:
+        """Return what is expected of a transmitter given others of the same building, whose means scatter.
+
+        `others` are the precisions (2, 2), and their products with the means, without a prior.
+        """
         within = np.minimum(BETWEEN_TRANSMITTERS, self.covariance)
         unsure = self.covariance - within
         precision, shift = np.zeros((2, 2)), np.zeros(2)
-        for each_precision, each_shift in (other._in_common for other in others):
+        for each_precision, each_shift in others:
             scattered = np.linalg.inv(np.eye(2) + each_precision @ within)
             precision, shift = precision + scattered @ each_precision, shift + scattered @ each_shift
         left = np.linalg.solve(np.eye(2) + unsure @ precision, unsure)
@@ -95,10 +108,16 @@ KINDS = (
 """Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
 
 KINDS_THROUGH_WALLS = tuple(
-    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, 5.0, math.inf, False) for offset_db in (2.0, 40.0)
+    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False) for offset_db in (2.0, 40.0)
 )
-"""Gains and powers that a real radio received through walls, whose loss is anything from none to twice the expected
-or more: on measured floors a wall costs 0.5 to 8 dB."""
+"""Gains and powers that a real radio received through walls of a given material, whose loss is anything from none to
+twice the expected or more."""
+
+UNKNOWN_FACTOR_STD = 0.3
+"""Standard deviation of the factor on losses where the candidates for an unknown material have losses of their own."""
+
+LEAST_WEIGHT = 0.01
+"""Probability of a candidate below which it is left out of predictions."""
 
 BETWEEN_TRANSMITTERS = np.diag([6.0, 0.3]) ** 2
 """Covariance (2, 2) of offset [dB] and factor between the transmitters of a building."""
@@ -154,6 +173,8 @@ class Walks:
         lengths_m = costs * self._step * self.partial.resolution_m
         graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
         cells, index = np.unique(self._cell_at(self.points_m), return_inverse=True)
+        if not len(cells):
+            return np.zeros((0, self._cost.size), dtype=np.float32)
         return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
 
     def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:
@@ -257,6 +278,27 @@ class _Hypothesis(NamedTuple):
         return precision, (design * weight) @ residual + precision @ self.kind.mean
 
 
+class _Fit(NamedTuple):
+    """The process under one material: weights (P,) and matrix (P, P) with which it predicts.
+
+    `fading_db` is the part of the noise that other receivers have as well.
+    """
+
+    kind: Kind
+    noise_db: float
+    fading_db: float
+    offset_db: float
+    factor: float
+    weights: Floats
+    precision: Floats
+
+    @classmethod
+    def of(cls, best: _Hypothesis, received: Bools, fading_db: float = 0.0) -> _Fit:
+        weights, precision = _posterior(best.covariance, best.residual, received, best.noise)
+        offset_db, factor = best.kind.mean + best.kind.covariance @ best.design @ weights
+        return cls(best.kind, best.noise_db, fading_db, float(offset_db), float(factor), weights, precision)
+
+
 def _hypotheses(
     sample: _Sample, links: _Links, prior: LinkPrediction, kinds: Sequence[Kind], p_powers: float
 ) -> Iterator[_Hypothesis]:
@@ -278,6 +320,106 @@ def _hypotheses(
             yield each._replace(log_p=log_p + each.log_evidence(received))
 
 
+class _Compared(NamedTuple):
+    """Measurements of one transmitter through walls, under K candidates for their material.
+
+    `kinds` has the kinds of measurements under each candidate; `correlation` (P, P) is the correlation of residuals.
+    """
+
+    sample: _Sample
+    links: _Links
+    materials: Sequence[LinkPrediction]
+    kinds: Sequence[Sequence[Kind]]
+    correlation: Floats
+
+    @classmethod
+    def of(
+        cls,
+        sample: _Sample,
+        links: _Links,
+        materials: Sequence[LinkPrediction],
+        others: Sequence[Sequence[tuple[Floats, Floats]]],
+    ) -> _Compared:
+        kinds = KINDS_THROUGH_WALLS
+        if len(materials) > 1:
+            unsure = np.array([1.0, UNKNOWN_FACTOR_STD])
+            kinds = tuple(kind._replace(covariance=kind.covariance * unsure * unsure[:, None]) for kind in kinds)
+        learnt = [
+            [kind.learnt([other[min(k, len(other) - 1)] for other in others]) for kind in kinds]
+            for k in range(len(materials))
+        ]
+        correlation = _positive(links.correlation(sample.rx_m, kinds[0]))
+        return cls(sample, links, materials, learnt, correlation)
+
+    def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
+        """Return the log-posterior (2, K, S, N) of kinds, candidates, process and noise, and the evidence (K, S, N)."""
+        received = self.sample.received
+        below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))
+        parts = []
+        for kind, log_kind in enumerate(np.log([1.0 - p_powers, p_powers])):
+            means = np.array([kinds[kind].mean for kinds in self.kinds])
+            residual_db = above_db - means[:, :1] - (means[:, 1:] - 1.0) * below_db
+            residuals = Residuals(
+                self.correlation[np.ix_(received, received)],
+                self.sample.size[received].astype(np.float64),
+                residual_db[:, received],
+                below_db[:, received],
+                std_db[:, received],
+                np.stack([kinds[kind].covariance for kinds in self.kinds]),
+            )
+            parts.append(log_kind + residuals.log_evidence(np.hypot(FADINGS_DB, self._given_db)))
+        evidence = np.stack(parts)
+        log_prior = np.log(weights)[:, None, None] + log_std_prior()
+        for other in others:
+            log_prior = log_prior + OTHERS_WEIGHT * _fitting(other, len(weights))
+        return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
+
+    def fit(self, k: int, p: Floats) -> _Fit:
+        """Fit the process under a candidate, given the probabilities (2, S, N) of kinds, process and noise."""
+        best, fading_db = self._hypothesis(k, p)
+        return _Fit.of(best, self.sample.received, fading_db)
+
+    def in_common(self, k: int, p: Floats) -> tuple[Floats, Floats]:
+        """Return the offset and factor of the measurements under a candidate, as `_Hypothesis.in_common`."""
+        return self._hypothesis(k, p)[0].in_common(self.sample.received)
+
+    def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
+        """Return averages (P,) of the prior above free space, of the measured above the prior, and of its spread."""
+        averaged, free_db = self.sample.averaged, self.links.free_space_db(self.sample.measured.rx)
+        below_db, above_db = prior.gain_mean_db - free_db, self.sample.level_db - prior.gain_mean_db
+        return averaged(below_db), averaged(above_db), averaged(prior.gain_std_db)
+
+    @property
+    def _given_db(self) -> float:
+        """Root mean square of the standard deviations of the measurements, 0 where none are given [dB]."""
+        std_db = self.sample.measured.std_db
+        return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
+
+    def _hypothesis(self, k: int, p: Floats) -> tuple[_Hypothesis, float]:
+        """Return the most probable kind under a candidate, with the root mean squares of process and fading."""
+        of_kind = p.sum(axis=(1, 2))
+        number = int(of_kind.argmax())
+        weights = p[number] if of_kind[number] > 0.0 else np.ones(p.shape[1:])
+        process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
+        fading_db = mean_square(FADINGS_DB, weights.sum(axis=0))
+        noise_db = float(np.hypot(fading_db, self._given_db))
+        below_db, above_db, std_db = self._levels(self.materials[k])
+        kind = self.kinds[k][number]._replace(trace_std_db=process_db)
+        scale_db = np.hypot(std_db, process_db)
+        residual = (above_db - kind.mean[0] - (kind.mean[1] - 1.0) * below_db) / scale_db
+        design = np.stack([np.ones(len(residual)), below_db]) / scale_db
+        given_db2 = 0.0 if self.sample.measured.std_db is None else self.sample.averaged(self.sample.measured.std_db**2)
+        noise = np.sqrt((fading_db**2 + given_db2) / self.sample.size) / scale_db
+        return _Hypothesis(0.0, kind, noise_db, design, self.correlation, residual, noise), fading_db
+
+
+def _fitting(log_evidence: Floats, candidates: int) -> Floats:
+    """Return the evidence (K, S, N) of another transmitter, averaged over candidates that are not compared."""
+    if len(log_evidence) in (1, candidates):
+        return log_evidence
+    return logsumexp(log_evidence, axis=0, keepdims=True) - math.log(len(log_evidence))
+
+
 @read_only
 @dataclass(frozen=True, eq=False)
 class Assimilation(Shown):
@@ -289,6 +431,9 @@ class Assimilation(Shown):
     Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
     common are those that make the measurements likeliest. Where that offset is large, so that a real radio is behind
     them, what is predicted below the gain in free space is scaled, too.
+
+    Through walls of an unknown material there is a process for each candidate. Their evidence, with the evidence of
+    other transmitters, gives the probabilities of the candidates, and the deviations of process and fading.
 
     `predict_map` does this for a map; for single links, predict the measured links, and those that are wanted.
 
@@ -307,7 +452,7 @@ class Assimilation(Shown):
     """
 
     noise_db: float
-    """Standard deviation of the measurements [dB]; the root mean square of those that were given."""
+    """Standard deviation of the measurements [dB]: of those that were given, and of fading."""
 
     offset_db: float
     """What the measurements have in common above the predicted gains [dB]."""
@@ -315,11 +460,13 @@ class Assimilation(Shown):
     shadow_scale: float
     """What gains below free space are multiplied by."""
 
-    _kind: Kind = field(repr=False)
+    material_weights: Floats
+    """Probability (K,) of each candidate for the material of walls, one where it is known."""
+
     _links: _Links = field(repr=False)
-    _weights: Floats = field(repr=False)
-    _precision: Floats = field(repr=False)
-    _in_common: tuple[Floats, Floats] = field(repr=False)
+    _fits: tuple[_Fit | None, ...] = field(repr=False)
+    _in_common: tuple[tuple[Floats, Floats], ...] = field(repr=False)
+    _log_evidence: Floats = field(repr=False)
 
     @property
     def tx_m(self) -> Floats:
@@ -381,9 +528,10 @@ class Assimilation(Shown):
         require_number("frequency_hz", frequency_hz, *FREQUENCIES_HZ)
         if p_powers is not None:
             require_number("p_powers", p_powers, 0.0, 1.0)
-        if not 0 < len(measured) == len(prior.p_los):
+        if not len(measured) == len(prior.p_los) or not (len(measured) or others):
             raise MeasurementError(
-                f"prior has {len(prior.p_los)} links, and measured {len(measured)}: give the same links, at least one."
+                f"prior has {len(prior.p_los)} links, and measured {len(measured)}: give the same links, at least one "
+                "without others."
             )
         tx_m = position_array("tx_m", tx_m)
         if tx_m.shape != (3,) or not np.isfinite(tx_m).all():
@@ -392,19 +540,40 @@ class Assimilation(Shown):
         good = gains_db.shape in ((), (len(measured),)) and bool(np.isfinite(gains_db).all())
         require(good, "antenna_db", antenna_db, f"give one finite gain [dB], or one for each of {len(measured)} links.")
         sample = _Sample.of(measured, gains_db)
-        kinds = [kind.learnt(others) for kind in KINDS_THROUGH_WALLS] if through_walls else KINDS
-        longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in kinds))
-        links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
         if p_powers is None:
-            p_powers = P_POWERS if links.tx_seen else UNSEEN_P_POWERS
+            p_powers = P_POWERS if partial.state_at(tx_m[None])[0] == CellState.FREE else UNSEEN_P_POWERS
             p_powers = FREE_P_POWERS if through_walls else p_powers
-        hypotheses = _hypotheses(sample, links, prior, kinds, min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P))
-        best = max(hypotheses, key=lambda each: each.log_p)
-        weights, precision = _posterior(best.covariance, best.residual, sample.received, best.noise)
-        kind = best.kind
-        offset_db, factor = kind.mean + kind.covariance @ best.design @ weights
-        in_common = best.in_common(sample.received)
-        return cls(best.noise_db, float(offset_db), float(factor), kind, links, weights, precision, in_common)
+        p_powers = min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P)
+        longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in (*KINDS, *KINDS_THROUGH_WALLS)))
+        links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
+        if through_walls:
+            return cls._through_walls(sample, links, prior, p_powers, others)
+        hypotheses = _hypotheses(sample, links, prior, KINDS, p_powers)
+        fit = _Fit.of(max(hypotheses, key=lambda each: each.log_p), sample.received)
+        return cls(fit.noise_db, fit.offset_db, fit.factor, np.ones(1), links, (fit,), (), np.zeros((1, 1, 1)))
+
+    @classmethod
+    def _through_walls(
+        cls,
+        sample: _Sample,
+        links: _Links,
+        prior: LinkPrediction,
+        p_powers: float,
+        others: Sequence[Assimilation],
+    ) -> Assimilation:
+        """Fit the process under each candidate for the material of walls, and weigh them by their evidence."""
+        materials, weights = prior.by_material
+        compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
+        log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
+        p = np.exp(log_p - logsumexp(log_p))
+        of_material = p.sum(axis=(0, 2, 3))
+        kept = of_material > LEAST_WEIGHT * (len(materials) > 1)
+        fits = tuple(compared.fit(k, p[:, k]) if kept[k] else None for k in range(len(materials)))
+        of_material = np.where(kept, of_material, 0.0) / of_material[kept].sum()
+        common = [(fit.noise_db, fit.offset_db, fit.factor) for fit in fits if fit is not None]
+        noise_db, offset_db, factor = (of_material[kept] @ common).tolist()
+        in_common = tuple(compared.in_common(k, p[:, k]) for k in range(len(materials)))
+        return cls(noise_db, offset_db, factor, of_material, links, fits, in_common, evidence)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return what is predicted of the links to receivers given the measurements, from what was before.
@@ -430,16 +599,25 @@ class Assimilation(Shown):
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
-        prior = self._shadowed(rx_m, prior)
-        across = self._links.correlation(rx_m, self._kind)
-        explained = np.clip(np.einsum("pn,pn->n", across, self._precision @ across), 0.0, 1.0 - 1e-3)
+        materials = prior.by_material[0] if len(self._fits) > 1 else (prior,)
+        updated, across = [], None
+        for fit, links in zip(self._fits, materials, strict=True):
+            if fit is not None:
+                across = self._links.correlation(rx_m, fit.kind) if across is None else across
+                updated.append(self._updated(fit, across, rx_m, links))
+        return LinkPrediction.mixture(updated, self.material_weights[self.material_weights > 0.0])
+
+    def _updated(self, fit: _Fit, across: Floats, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
+        """Update links under one material, whose residuals have the correlations (P, N) `across` with the measured."""
+        kind, prior = fit.kind, self._shadowed(rx_m, prior, fit.factor)
+        explained = np.clip(np.einsum("pn,pn->n", across, fit.precision @ across), 0.0, 1.0 - 1e-3)
         informed = explained > _LEAST_EXPLAINED
         explained = np.where(informed, explained, 1.0)
-        scale_db = np.hypot(prior.gain_std_db, self._kind.trace_std_db)
-        gain_db = prior.gain_mean_db + scale_db * (self._weights @ across) / explained
+        scale_db = np.hypot(prior.gain_std_db, kind.trace_std_db)
+        gain_db = prior.gain_mean_db + scale_db * (fit.weights @ across) / explained
         noise_db2 = scale_db**2 * (1.0 - explained) / explained
         probabilities, means_db, stds_db = prior.by_state
-        variance = stds_db**2 + self._kind.trace_std_db**2
+        variance = stds_db**2 + kind.trace_std_db**2
         total = variance + noise_db2
         with np.errstate(divide="ignore"):
             logs = np.log(probabilities)
@@ -448,18 +626,18 @@ class Assimilation(Shown):
         has_path = np.arange(3)[:, None] != LinkState.OUTAGE
         pull = np.where(informed & has_path, variance / total, 0.0)
         means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
-        left = np.where(has_path, variance * (1.0 - pull), 0.0)
-        stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, left) if self._kind.exact else left, 0.0))
+        left = np.where(has_path, variance * (1.0 - pull) + fit.fading_db**2, 0.0)
+        stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, left) if kind.exact else left, 0.0))
         updated = LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db)
-        return prior.where(informed, updated) if self._kind.exact else updated
+        return prior.where(informed, updated) if kind.exact else updated
 
-    def _shadowed(self, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
+    def _shadowed(self, rx_m: Floats, prior: LinkPrediction, factor: float) -> LinkPrediction:
         """Scale what is predicted of gains below free space."""
-        if self.shadow_scale == 1.0:
+        if factor == 1.0:
             return prior
         free_db = self._links.free_space_db(rx_m)
         probabilities, means_db, stds_db = prior.by_state
-        scaled_db = np.maximum(free_db + self.shadow_scale * (means_db - free_db), GAIN_FLOOR_DB)
+        scaled_db = np.maximum(free_db + factor * (means_db - free_db), GAIN_FLOOR_DB)
         scaled_db[LinkState.OUTAGE] = GAIN_FLOOR_DB
         return LinkPrediction.of_parts(probabilities, scaled_db, stds_db)
 

@@ -24,12 +24,12 @@ Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 """Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
 
-MOST_GROUPS = 25
+MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements, of each of which one is traced."""
 
-CORRELATION_M = 3.0
+CORRELATION_M, CORRELATION_THROUGH_WALLS_M = 3.0, 2.0
 """Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 % of the
-transmitters of procedural homes, also of those that no measurement received."""
+transmitters of procedural homes, also of those that no measurement received, and of a measured flat."""
 
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
@@ -96,31 +96,42 @@ def likely_region(probability: Floats) -> Bools:
 
 
 def locate_transmitter(
-    partial: PartialMap, measured: Measurements, allowed: Callable[[Floats], Bools], predict: Predict, report: Progress
+    partial: PartialMap,
+    measured: Measurements,
+    allowed: Callable[[Floats], Bools],
+    predict: Predict,
+    report: Progress,
+    *,
+    through_walls: bool = False,
 ) -> TransmitterPosterior:
     """Compare positions by the likelihood of gains measured of one transmitter, weighted by P(indoor).
 
     Links are reciprocal: they are predicted from the measured positions to all others (`allowed` returns where one can
     be). A gain has the distribution that is predicted, and noise; at or below the sensitivity it is at most that.
-    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one.
+    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one. Where the
+    material of walls is unknown, its candidates are compared together with the positions.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
     received = measured.gain_db > measured.sensitivity_db
-    some = measured.take(grouped(measured.rx, received, MOST_GROUPS)[0])
+    groups = MOST_GROUPS_THROUGH_WALLS if through_walls else MOST_GROUPS
+    correlation_m = CORRELATION_THROUGH_WALLS_M if through_walls else CORRELATION_M
+    some = measured.take(grouped(measured.rx, received, groups)[0])
     possible = np.flatnonzero(allowed(points_m))
     if not len(possible):
         raise PositionError("a transmitter can be nowhere: no position is away from walls and measurements.")
     partial.require_positions("tx", points_m[possible])
-    log_p = np.zeros((len(OFFSETS_DB), len(possible)))
-    p_indoor = np.zeros(len(possible))
+    log_p, weights, p_indoor = np.zeros(()), np.ones(1), np.zeros(len(possible))
     for index, each_m in enumerate(some.rx):
         report(index / len(some), "comparing positions of the transmitter")
         prediction, antenna_db, indoor = predict(each_m, points_m[possible])
         p_indoor += indoor / len(some)
-        log_p += _log_likelihood(prediction, some.take(np.array([index])), antenna_db)
-    walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
-    log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
+        materials, weights = prediction.by_material
+        one = some.take(np.array([index]))
+        log_p = log_p + np.stack([_log_likelihood(each, one, antenna_db) for each in materials])
+    walks_m = Walks(partial, some.rx, 10.0 * correlation_m).lengths_m(some.rx)
+    log_p *= len(some) / np.exp(-walks_m / correlation_m).sum()
+    log_p = logsumexp(log_p + np.log(weights)[:, None, None], axis=0)
     log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
     joint = np.exp(log_p - logsumexp(log_p))
     posterior.probability.ravel()[possible] = joint.sum(axis=0)

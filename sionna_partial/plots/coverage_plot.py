@@ -456,7 +456,10 @@ def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_db
         if where.any() and not (attributes["map_complete"] and what == "unobserved")
     ]
     lines += ["", "Uncertainty: the mean standard deviation of the path gain is", f"{', '.join(spreads)}."]
-    if attributes["map_complete"]:
+    if "wall_material" in attributes:
+        lines.append(f"Material of the walls: {attributes['wall_material']}. Its uncertainty, and of what maps lack,")
+        lines.append("as furniture, is in that deviation.")
+    elif attributes["map_complete"]:
         lines.append("The map is complete: the numbers are a ray trace of it. Errors of walls' positions, of their")
         lines.append("material and of furniture that the map does not show are not in that deviation.")
     else:

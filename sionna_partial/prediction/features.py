@@ -243,7 +243,7 @@ def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_
     """
     if not trace_settings.through_walls:
         return MOST_LOSS_DB
-    materials = scene_settings.material, *partial.wall_materials
+    materials = scene_settings.traced_material, *partial.wall_materials
     cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
     count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
     weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
@@ -376,6 +376,8 @@ class LinkFeatures(Shown):
         paper's predictor does not use it.
     frequency_hz : float, optional
         Carrier frequency of the trace [Hz], from `link_features`. None is the frequency of the predictor.
+    path_power : (N, C + 1, R + 1) float64 array, optional
+        Power of the paths of each link by crossed walls and by reflections, where the material of walls is unknown.
 
     Raises
     ------
@@ -396,6 +398,7 @@ class LinkFeatures(Shown):
     gain_db: Floats
     context: LinkContext | None = None
     frequency_hz: float | None = None
+    path_power: Floats | None = None
 
     def __post_init__(self) -> None:
         count, shape = np.size(self.distance_m), np.shape(self.distance_m)
@@ -432,7 +435,25 @@ class LinkFeatures(Shown):
         """Return the links that an index array, a mask or a slice selects, one after the other."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
-        return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz)
+        path_power = None if self.path_power is None else self.path_power[index]
+        return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz, path_power=path_power)
+
+    def with_extra_losses(self, crossing_db: float, reflection_db: float) -> "LinkFeatures":
+        """Return the features where walls lose more than in the trace: at each crossing and reflection [dB]."""
+        assert self.path_power is not None
+        walls, reflections = (np.arange(count) for count in self.path_power.shape[1:])
+        extra_db = crossing_db * walls[:, None] + reflection_db * reflections
+        gain_db = path_gain_db(np.tensordot(self.path_power, 10.0 ** (-extra_db / 10.0)))
+        states = np.where(gain_db > GAIN_FLOOR_DB, self.link_state, LinkState.OUTAGE)
+        context = self.context
+        if context is not None:
+            straight_db = context.straight_gain_db - crossing_db * context.straight_walls
+            context = replace(
+                context,
+                straight_gain_db=np.maximum(straight_db, GAIN_FLOOR_DB),
+                wall_loss_db=context.wall_loss_db + crossing_db,
+            )
+        return replace(self, gain_db=gain_db, link_state=states, context=context)
 
     def free_space_shift_db(self, frequency_hz: float) -> float:
         """Return the free-space gain at another frequency less the gain at the frequency of the links [dB]."""
@@ -450,7 +471,9 @@ class LinkFeatures(Shown):
         contexts = [part.context for part in parts if part.context is not None]
         context = LinkContext.concatenate(contexts) if len(contexts) == len(parts) else None
         columns = {name: np.concatenate([getattr(part, name).ravel() for part in parts]) for name in _PAPER}
-        return cls(**columns, context=context, frequency_hz=frequencies_hz.pop())
+        powers = [part.path_power for part in parts if part.path_power is not None]
+        path_power = np.concatenate(powers) if len(powers) == len(parts) else None
+        return cls(**columns, context=context, frequency_hz=frequencies_hz.pop(), path_power=path_power)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
         """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
@@ -459,7 +482,8 @@ class LinkFeatures(Shown):
         return replace(self, context=self.context.with_windows(maps, map_index))
 
 
-_PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in ("context", "frequency_hz"))
+_OPTIONAL = ("context", "frequency_hz", "path_power")
+_PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in _OPTIONAL)
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
@@ -557,14 +581,17 @@ def features_of_paths(
     blocks: Iterable[SolvedPaths],
     settings: tuple[TraceSettings, SceneSettings],
     windows: NDArray[np.uint8] | None,
+    *,
+    material_unknown: bool = False,
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
 
     `blocks` are all paths between them, from `Simulation.blocks`, `settings` those of the trace, and `windows` those of
     `map_windows` around the transmitter. Without windows there is no context, which the paper's predictor does not
-    need.
+    need. Where the material of walls is unknown, the features have the power of the paths by their interactions.
     """
-    sums = LinkSums(1, len(rx_m))
+    limits = (settings[0].max_walls, settings[0].max_depth) if material_unknown else ()
+    sums = LinkSums(1, len(rx_m), *limits)
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
     for paths in blocks:
         sums.add(paths)
@@ -572,6 +599,7 @@ def features_of_paths(
             indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()
     phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz, context=windows is not None)
+    phi = replace(phi, path_power=sums.path_power) if material_unknown else phi
     return phi if phi.context is None else replace(phi, context=replace(phi.context, windows=windows))
 
 

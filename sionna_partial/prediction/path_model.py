@@ -243,20 +243,29 @@ class AntennaLinks:
         antenna_db = phi.gain_db - traced_db
         if complete.all():
             return phi, prediction, antenna_db
-        probabilities, means_db, stds_db = prediction.by_state
-        change_db = np.zeros_like(means_db)
         free_space = 10.0 ** (free_space_gain_db(phi.distance_m, self.frequency_hz) / 10.0)
         direct, table = self.antenna.gain(self._direct_rad, self.frequency_hz), self._table()
-        for state in STATES:
-            sight = free_space * (state == LinkState.LOS)
-            alone, known = sight + self._indirect_alone, sight * direct + self._indirect
-            whole = np.maximum(10.0 ** (means_db[state] / 10.0), alone)
-            change_db[state] = path_gain_db((known + (whole - alone) * self._spread(state, table)) / whole)
-        weights = np.where(np.arange(len(change_db))[:, None] == LinkState.OUTAGE, 0.0, probabilities + _TINY)
+        spread = {state: self._spread(state, table) for state in STATES}
+
+        def change(links: LinkPrediction) -> tuple[Floats, Floats]:
+            probabilities, means_db, _ = links.by_state
+            change_db = np.zeros_like(means_db)
+            for state in STATES:
+                sight = free_space * (state == LinkState.LOS)
+                alone, known = sight + self._indirect_alone, sight * direct + self._indirect
+                whole = np.maximum(10.0 ** (means_db[state] / 10.0), alone)
+                change_db[state] = path_gain_db((known + (whole - alone) * spread[state]) / whole)
+            return change_db, np.where(np.arange(3)[:, None] == LinkState.OUTAGE, 0.0, probabilities + _TINY)
+
+        change_db, weights = change(prediction)
         mean_db = (weights * change_db).sum(axis=0) / weights.sum(axis=0)
-        means_db += np.where(weights > 0.0, change_db - mean_db, 0.0)
-        relative = LinkPrediction.of_parts(probabilities, means_db, stds_db).where(complete, prediction)
-        return phi, relative, np.where(complete, antenna_db, mean_db)
+
+        def relative(links: LinkPrediction) -> LinkPrediction:
+            (change_db, weights), (probabilities, means_db, stds_db) = change(links), links.by_state
+            means_db += np.where(weights > 0.0, change_db - mean_db, 0.0)
+            return LinkPrediction.of_parts(probabilities, means_db, stds_db).where(complete, links)
+
+        return phi, prediction.mapped(relative), np.where(complete, antenna_db, mean_db)
 
     def _table(self) -> Floats:
         """Gain in all whole degrees of zenith and azimuth (181, 360)."""

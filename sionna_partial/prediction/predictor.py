@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, NamedTuple, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,7 +51,7 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
 from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import PredictorSettings
+from sionna_partial.settings import PredictorSettings, TraceSettings
 
 if TYPE_CHECKING:
     import keras
@@ -139,6 +139,39 @@ class LinkPrediction(Shown):
     gain_nlos_mean_db: Floats
     gain_nlos_std_db: Floats
 
+    _materials: ClassVar[tuple[tuple[LinkPrediction, ...], Floats] | None] = None
+    """Distributions given each candidate for the material of walls, and their probabilities (K,), where unknown."""
+
+    @property
+    def by_material(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
+        """Distributions given each candidate for the material of walls, without residuals, and their weights (K,)."""
+        return self._materials or ((self,), np.ones(1))
+
+    @classmethod
+    def over_materials(
+        cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float = 0.0
+    ) -> LinkPrediction:
+        """Return the mixture over candidates for the material of walls, which is remembered.
+
+        `residual_db` is the standard deviation of gains about the trace with the true material [dB].
+        """
+        mixed = cls.mixture(parts, weights)
+        if residual_db:
+            probabilities, means_db, stds_db = mixed.by_state
+            stds_db[1:] = np.hypot(stds_db[1:], residual_db)
+            mixed = cls.of_parts(probabilities, means_db, stds_db)
+        if len(parts) > 1:
+            object.__setattr__(mixed, "_materials", (tuple(parts), weights))
+        return mixed
+
+    def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
+        """Return a change of this distribution, with the same change of those given each material."""
+        changed = change(self)
+        if self._materials is not None:
+            parts, weights = self._materials
+            object.__setattr__(changed, "_materials", (tuple(map(change, parts)), weights))
+        return changed
+
     @property
     def link_state(self) -> States:
         """Likeliest LinkState (N,)."""
@@ -185,12 +218,14 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
     @classmethod
-    def of_mean_losses(cls, phi: LinkFeatures, walls: Floats) -> LinkPrediction:
-        """Return what the mean loss of walls predicts of links through walls, which have a context.
+    def of_mean_losses(
+        cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
+    ) -> LinkPrediction:
+        """Return the prediction by the mean loss of walls, for links through walls, which have a context.
 
-        `walls` (N,) are the expected numbers of unseen walls on their direct lines.
+        `walls` (N,) are the expected numbers of unseen walls on their direct lines, `max_walls` is that of the trace.
         """
-        return cls.of_parts(*by_mean_losses(phi, walls))
+        return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
@@ -238,19 +273,30 @@ class LinkPrediction(Shown):
 
         Outages stay, and no gain falls below the floor.
         """
-        probabilities, means_db, stds_db = self.by_state
         has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
-        means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
-        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        def amplified(links: LinkPrediction) -> LinkPrediction:
+            probabilities, means_db, stds_db = links.by_state
+            means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
+            return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        return self.mapped(amplified)
 
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
         """Return the links that an index array, a mask (N,) or a slice selects."""
-        return LinkPrediction(*(getattr(self, column.name)[index] for column in fields(self)))
+        return self.mapped(
+            lambda links: LinkPrediction(*(getattr(links, column.name)[index] for column in fields(links)))
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
         """Return the links of all `parts`, one part after the other."""
-        return cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+        joined = cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
+        materials = [part._materials for part in parts if part._materials is not None]
+        if len(materials) == len(parts) > 0:
+            under = tuple(map(cls.concatenate, zip(*(part for part, _ in materials), strict=True)))
+            object.__setattr__(joined, "_materials", (under, materials[0][1]))
+        return joined
 
     @classmethod
     def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
@@ -269,7 +315,9 @@ class LinkPrediction(Shown):
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
         """Return the same links in another shape, as (T, N)."""
-        return LinkPrediction(*(getattr(self, column.name).reshape(shape) for column in fields(self)))
+        return self.mapped(
+            lambda links: LinkPrediction(*(getattr(links, column.name).reshape(shape) for column in fields(links)))
+        )
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` for the links of a mask (N,), and this distribution for the rest."""
@@ -643,8 +691,8 @@ class MeanLosses:
 
     name = WALL_LOSSES
 
-    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap) -> None:
-        self._networks, self._partial = networks, partial
+    def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap, max_walls: int) -> None:
+        self._networks, self._partial, self._max_walls = networks, partial, max_walls
         self.settings, self.fingerprint = networks.settings, networks.fingerprint
         self.predict_indoor = networks.predict_indoor
 
@@ -654,7 +702,12 @@ class MeanLosses:
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links (N,)."""
-        return LinkPrediction.of_mean_losses(phi, self._walls.counts(phi))
+        return self.predict_each([phi])[0]
+
+    def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
+        """Predict the same links with several losses of walls."""
+        walls = self._walls.counts(features[0])
+        return [LinkPrediction.of_mean_losses(phi, walls, self._max_walls) for phi in features]
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses

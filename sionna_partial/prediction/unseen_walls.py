@@ -3,12 +3,12 @@
 A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls of each unknown cell: how many a line
 along x, and one along y, meets on a metre. The integral over the unknown part of a line is what a second network
 corrects by the lengths of the line and its known walls. They were trained on lines in procedural buildings, in which
-walls are counted without tracing anything further (`training.walls`). The number of walls has about a Poisson
-distribution.
+walls are counted without tracing anything further (`training.walls`). The number of walls has a negative binomial
+distribution (`count_probabilities`).
 
 The loss of an unseen wall is the mean loss of the known walls (`by_mean_losses`). Its constants were fitted to
-procedural homes of one material and to procedural floors and halls, whose walls lose 2 to 20 dB;
-`benchmarks/unseen_walls.py` measures others.
+procedural homes, floors and halls of several materials, whose walls lose 3 to 26 dB; `benchmarks/unseen_walls.py`
+measures others.
 """
 
 import functools
@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.special import expit, ndtr
 
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
@@ -31,6 +32,7 @@ from sionna_partial.prediction.paper_networks import import_keras, layer, tf
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.windows import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.settings import TraceSettings
 
 if TYPE_CHECKING:
     import keras
@@ -60,19 +62,32 @@ _MAX_BYTES = 10_000_000
 WALL_LOSSES = "the mean loss of unobserved walls"
 """Stands for the predictor's name in coverage maps."""
 
-LOSS_OF_WALL, LARGEST_LOSS_DB = 0.78, 72.0
-"""Loss of an unseen wall in losses of a known one, on lines that are traced in LOS and have none, as other paths add
-power; and what many walls come near to [dB]: paths around them are the strongest there."""
+LONGEST_M = 50.0
+"""Longer lines have as many walls on a metre as a line of this length [m]: lines of the training are shorter."""
+
+DISPERSION = 0.2
+"""Variance of the number of walls in excess of a Poisson distribution, in squares of the mean: buildings differ."""
+
+MOST_COUNTED = 32
+"""Largest number of unseen walls on a line that is told apart from larger ones."""
+
+LOSS_OF_WALL, LARGEST_LOSS_DB = 0.78, 120.0
+"""Loss of the first unseen wall in losses of a known one, as other paths add power; and upper limit of the loss of many
+walls [dB]: paths around them are the strongest there."""
 
 FOUND_WALLS = 0.43
 """Number of walls that unseen reflections compensate, for links that are traced without LOS."""
 
+AROUND_RATIO, AROUND_SPREAD = 3.0, 0.9
+"""Ratio of walls on the direct line to the largest number on a path, above 1, at which other paths still reach one half
+of the receivers; scale of the logistic function of this ratio. Measured on procedural floors."""
+
 LOS_GAIN_DB = 2.0
 """By how much unseen reflections add to a link with LOS, for the square root of an expected wall."""
 
-SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD, LARGEST_STD_DB = 0.5, 0.8, 0.72, 25.0
-"""Standard deviations of gains whose direct line is observed, and of links with LOS likewise [dB]; those of all other
-links, likewise in losses of a wall [1], and the largest of them [dB]."""
+SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 0.5, 0.8, 0.52
+"""Standard deviations of gains whose direct line is observed [dB]; of links with LOS, for the square root of an
+expected wall [dB]; and of other links, for the square root of a wall, in losses of a wall."""
 
 
 class WallDensity(NamedTuple):
@@ -96,14 +111,15 @@ class WallDensity(NamedTuple):
         """Return the expected number of unseen walls on the direct line (N,) of links, which have a context."""
         context = context_of(phi)
         ends = ((end_m[:, :2] - self.origin_m) / CELL_M for end_m in (context.tx_m, context.rx_m))
-        columns = [*ends, phi.unobserved_distance_m, phi.distance_m, context.straight_walls]
-        start, end, *lengths = (np.asarray(column, dtype=np.float32) for column in columns)
+        scale = np.minimum(1.0, LONGEST_M / phi.distance_m)
+        lengths = (scale * column for column in (phi.unobserved_distance_m, phi.distance_m, context.straight_walls))
+        start, end, part, *lines = (np.asarray(column, dtype=np.float32) for column in (*ends, scale, *lengths))
         found = np.zeros(len(phi))
         for first in range(0, len(phi), _LINES_AT_ONCE):
             here = slice(first, first + _LINES_AT_ONCE)
             integral = walls_met(self.per_m, start[None, here], end[None, here])[0]
-            found[here] = corrected(self.lines, integral, *(each[here] for each in lengths))
-        return np.where(phi.unobserved_distance_m > 0.0, found, 0.0)
+            found[here] = corrected(self.lines, part[here] * integral, *(column[here] for column in lines))
+        return np.where(phi.unobserved_distance_m > 0.0, found / scale, 0.0)
 
 
 class UnseenWalls(NamedTuple):
@@ -224,27 +240,58 @@ def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m
     return integral * tf.exp(outputs[..., 0]) + tf.math.softplus(outputs[..., 1] + _LEAST)
 
 
-def by_mean_losses(phi: LinkFeatures, walls: Floats) -> tuple[Floats, Floats, Floats]:
+def count_probabilities(walls: Floats) -> Floats:
+    """Return the probabilities (K, N) of 0, 1, ... unseen walls, and of K - 1 or more, given the mean (N,).
+
+    The distribution is negative binomial: Poisson distributions, whose means have a gamma distribution.
+    """
+    count, failures = np.arange(MOST_COUNTED)[:, None], 1.0 / DISPERSION
+    ratios = (count + failures) / (count + 1.0) * (walls / (walls + failures))
+    none = (1.0 + DISPERSION * walls) ** -failures
+    probabilities = none * np.concatenate([np.ones((1, len(walls))), np.cumprod(ratios, axis=0)])
+    probabilities[-1] = np.maximum(1.0 - probabilities[:-1].sum(axis=0), 0.0)
+    return probabilities
+
+
+def by_mean_losses(
+    phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
+) -> tuple[Floats, Floats, Floats]:
     """Return probabilities, means and standard deviations of the gain [dB] of links through walls, each (3, N).
 
-    They are by LinkState, from the features of N links, which have a context, and the expected numbers of unseen walls
-    on their direct lines (N,). That number has a Poisson distribution: a link that is traced in line of sight has LOS
-    if it is 0.
+    They are by LinkState, from the features of N links, which have a context, the expected numbers of unseen walls on
+    their direct lines (N,), and the largest number of walls on a traced path. A link that is traced in line of sight
+    has LOS if there is no unseen wall.
     """
-    wall_loss_db, los = context_of(phi).wall_loss_db, phi.link_state == LinkState.LOS
-    p_los = np.where(los, np.exp(-walls), 0.0)
-    some = walls / np.maximum(-np.expm1(-walls), np.finfo(float).tiny)
-    count = np.where(los, np.where(walls > 0.0, some, 1.0), np.maximum(walls - FOUND_WALLS, 0.0))
-    loss_db = LOSS_OF_WALL * wall_loss_db * count
-    mean_db = np.maximum(phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB), GAIN_FLOOR_DB)
-    p_outage = np.where(mean_db > GAIN_FLOOR_DB, 0.0, 1.0 - p_los)
-    root = np.sqrt(walls)
+    blocks = [slice(first, first + _LINES_AT_ONCE) for first in range(0, max(1, len(walls)), _LINES_AT_ONCE)]
+    found = [_by_mean_losses(phi.take(block), walls[block], max_walls) for block in blocks]
+    probabilities, means_db, stds_db = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
+    return probabilities, means_db, stds_db
+
+
+def _by_mean_losses(phi: LinkFeatures, walls: Floats, max_walls: int) -> tuple[Floats, Floats, Floats]:
+    context, los = context_of(phi), phi.link_state == LinkState.LOS
+    probabilities = count_probabilities(walls)
+    count = np.arange(len(probabilities))[:, None]
+    loss_db = LOSS_OF_WALL * context.wall_loss_db * np.maximum(count - np.where(los, 0.0, FOUND_WALLS), 0.0)
+    near = 1.0 / (1.0 + loss_db / LARGEST_LOSS_DB)
+    gain_db = phi.gain_db - loss_db * near
+    std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * context.wall_loss_db * np.sqrt(count) * near**2)
+    ratio = (context.straight_walls + count) / max_walls
+    around = np.where(ratio > 1.0, expit((AROUND_RATIO - ratio) / AROUND_SPREAD), 1.0)
+    around *= ndtr((gain_db - GAIN_FLOOR_DB) / std_db)
+    linked = np.where(count == 0, 1.0, around) * (phi.gain_db > GAIN_FLOOR_DB)
+    p_los = np.where(los, probabilities[0], 0.0)
+    joint = probabilities * linked * ((count > 0) | ~los)
+    p_nlos = joint.sum(axis=0)
+    weights = joint + np.finfo(float).tiny * (count == 1)
+    weights /= weights.sum(axis=0)
+    gain_db = np.maximum(gain_db, GAIN_FLOOR_DB)
+    mean_db = (weights * gain_db).sum(axis=0)
+    variance = (weights * (std_db**2 + (gain_db - mean_db) ** 2)).sum(axis=0)
+    nothing, root = np.zeros(len(walls)), np.sqrt(walls)
     los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root, 0.0)
-    los_std_db = np.hypot(SEEN_STD_DB, LOS_STD_DB * root)
-    std_db = np.hypot(SEEN_STD_DB, np.minimum(UNSEEN_STD * wall_loss_db * root, LARGEST_STD_DB))
-    nothing = np.zeros(len(walls))
     return (
-        np.stack([p_outage, p_los, 1.0 - p_los - p_outage]),
+        np.stack([np.maximum(1.0 - p_los - p_nlos, 0.0), p_los, p_nlos]),
         np.stack([nothing + GAIN_FLOOR_DB, los_db, mean_db]),
-        np.stack([nothing, los_std_db, std_db]),
+        np.stack([nothing, np.hypot(SEEN_STD_DB, LOS_STD_DB * root), np.sqrt(variance)]),
     )

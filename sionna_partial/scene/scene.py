@@ -56,6 +56,10 @@ class Lid(NamedTuple):
     material: int
 
 
+_NO_MATERIAL = Material(itu="vacuum")
+"""Stands for the default material where the materials that a map names are sought."""
+
+
 @dataclass(frozen=True)
 class SceneGeometry:
     """Walls, floor and ceiling of a map in its local frame: the origin is the lower-left corner of the grid, on z = 0.
@@ -134,17 +138,23 @@ class SceneGeometry:
 
 
 def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> SceneSettings:
-    """Return the settings of a map's scene, with the map's own material, if it has one."""
+    """Return the settings of a map's scene, with the map's own material, or drywall in place of None."""
     settings = settings_or_default("scene_settings", settings, SceneSettings)
-    default = partial.material or settings.material
+    default = partial.material or settings.traced_material
     used = partial.environment.known_materials(default)
-    if used and settings.material not in (DRYWALL, *used):
+    if used and settings.material not in (None, DRYWALL, *used):
         _log.warning(
             "material = %s of the scene settings is not used: the map or mesh has its own; leave it out, or set that "
             "of the map with dataclasses.replace",
             settings.material,
         )
     return replace(settings, material=default)
+
+
+def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
+    """Return whether neither the settings nor the map name a material of walls."""
+    named = partial.environment.known_materials(_NO_MATERIAL) != {_NO_MATERIAL}
+    return settings.material is None and partial.material is None and not named
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
@@ -157,7 +167,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
         segments=walls.outlines.segments,
         open_end=_open_ends(partial, walls.outlines),
         wall_material=walls.material,
-        materials=(settings.material, *partial.wall_materials),
+        materials=(settings.traced_material, *partial.wall_materials),
         top_m=walls.top_m,
         lids=tuple(_lids(partial, walls)),
         floor_m=_rectangles(floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
@@ -241,7 +251,7 @@ def export_scene(
     require_map("partial", partial)
     settings, environment = scene_settings_of(partial, scene_settings), partial.environment
     offset_m = environment.scene_offset_m(partial.bounds_m)
-    for each in environment.known_materials(settings.material):
+    for each in environment.known_materials(settings.traced_material):
         each.require_frequency(frequency_hz)
     with atomic_folder(folder) as target:
         write_map(partial, target, settings, offset_m=offset_m, frequency_hz=frequency_hz)
@@ -258,7 +268,7 @@ def write_map(
     """
     environment = partial.environment
     if isinstance(environment, SceneMesh):
-        default = settings.material
+        default = settings.traced_material
         path = write_mesh_scene(
             environment, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
         )

@@ -190,9 +190,9 @@ def _verified(
     """Verify candidates, many blocks of one kind at once."""
     waiting: list[Block] = []
     for block in itertools.chain(blocks, [None]):
-        full = sum(len(each.candidates.rx) for each in waiting) >= CANDIDATES_AT_ONCE
+        full = sum(len(stored.candidates.rx) for stored in waiting) >= CANDIDATES_AT_ONCE
         if waiting and (block is None or full or not block.candidates.is_like(waiting[0].candidates)):
-            together = Candidates.concatenate([each.candidates for each in waiting])
+            together = Candidates.concatenate([stored.candidates for stored in waiting])
             for start in range(0, len(together.rx), CANDIDATES_AT_ONCE):
                 part = together.rows(np.arange(start, min(start + CANDIDATES_AT_ONCE, len(together.rx))))
                 paths, rows = solver.verify(part, tx_m, rx_m)

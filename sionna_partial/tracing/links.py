@@ -15,7 +15,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, Link
 from sionna_partial.display import Shown, later
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.interactions import REFRACTION
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import SolvedPaths
 
 if TYPE_CHECKING:
@@ -438,16 +438,31 @@ _VARIABLES = {
 
 
 class LinkSums:
-    """The power of links (T, N), and whether each is in sight, added up over their paths, some at a time."""
+    """The power of links (T, N), and whether each is in sight, added up over their paths, some at a time.
 
-    def __init__(self, transmitters: int, receivers: int) -> None:
+    `path_power` (T N, C + 1, R + 1) is the power by the number of walls that a path crosses, and by its number of
+    reflections; paths with more than C or R count with these.
+    """
+
+    def __init__(self, transmitters: int, receivers: int, walls: int = 0, reflections: int = 0) -> None:
         self._shape = transmitters, receivers
-        self.power, self._is_direct = np.zeros(transmitters * receivers), np.zeros(transmitters * receivers, dtype=bool)
+        self.path_power = np.zeros((transmitters * receivers, walls + 1, reflections + 1))
+        self._is_direct = np.zeros(transmitters * receivers, dtype=bool)
+
+    @property
+    def power(self) -> Floats:
+        """Sum over the paths of each link (T N,)."""
+        power: Floats = self.path_power.sum(axis=(1, 2))
+        return power
 
     def add(self, paths: SolvedPaths) -> None:
         """Add some of the paths."""
         link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
-        np.add.at(self.power, link, paths.power)
+        counts = (
+            np.minimum(np.count_nonzero(paths.interactions == kind, axis=1), most - 1)
+            for kind, most in zip((REFRACTION, REFLECTION), self.path_power.shape[1:], strict=True)
+        )
+        np.add.at(self.path_power, (link, *counts), paths.power)
         self._is_direct[link[paths.is_direct]] = True
 
     def states_and_gains(self) -> tuple[States, Floats]:

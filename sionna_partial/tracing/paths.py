@@ -248,7 +248,7 @@ class Candidates:
         return same and (self.same_wall is None) == (other.same_wall is None)
 
     @property
-    def columns(self) -> dict[str, NDArray[Any]]:
+    def columns(self) -> dict[str, Any]:
         """The arrays that it has, by name, each with a row for every candidate."""
         arrays = {name: value for name, value in vars(self).items() if name != "wedges"}
         return {name: array for name, array in arrays.items() if array is not None}
@@ -256,16 +256,18 @@ class Candidates:
     @classmethod
     def concatenate(cls, parts: list["Candidates"]) -> "Candidates":
         """Join candidates that can be verified together; at least one part."""
-        joined = {name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns}
+        joined: dict[str, Any] = {
+            name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns
+        }
         return replace(parts[0], **joined)
 
     def widened(self, depth: int) -> "Candidates":
         """Return them with room for `depth` interactions."""
         nothing = {"kind": 0, "face": -1, "vertices_m": 0.0, "same_wall": 0}
-        columns = self.columns
-        return replace(
-            self, **{name: widened(columns[name], depth, nothing[name]) for name in columns.keys() & nothing}
-        )
+        wide: dict[str, Any] = {
+            name: widened(array, depth, nothing[name]) for name, array in self.columns.items() if name in nothing
+        }
+        return replace(self, **wide)
 
     def narrowed(self) -> "Candidates":
         """Return them without the last columns, which none of them uses."""

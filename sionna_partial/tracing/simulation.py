@@ -31,7 +31,7 @@ from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
-from sionna_partial.scene.scene import scene_settings_of
+from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
@@ -84,6 +84,8 @@ class Simulation:
     scene_settings : SceneSettings
         As given, likewise.
     resolved : ResolvedSettings
+    material_unknown : bool
+        True where paths go through walls of which neither settings nor map give the material.
 
     Raises
     ------
@@ -113,6 +115,9 @@ class Simulation:
         self.trace_settings = settings_or_default("trace_settings", trace_settings, TraceSettings)
         self.scene_settings = settings_or_default("scene_settings", scene_settings, SceneSettings)
         self.resolved = resolved_settings(self.partial, self.trace_settings, self.scene_settings)
+        self.material_unknown = self.trace_settings.through_walls and material_is_unknown(
+            self.partial, self.scene_settings
+        )
         self._origin_m = np.array([*self.partial.origin_m, 0.0])
 
     def __repr__(self) -> str:
@@ -471,7 +476,7 @@ def resolved_settings(
 ) -> ResolvedSettings:
     """Resolve settings on a map; raise a SettingsError unless all materials cover the frequency."""
     scene_settings = scene_settings_of(partial, scene_settings)
-    for material in partial.environment.known_materials(scene_settings.material):
+    for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
     return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
 

@@ -6,6 +6,9 @@ receiver that lies there, or a little beside, is a candidate if the line to it, 
 
 Where walls let power through, every leg of a candidate is then cast through the mesh, the faces on it are grouped to
 walls, and the power of the path follows. Where no wall may be crossed, Sionna RT finds the faces in its way.
+
+Plans fold lines with `unfold` of `plan/reflections.py`. It works in two dimensions, with walls instead of planes, and
+gives fractions of the length in the plan, from which heights follow: both functions have one line in common.
 """
 
 import itertools
@@ -176,7 +179,7 @@ class MeshReflections:
             sequences = split_rays(links, self._rays, by_distance)
         return Traced(sequences, view_sequences(sequences, links.mesh.planes, links.tx_m, _MARGIN))
 
-    def _written(self, traced: Traced, node: Indices, rx: NDArray[np.int32], rows: Indices) -> Candidates:
+    def _written(self, traced: Traced, node: NDArray[np.int32], rx: NDArray[np.int32], rows: Indices) -> Candidates:
         depth = max(1, self._links.limits.depth)
         kind, face, vertices_m, same_wall = _write(
             node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES

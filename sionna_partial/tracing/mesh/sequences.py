@@ -166,9 +166,8 @@ def collect_sequences(rays: Iterable[Rays], planes: MeshPlanes) -> Sequences:
 
 def _no_sequences() -> Sequences:
     """Return a tree without sequences or room for any."""
-    numbers, directions = (np.empty(0, np.int32) for _ in range(3)), (np.empty((0, 3), np.float32) for _ in range(2))
-    parent, plane, table = numbers
-    return Sequences(parent, plane, *directions, np.empty(0, np.float32), np.empty(0), table, 0, 0)
+    number, box, length = np.empty(0, np.int32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+    return Sequences(number, number, box, box, length, np.empty(0), number, 0, 0)
 
 
 @njit(cache=True)

@@ -5,9 +5,9 @@ the transmitter and a window, the part of the last wall that reflects it, bound 
 the image source S and the window from A to B, a point is S + r ((1 - t)(A - S) + t (B - S)). The window is r = 1, t
 runs over the beam from 0 to 1, and on any line 1 / r is linear in t.
 
-Beams between opaque walls (`trace_beams`) and beams through walls (`follow_beams`) share all of the geometry: clipping,
-windows, reflection, and the receivers below a beam. They remain two searches, as a wall with transmission 0 would make
-the search through walls several times slower:
+Beams between opaque walls (`trace_beams`) and beams through walls (`follow_beams`) share the geometry: clipping,
+windows, reflection, and the bins of receivers in a beam. They remain two searches, which stop at different walls and
+select by different rules; one search would clip and sort walls that an opaque wall hides:
 
 - Opaque walls end a beam. The nearest wall is the upper envelope of segments in (t, 1 / r), and walls are clipped in
   strips from the window outwards until those found fill the view. Every sequence is listed, whatever its power, as

@@ -1,11 +1,16 @@
-"""Maps that are uploaded: files with names that are not trusted -> a PartialMap."""
+"""Files of a window: uploaded maps, whose names are not trusted, and downloads of an answer."""
 
+import io
 import re
 import tempfile
+import zipfile
 from collections.abc import Sequence
 from pathlib import Path, PurePath
 
+import xarray as xr
+
 from sionna_partial.app.jobs import logged_warnings
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import shown
 from sionna_partial.constants import (
     BAG_SUFFIXES,
@@ -16,10 +21,12 @@ from sionna_partial.constants import (
     VACUUM_SUFFIXES,
 )
 from sionna_partial.errors import MapError
+from sionna_partial.export import save_coverage, save_network
 from sionna_partial.files import unzipped
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
+from sionna_partial.plots.coverage_plot import report_pdf
 
 MOST_BYTES = 200_000_000
 """Size of the files that are uploaded together [bytes]."""
@@ -34,6 +41,17 @@ MAP_SUFFIXES = (
 
 UPLOADED_SUFFIXES = (*MAP_SUFFIXES, *_IMAGES, ".zip")
 """Files that can be uploaded for a map."""
+
+
+FILES = {
+    "png": "coverage.png",
+    "html": "coverage.html",
+    "nc": "coverage.nc",
+    "tif": "coverage.tif",
+    "yaml": "radio_map.zip",
+    "pdf": "report.pdf",
+}
+"""Kinds of files that can be downloaded, and their names."""
 
 
 def uploaded_map(files: Sequence[tuple[str, bytes]]) -> PartialMap:
@@ -82,3 +100,27 @@ def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
         return [*unzipped(content, MOST_BYTES).items()]
     except ValueError as error:
         raise MapError(f"the zip cannot be read ({error}): give a zip of a ROS map's YAML and image.") from error
+
+
+def coverage_file(
+    kind: str, coverage: xr.Dataset, network: xr.Dataset | None, eirp_dbm: Floats, threshold_dbm: float
+) -> bytes:
+    """Return a file of one of `FILES` of a coverage; a ROS map is a zip, of several transmitters of their network."""
+    if kind == "pdf":
+        return report_pdf(coverage, eirp_dbm, threshold_dbm)
+    with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
+        path = Path(folder) / f"coverage.{kind}"
+        if kind == "yaml" and network is not None:
+            save_network(network, path)
+        else:
+            save_coverage(coverage.isel(tx=0) if kind == "yaml" else coverage, path)
+        return path.read_bytes() if kind != "yaml" else _zipped(sorted(Path(folder).iterdir()))
+
+
+def _zipped(paths: Sequence[Path]) -> bytes:
+    """Return files as a zip; equal files give equal bytes."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        for path in paths:
+            archive.writestr(zipfile.ZipInfo(path.name), path.read_bytes())
+    return stream.getvalue()

@@ -1,0 +1,79 @@
+"""Evidence of measured powers for candidates of the material of walls, and for the size of residuals.
+
+Residuals of a trace are a Gaussian process of standard deviation s, white noise n, an offset and a factor on the loss
+of walls that all links have in common. Candidates differ in their residuals alone, so that one eigenvalue
+decomposition of the correlation serves all candidates and all s and n.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from sionna_partial.arrays import Floats
+
+STDS_DB, LIKELY_STD_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 5.0, 0.4
+"""Standard deviations of the process that are tried [dB], the most probable one before any measurement, and the
+standard deviation of its logarithm."""
+
+FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
+"""Standard deviations of what differs from receiver to receiver that are tried [dB]."""
+
+LIKELY_FADING_DB, FADING_SPREAD = 3.0, 0.5
+"""The most probable one before any measurement, and the standard deviation of its logarithm [dB]."""
+
+OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
+"""Exponents of the evidence of a transmitter, and of other transmitters of the building: errors of a trace are
+correlated over more than the process has."""
+
+
+class Residuals(NamedTuple):
+    """Residuals of P averages of `size` (P,) measurements under K candidates.
+
+    `correlation` (P, P); residuals (K, P) less the expected common part, predictions above free space (K, P), and
+    standard deviations of the predictions without the process (K, P) [dB]; prior covariance (K, 2, 2) of offset [dB]
+    and factor.
+    """
+
+    correlation: Floats
+    size: Floats
+    residual_db: Floats
+    below_db: Floats
+    std_db: Floats
+    covariance: Floats
+
+    def log_evidence(self, noises_db: Floats) -> Floats:
+        """Return the log-likelihood (K, S, N) for `STDS_DB` and standard deviations of noise [dB], but for a constant.
+
+        Noise is taken to be as large, relative to the process, at all P.
+        """
+        root = np.sqrt(self.size)
+        values, vectors = np.linalg.eigh(self.correlation * root[:, None] * root)
+        values = np.maximum(values, 1e-6)
+        found = np.empty((len(self.residual_db), len(STDS_DB), len(noises_db)))
+        for k, covariance in enumerate(self.covariance):
+            for s, process_db in enumerate(STDS_DB):
+                scale_db = np.hypot(self.std_db[k], process_db)
+                rows = np.stack([self.residual_db[k], np.ones(len(root)), self.below_db[k]]) * (root / scale_db)
+                rows = rows @ vectors
+                spectrum = values + (noises_db**2 * (scale_db**-2.0).sum() / max(len(root), 1))[:, None]
+                gram = np.einsum("np,ap,bp->nab", 1.0 / spectrum, rows, rows, optimize=True)
+                common = np.linalg.inv(covariance) + gram[:, 1:, 1:]
+                shift = gram[:, 1:, 0]
+                square = gram[:, 0, 0] - np.einsum("na,nab,nb->n", shift, np.linalg.inv(common), shift)
+                volume = np.log(spectrum).sum(axis=1) + np.linalg.slogdet(covariance @ common)[1]
+                found[k, s] = -0.5 * (square + volume) - np.log(scale_db).sum()
+        return found
+
+
+def log_std_prior() -> Floats:
+    """Return the log-probability (S, N) of `STDS_DB` and `FADINGS_DB`, but for a constant."""
+    apart = np.log(np.array(STDS_DB) / LIKELY_STD_DB) / STD_SPREAD
+    fading_apart = np.log(FADINGS_DB / LIKELY_FADING_DB) / FADING_SPREAD
+    log_prior: Floats = -0.5 * apart[:, None] ** 2 - 0.5 * fading_apart**2
+    return log_prior
+
+
+def mean_square(values: Floats, weights: Floats) -> float:
+    """Return the root of the weighted mean square."""
+    return math.sqrt(float(weights @ values**2 / weights.sum()))

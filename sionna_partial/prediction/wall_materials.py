@@ -1,0 +1,94 @@
+"""The unknown material of walls: candidates for the loss of a crossed wall and of a reflection, and their prior.
+
+Paths do not depend on the material of the walls, only their powers do. A trace with drywall therefore gives the gains
+under every candidate: each candidate adds a loss to every wall that a path crosses, and to every reflection. The trace
+has the usual tolerance of power: in an office at 2.4 GHz the best candidate is 0.9 and 2.1 dB off separate traces with
+brick and concrete (root mean square), and 0.9 and 2.0 dB with a tenth of the tolerance and 1.5 times the time.
+
+The prior of the loss of a wall is a mixture of log-normal distributions around the mean losses of common materials at
+the frequency (`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Losses that were measured on walls of one
+name scatter by a factor of 1.7 around them. A measured floor says which candidates hold (`Assimilation`).
+"""
+
+import math
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from sionna_partial.arrays import Floats
+from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.settings import DRYWALL, WALL_MATERIALS
+from sionna_partial.tracing.power import wall_loss_db
+
+COMMON = {"drywall": 0.4, "brick": 0.35, "concrete": 0.25}
+"""Materials of walls and the prior probability of each."""
+
+MODELS_HZ = (1e9, 40e9)
+"""Frequencies that the models of all of them cover [Hz]."""
+
+SCATTER = math.log(1.7)
+"""Standard deviation of the logarithm of the loss of walls of one material."""
+
+CROSSINGS, LARGEST_DB, REFLECTIONS_DB = 8, (21.0, 40.0), (0.0, 3.0)
+"""Number of losses of a wall that are compared, limits of the largest one, and extra losses of a reflection [dB]."""
+
+BELOW = 1.3
+"""Ratio of the smallest mean loss of the common materials to the smallest loss that is compared."""
+
+RESIDUAL_DB = 6.0
+"""Standard deviation of measured powers about a trace with the best material and offset: what maps lack [dB]."""
+
+
+@dataclass(frozen=True, eq=False)
+class WallMaterials:
+    """Candidates for the material of the walls.
+
+    Parameters
+    ----------
+    crossing_db, reflection_db : (K,) float64 arrays
+        Loss of a crossed wall, and of a reflection, beyond drywall [dB].
+    prior : (K,) float64 array
+        Probability of each candidate.
+    names : tuple of K str
+        The `COMMON` material whose loss is nearest on a logarithmic scale.
+    traced_db : float
+        Loss of a crossed wall of drywall [dB].
+    """
+
+    crossing_db: Floats
+    reflection_db: Floats
+    prior: Floats
+    names: tuple[str, ...]
+    traced_db: float
+
+    @classmethod
+    @lru_cache(maxsize=16)
+    def at(cls, frequency_hz: float) -> "WallMaterials":
+        """Return the candidates at a frequency [Hz]."""
+        covered_hz = min(max(frequency_hz, MODELS_HZ[0]), MODELS_HZ[1])
+        mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], covered_hz) for name in COMMON])
+        losses_db = np.geomspace(mean_db.min() / BELOW, np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
+        apart = np.log(losses_db[:, None] / mean_db)
+        density = np.exp(-0.5 * (apart / SCATTER) ** 2)
+        joint = np.tile(density / density.sum(axis=0) * [*COMMON.values()], (len(REFLECTIONS_DB), 1))
+        prior = joint.sum(axis=1) / len(REFLECTIONS_DB)
+        traced_db = wall_loss_db(DRYWALL, frequency_hz)
+        crossing_db, reflection_db = np.meshgrid(losses_db - traced_db, REFLECTIONS_DB)
+        names = tuple([*COMMON][at] for at in np.tile(np.abs(apart).argmin(axis=1), len(REFLECTIONS_DB)))
+        return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
+
+    def under(self, phi: LinkFeatures) -> list[LinkFeatures]:
+        """Return the features of links under each candidate."""
+        pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
+        return [phi.with_extra_losses(*pair) for pair in pairs]
+
+    def attributes(self, weights: Floats) -> dict[str, str | float]:
+        """Return the attributes of a coverage map: the materials as a text, and the mean loss of a wall [dB]."""
+        return {"wall_material": self.text(weights), "wall_loss_db": float(weights @ self.crossing_db) + self.traced_db}
+
+    def text(self, weights: Floats) -> str:
+        """Return the probabilities (K,) of the candidates by material, the most probable first."""
+        sums = {name: float(weights @ [name == near for near in self.names]) for name in COMMON}
+        shown = sorted(((round(p, 2), name) for name, p in sums.items()), reverse=True)
+        return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)

@@ -1,0 +1,180 @@
+"""Walls of an unknown material: candidates on one trace, their prior, and what measured powers say of them."""
+
+import numpy as np
+import pytest
+
+import sionna_partial as sp
+from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.prediction.features import features_of_paths
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.wall_materials import COMMON, RESIDUAL_DB, WallMaterials
+from sionna_partial.tracing.links import path_gain_db
+
+WIFI = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False)
+EVERY_PATH = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False, power_tolerance_db=0.0)
+TX = (1.0, 1.0, 1.5)
+OFFSET_DB = -35.0
+
+
+def flat() -> sp.PartialMap:
+    """Return four rooms in a row, complete, with a door in none of their walls."""
+    cells = np.zeros((34, 98), dtype=np.uint8)
+    cells[[0, 1, -2, -1]] = cells[:, [0, 1, 24, 25, 48, 49, 72, 73, -2, -1]] = sp.CellState.WALL
+    return sp.PartialMap(cells, resolution_m=0.1)
+
+
+FLAT = flat()
+RNG = np.random.default_rng(5)
+RX = np.column_stack([RNG.uniform(2.7, 9.4, 120), RNG.uniform(0.4, 3.0, 120), np.full(120, 1.4)])
+RX = RX[FLAT.radios_can_stand(RX)]
+
+
+def model_of(material: str | None, settings: sp.TraceSettings = WIFI, partial: sp.PartialMap = FLAT) -> sp.LinkModel:
+    return sp.LinkModel(partial, None, settings, sp.SceneSettings(material=material))
+
+
+def powers(material: str, rx=RX, tx=TX) -> sp.Measurements:
+    """Return powers that a radio measures, with an unknown offset and errors of 2 dB."""
+    noise_db = 2.0 * np.random.default_rng(3).standard_normal(len(rx))
+    return sp.Measurements(tx, rx, model_of(material).predict(tx, rx).gain_mean_db + OFFSET_DB + noise_db)
+
+
+class TestCandidates:
+    @pytest.mark.parametrize("extra_db", [(0.0, 0.0), (7.0, 0.0), (0.0, 3.0), (12.0, 3.0)])
+    def test_one_trace_has_the_gains_of_any_extra_loss(self, extra_db):
+        simulation = sp.Simulation(FLAT, EVERY_PATH)
+        paths = list(simulation.blocks(np.array(TX), RX, lambda *_: None))
+        phi = features_of_paths(FLAT, np.array(TX), RX, paths, simulation.resolved, None, material_unknown=True)
+        power = np.zeros(len(RX))
+        for block in paths:
+            walls, reflections = ((block.interactions == kind).sum(axis=1) for kind in (4, 1))
+            np.add.at(
+                power, block.path_rx, block.power * 10.0 ** (-(extra_db[0] * walls + extra_db[1] * reflections) / 10.0)
+            )
+        assert np.allclose(phi.with_extra_losses(*extra_db).gain_db, path_gain_db(power))
+        assert np.array_equal(phi.with_extra_losses(0.0, 0.0).link_state, phi.link_state)
+
+    @pytest.mark.parametrize("material", COMMON)
+    def test_a_candidate_is_near_the_trace_with_each_material(self, material):
+        candidates, _ = model_of(None).predict(TX, RX).by_material
+        named = model_of(material).predict(TX, RX).gain_mean_db
+        off_db = [np.sqrt(np.mean((each.gain_mean_db - named) ** 2)) for each in candidates]
+        assert min(off_db) < 2.5
+        assert candidates[int(np.argmin(off_db))].gain_mean_db.mean() == pytest.approx(named.mean(), abs=2.0)
+
+    @pytest.mark.parametrize("frequency_hz", [0.9e9, 2.4e9, 5.8e9, 28e9, 60e9])
+    def test_prior(self, frequency_hz):
+        found = WallMaterials.at(frequency_hz)
+        assert found.prior.sum() == pytest.approx(1.0)
+        assert len(found.prior) == len(found.crossing_db) == len(found.names) == 16
+        assert {*found.names} <= {*COMMON}
+        assert found.crossing_db.min() + found.traced_db > 0.0
+
+    def test_text(self):
+        found = WallMaterials.at(2.4e9)
+        assert found.text(np.eye(16)[0]) == "drywall 1.00"
+        assert found.text(0.6 * np.eye(16)[0] + 0.4 * np.eye(16)[7]) == "drywall .60, concrete .40"
+
+
+class TestPrediction:
+    def test_it_is_the_mixture_over_the_prior_with_residuals(self):
+        found = model_of(None).predict(TX, RX)
+        parts, weights = found.by_material
+        mean_db = sum(weight * part.gain_mean_db for part, weight in zip(parts, weights, strict=True))
+        square = sum(weight * part.gain_mean_db**2 for part, weight in zip(parts, weights, strict=True))
+        assert np.allclose(found.gain_mean_db, mean_db)
+        assert np.allclose(found.gain_std_db**2, square - mean_db**2 + RESIDUAL_DB**2)
+
+    def test_selected_links_keep_their_candidates(self):
+        found = model_of(None).predict([TX, (1.2, 2.0, 1.5)], RX)
+        assert found.by_material[0][3].gain_mean_db.shape == found.gain_mean_db.shape == (2, len(RX))
+        some = model_of(None).predict(TX, RX).take(np.arange(4))
+        assert len(some.by_material[0]) == 16
+        assert some.amplified(3.0).by_material[0][2].gain_mean_db == pytest.approx(
+            some.by_material[0][2].gain_mean_db + 3.0
+        )
+        joined = LinkPrediction.concatenate([some, some])
+        assert joined.by_material[0][1].gain_mean_db.shape == (8,)
+
+    def test_a_named_material_is_certain(self):
+        found = model_of("brick").predict(TX, RX)
+        assert np.all(found.gain_std_db == 0.0)
+        assert len(found.by_material[0]) == 1
+
+    @pytest.mark.parametrize(
+        ("partial", "settings"),
+        [
+            (FLAT, sp.TraceSettings(28e9)),
+            (FLAT, sp.TraceSettings(2.4e9, refraction=False)),
+            (sp.PartialMap(FLAT.state, 0.1, material=sp.Material.named("brick")), WIFI),
+            (FLAT.with_wall_material("brick", FLAT.state == sp.CellState.WALL), WIFI),
+        ],
+    )
+    def test_known_materials(self, partial, settings):
+        assert not sp.Simulation(partial, settings).material_unknown
+
+    def test_28_ghz_through_walls(self):
+        simulation = sp.Simulation(FLAT, sp.TraceSettings(28e9, refraction=True))
+        assert simulation.material_unknown
+        assert simulation.resolved.scene_settings.material == sp.Material.named("drywall")
+
+    def test_unseen_walls_have_the_loss_of_each_candidate(self):
+        state = FLAT.state.copy()
+        state[:, 60:] = sp.CellState.UNKNOWN
+        far = RX[RX[:, 0] > 6.2]
+        parts, _ = model_of(None, partial=sp.PartialMap(state, 0.1)).predict(TX, far).by_material
+        means_db = [part.gain_mean_db.mean() for part in parts[:8]]
+        assert np.all(np.diff(means_db) < 0.0)
+        assert min(part.gain_mean_db.min() for part in parts) >= GAIN_FLOOR_DB
+
+
+class TestMeasurements:
+    @pytest.mark.parametrize(("material", "least"), [("drywall", 0.5), ("brick", 0.5), ("concrete", 0.8)])
+    def test_powers_find_the_material(self, material, least):
+        model, measured = model_of(None), powers(material)
+        fitted = self.fit(model, measured)
+        names = np.array(model.wall_materials.names)
+        found = {name: fitted.material_weights[names == name].sum() for name in COMMON}
+        assert max(found, key=found.get) == material, found
+        assert found[material] > least
+        assert fitted.offset_db == pytest.approx(OFFSET_DB, abs=6.0)
+
+    def test_few_powers_predict_the_others(self):
+        model, measured = model_of(None), powers("concrete")
+        given, rest = np.arange(8), np.arange(8, len(RX))
+        fitted = self.fit(model, measured.take(given))
+        after = fitted.update(RX[rest], model.predict(TX, RX[rest]))
+        off_db = after.gain_mean_db + fitted.offset_db - measured.gain_db[rest]
+        assert np.mean(np.abs(off_db) < 1.645 * after.gain_std_db) > 0.8
+        drywall = model_of("drywall")
+        simple = self.fit(drywall, measured.take(given))
+        simple_db = simple.update(RX[rest], drywall.predict(TX, RX[rest])).gain_mean_db + simple.offset_db
+        assert np.mean(off_db**2) < np.mean((simple_db - measured.gain_db[rest]) ** 2)
+
+    def test_others_are_enough(self):
+        model, tx = model_of(None), (8.8, 2.5, 1.5)
+        rx = RX[RX[:, 0] < 7.0]
+        other = self.fit(model, powers("concrete", rx, tx), tx)
+        nothing = sp.Measurements(TX, np.zeros((0, 3)), np.zeros(0))
+        fitted = self.fit(model, nothing, others=[other])
+        concrete = np.array(model.wall_materials.names) == "concrete"
+        assert fitted.material_weights[concrete].sum() > model.wall_materials.prior[concrete].sum() + 0.15
+        assert fitted.offset_db == pytest.approx(OFFSET_DB, abs=10.0)
+
+    def test_maps_say_what_the_walls_are(self):
+        model, options = model_of(None), {"spacing_m": 1.0, "progress": False}
+        before = sp.predict_map(model, TX, **options)
+        after = sp.predict_map(model, TX, measurements=powers("concrete"), **options)
+        both = sp.predict_map(model, {"a": TX, "b": (8.8, 2.5, 1.5)}, measurements=powers("concrete"), **options)
+        assert after.attrs["wall_material"].startswith("concrete")
+        assert both.attrs["wall_material"].startswith("concrete")
+        assert after.attrs["wall_loss_db"] > before.attrs["wall_loss_db"] > 3.0
+        assert after.gain_std_db.mean() < before.gain_std_db.mean()
+        assert "wall_material" not in sp.predict_map(model_of("brick"), TX, **options).attrs
+
+    @staticmethod
+    def fit(model, measured, tx=TX, others=()):
+        prior = model.predict(tx, measured.rx)
+        options = {"frequency_hz": 2.4e9, "through_walls": True, "others": others}
+        return Assimilation.fit(FLAT, tx, measured, prior, **options)
