@@ -34,6 +34,9 @@ _TURNS = (0, 2, -1, 1)
 
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
+_ROUGH, _DEEP = 0.05, 0.3
+"""Levelled cells, and wall cells behind faces, per cell of a face, from which on `CleanWalls.roughness` is 1."""
+
 _RAGGED = 0.006, 0.012
 """Fractions of ragged edges from which on depth is a sign of noise, in part and in full.
 
@@ -68,12 +71,14 @@ class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) that bear outlines.
 
     `peeled` (ny, nx) face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
-    `noise` is 0 where walls are exact, to 1 where range noise made them thick and rough.
+    `noise` is 0 where walls are exact, to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts
+    ragged cells of thick walls: outlines follow faces as closely as it allows.
     """
 
     cells: Bools
     peeled: Bools
     noise: float
+    roughness: float
 
 
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
@@ -91,7 +96,7 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     longest = int(bridge_gap_m / resolution_m + 1e-6)
     filled = _unknown_gaps(wall, free, longest)
     noise = _noise(wall | filled, free, resolution_m)
-    wall, free = _levelled(wall | filled, free)
+    wall, free, roughness = _levelled(wall | filled, free)
     more = _unknown_gaps(wall, free, longest)
     wall, filled = wall | more, filled | more
     wall |= _short_gaps(wall, free, resolution_m, bridge_gap_m)
@@ -101,7 +106,7 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
     unseen[label[seen]] = False
     thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
-    return CleanWalls(thinned, peeled, noise)
+    return CleanWalls(thinned, peeled, noise, roughness)
 
 
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
@@ -155,13 +160,17 @@ def ragged_edges(wall: Bools) -> float:
     return ragged / max(1, edges)
 
 
-def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
-    """Return the walls and the FREE cells with level faces."""
+def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
+    """Return the walls and the FREE cells with level faces, and the roughness of `CleanWalls`."""
+    facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
+    was_free = free
     for level in (_without_bumps, _without_notches) * 2:
         for turns in _TURNS:
             turned = level(np.rot90(wall, turns), np.rot90(free, turns))
             wall, free = (np.rot90(mask, -turns) for mask in turned)
-    return wall, free
+    levelled = int((free != was_free).sum())
+    return wall, free, min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
 
 
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:

@@ -107,7 +107,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     walls = wall_cells(state, partial.resolution_m, bridge_gap_m)
     graph = _wall_graph(walls.cells, cut_spurs=True)
     shift = _layer_shift(graph.points, walls.peeled)
-    chains = [_fitted(graph, shift, points, (1.0 + walls.noise) * tolerance_cells) for points in _chains(graph)]
+    chains = [_fitted(graph, shift, points, (1.0 + walls.roughness) * tolerance_cells) for points in _chains(graph)]
     while True:
         lines, runs = _polylines(graph, chains)
         if not _make_crossing_plain(lines, runs, chains):
