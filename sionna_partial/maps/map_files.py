@@ -51,7 +51,7 @@ ACCEPTED = (
     f"a building model ({', '.join(IFC_SUFFIXES)}), the map of a vacuum robot ({', '.join(VACUUM_SUFFIXES)}), "
     f"a floor plan as a picture ({', '.join(PICTURE_SUFFIXES)}), or a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
-"""What load_map reads."""
+"""Kinds of files that load_map reads."""
 
 _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
 """Size of the largest array of a mesh [bytes]."""
@@ -109,27 +109,27 @@ def load_map(
         World z between which a surface of a mesh, or a point of a cloud, is a wall [m]. By default `DEFAULT_BAND_M`
         above the lowest point, of a cloud above its lowest floor.
     observed : (M, 2) array-like, PartialMap or None
-        What has been observed of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it
-        is. By default all cells above or below which the mesh has a surface.
+        Observed part of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it is.
+        By default all cells above or below which the mesh has a surface.
     resolution_m : float or None
         Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
-        multiples of it. Of a picture, the metres per pixel: a known length [m] over its number of pixels.
+        multiples of it. For a picture, the metres per pixel: a known length [m] over its number of pixels.
     up : {"z", "y"} or None
         Axis of a mesh or cloud that points up. By default y of glTF (.glb, .gltf), as its specification says, and z of
         other files, with a `MapWarning` if that looks wrong.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
-        Of a building model, by types such as "IfcWall", in place of those that its materials name. Doors that are given
+        For a building model, by types such as "IfcWall", in place of the materials that it names. Doors that are given
         one ("IfcDoor") are closed.
     wall_layers : sequence of str or None
         Layers of a drawing with the walls, `*` and `?` as in file names (see `map_from_drawing`).
     unit_m : float or None
-        Length of a unit of a drawing, mesh or cloud [m], 0.001 for millimetres, 0.3048 for feet. By default that of
-        the header of a drawing, and 1 for meshes and clouds.
+        Length of a unit of a drawing, mesh or cloud [m], 0.001 for millimetres, 0.3048 for feet. By default the unit
+        in the header of a drawing, and 1 for meshes and clouds.
     storey : str or None
         Name of a storey of a building model; it may be left out where one alone has walls.
     obstacle_height_m : float or None
-        Height of what stands free on a floor plan [m], such as furniture on the map of a robot (see
+        Height of free-standing obstacles on a floor plan [m], such as furniture on the map of a robot (see
         `PartialMap.with_obstacle_height`). By default walls reach the ceiling, but for obstacles that the file has.
 
     Returns

@@ -62,12 +62,10 @@ transmitter is unknown: with the first, 90 % regions contain 69 % of transmitter
 
 
 class Kind(NamedTuple):
-    """What measurements may be."""
+    """Kind of measurements, path gains or powers, and its priors."""
 
     mean: tuple[float, float]
-    """Expected offset that all have in common [dB], and factor on what is predicted below the gain in free space [1].
-
-    Together they are what measurements have in common."""
+    """Expected common offset of all measurements [dB], and common factor on the loss over free space [1]."""
 
     covariance: Floats
     """Prior covariance (2, 2) of the two."""
@@ -76,17 +74,17 @@ class Kind(NamedTuple):
     """Walk over which residuals stay correlated where both ends of a link are in cells that were seen [m]."""
 
     trace_std_db: float
-    """Standard deviation of a trace through observed space alone, from what was measured there [dB]."""
+    """Standard deviation of the measured gain from a trace through observed space alone [dB]."""
 
     deepest: float
-    """Where it is decided what was measured, residuals below minus this count as this: walls that were not seen make
-    single links deeper without bound [1]."""
+    """Residuals below minus this count as this when kinds are compared, because unseen walls make single links deeper
+    without bound [1]."""
 
     exact: bool
-    """Whether what is certain without measurements stays so, as no trace is for a real radio."""
+    """True if predictions that are certain without measurements stay certain; for a real radio no trace is."""
 
     def learnt(self, others: Sequence[tuple[Floats, Floats]]) -> Kind:
-        """Return what is expected of a transmitter given others of the same building, whose means scatter.
+        """Return the prior of a transmitter given others of the same building, whose means scatter.
 
         `others` are the precisions (2, 2), and their products with the means, without a prior.
         """
@@ -155,7 +153,7 @@ class Walks:
 
     @cached_property
     def _cost(self) -> Floats:
-        """What it costs to cross a cell of walks, which is several cells of the map wide; 0 in walls."""
+        """Cost of crossing a cell of walks, which is several cells of the map wide; 0 in walls."""
         blocks, _ = self._blocks
         unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
         return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
@@ -234,7 +232,7 @@ class _Sample(NamedTuple):
         return np.bincount(self.group, weights=values) / self.size
 
     def noises_db(self) -> dict[float, Floats]:
-        """Return standard deviations (P,) of averages by that of a measurement [dB]: those to try, or the given."""
+        """Return standard deviations (P,) of averages by the noise of a measurement [dB], given or tried."""
         std_db = self.measured.std_db
         if std_db is None:
             return {noise_db: noise_db / np.sqrt(self.size) for noise_db in NOISES_DB}
@@ -242,7 +240,7 @@ class _Sample(NamedTuple):
 
 
 class _Hypothesis(NamedTuple):
-    """What the measurements may be, and the process that follows: residuals, covariance and noise, without unit."""
+    """A kind and a noise of the measurements, and their process: residuals, covariance and noise, without unit."""
 
     log_p: float
     kind: Kind
@@ -266,10 +264,10 @@ class _Hypothesis(NamedTuple):
         return float(-0.5 * z @ cho_solve(factor, z) - np.log(np.diag(factor[0])).sum())
 
     def in_common(self, received: Bools) -> tuple[Floats, Floats]:
-        """Precision (2, 2) of what the measurements have in common, and its product with the mean, without a prior.
+        """Return the precision (2, 2) of offset and factor, and its product with their mean, without a prior.
 
         Residuals that are correlated count once: least squares with their covariance would have a factor on shadows
-        from differences between neighbours alone, and those of a trace are wrong.
+        from differences between neighbours alone, which a trace has wrong.
         """
         design, residual = self.design[:, received], self.residual[received]
         redundancy = self.correlation[np.ix_(received, received)].sum() / max(1, received.sum())
@@ -425,12 +423,12 @@ def _fitting(log_evidence: Floats, candidates: int) -> Floats:
 class Assimilation(Shown):
     """Posterior of the links to other receivers, given measurements of one transmitter: see `fit`.
 
-    The residual of a link is what its gain is above the predicted mean, in predicted standard deviations. Residuals are
-    a Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
+    The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
+    Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
     the sensitivity is known to be at most that (expectation propagation; Rasmussen and Williams, Gaussian Processes for
     Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
-    common are those that make the measurements likeliest. Where that offset is large, so that a real radio is behind
-    them, what is predicted below the gain in free space is scaled, too.
+    common maximise the likelihood of the measurements. Where that offset is large, so that a real radio is behind them,
+    the predicted loss over free space is scaled, too.
 
     Through walls of an unknown material there is a process for each candidate. Their evidence, with the evidence of
     other transmitters, gives the probabilities of the candidates, and the deviations of process and fading.
@@ -455,10 +453,10 @@ class Assimilation(Shown):
     """Standard deviation of the measurements [dB]: of those that were given, and of fading."""
 
     offset_db: float
-    """What the measurements have in common above the predicted gains [dB]."""
+    """Common offset of the measurements above the predicted gains [dB]."""
 
     shadow_scale: float
-    """What gains below free space are multiplied by."""
+    """Factor on the predicted loss over free space."""
 
     material_weights: Floats
     """Probability (K,) of each candidate for the material of walls, one where it is known."""
@@ -497,7 +495,7 @@ class Assimilation(Shown):
         measured : Measurements
             M links of this transmitter, at least one.
         prior : LinkPrediction
-            Of these links, without the measurements.
+            Prediction of these links without the measurements.
         antenna_db : float or (M,) array-like
             Gain of the transmitter's antenna in these links, which `measured` has and `prior` lacks [dB]. `update`
             takes and returns predictions without it.
@@ -505,11 +503,10 @@ class Assimilation(Shown):
         p_powers : float, optional
             Prior probability that powers were measured, with an unknown offset, and no path gains.
         through_walls : bool
-            Whether the prior comes from a trace through walls. Measurements are then taken for those of a real radio:
-            the loss of walls is inferred with them, and no trace is certain.
+            True if the prior comes from a trace through walls. The measurements are then ascribed to a real radio: the
+            loss of walls is inferred with them, and no trace is certain.
         others : sequence of Assimilation
-            What was fitted to other transmitters of the building through walls, from which their losses and offsets are
-            known in part.
+            Fits to other transmitters of the building through walls, from which losses and offsets are known in part.
 
         Returns
         -------
@@ -576,17 +573,17 @@ class Assimilation(Shown):
         return cls(noise_db, offset_db, factor, of_material, links, fits, in_common, evidence)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
-        """Return what is predicted of the links to receivers given the measurements, from what was before.
+        """Return the prediction of links to receivers given the measurements.
 
-        What the process predicts of a residual counts as a measurement of the gain with a noise of its own: it weighs
-        the link states, and the distribution of the gain given each, by Bayes' rule.
+        A residual that the process predicts counts as a measurement of the gain with a noise of its own: it weighs the
+        link states, and the distribution of the gain given each, by Bayes' rule.
 
         Parameters
         ----------
         rx_m : (N, 3) array-like
             Receivers [m].
         prior : LinkPrediction
-            Of the links to them, without the measurements.
+            Prediction of these links without the measurements.
 
         Returns
         -------
@@ -632,7 +629,7 @@ class Assimilation(Shown):
         return prior.where(informed, updated) if kind.exact else updated
 
     def _shadowed(self, rx_m: Floats, prior: LinkPrediction, factor: float) -> LinkPrediction:
-        """Scale what is predicted of gains below free space."""
+        """Scale the predicted loss over free space."""
         if factor == 1.0:
             return prior
         free_db = self._links.free_space_db(rx_m)

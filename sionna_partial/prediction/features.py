@@ -1,4 +1,4 @@
-"""Features of links: TracedLinks + PartialMap -> LinkFeatures, with what the map shows of them as LinkContext."""
+"""Features of links: TracedLinks + PartialMap -> LinkFeatures, with the walls and space along them as LinkContext."""
 
 import itertools
 import math
@@ -66,17 +66,17 @@ class LinkContext(Shown):
     tx_m, rx_m : (N, 3) float64 arrays
         Positions of transmitter and receiver [m].
     tx_seen, rx_seen : (N,) bool arrays
-        Whether they are in observed cells.
+        True where they are in observed cells.
     complete : (N,) bool array
-        Whether the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
+        True if the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
     nearly_complete : (N,) bool array
-        Whether the map is nearly complete, and both ends are in observed cells: then the trace is close to the truth.
+        True if the map is nearly complete, and both ends are in observed cells: then the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
     wall_noise : (N,) float64 array
         Degree to which range noise thickened and roughened the walls of the map, 0 (exact) to 1.
     possible : (N, 3) bool array
-        Whether the map leaves each LinkState possible; at least one is.
+        True for each LinkState that the map leaves possible, at least one.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
         Gain of all traced paths but the direct one, each attenuated by the unobserved space that it crosses [dB], at
         least -150: of all of them first, of those wholly in observed space last.
@@ -127,7 +127,7 @@ class LinkContext(Shown):
         unobserved_distance_m: Floats,
         **traced: Any,
     ) -> "LinkContext":
-        """Compute what the maps show of links, without windows.
+        """Compute the context of links on their maps, without windows.
 
         `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`: those
         from `tx_m` on which are not found here.
@@ -372,8 +372,8 @@ class LinkFeatures(Shown):
     gain_db : (N,) or (T, N) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
     context : LinkContext, optional
-        What the map shows along and around the links, as arrays, from `link_features`; one link after the other. The
-        paper's predictor does not use it.
+        Walls and space along and around the links, from `link_features`; one link after the other. The paper's
+        predictor does not use it.
     frequency_hz : float, optional
         Carrier frequency of the trace [Hz], from `link_features`. None is the frequency of the predictor.
     path_power : (N, C + 1, R + 1) float64 array, optional
@@ -503,7 +503,7 @@ def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
 
 
 def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return numbers of links as an array of a shape; a PredictorError for another shape, or what is not finite."""
+    """Return finite numbers of links as an array of a shape; a PredictorError for any other values or shape."""
     count = " x ".join(map(str, shape))
     try:
         numbers = np.asarray(values, dtype=np.float64)
@@ -516,7 +516,7 @@ def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
 
 
 def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> States:
-    """Return link states as a uint8 array of a shape; a PredictorError for another shape, or what is none."""
+    """Return link states as a uint8 array of a shape; a PredictorError for another shape or another value."""
     states = link_numbers(name, values, shape)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
     require_each(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
@@ -533,12 +533,12 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     links : TracedLinks
         From one or T transmitters to N receivers.
     windows : bool
-        Whether to draw the map around the transmitters, which only the predictor "map" needs (20 ms each).
+        Draw the map around the transmitters, which only the predictor "map" needs (20 ms each).
 
     Returns
     -------
     LinkFeatures
-        Of shape (N,) or (T, N), as `links`.
+        Features of shape (N,) or (T, N), as `links`.
 
     Raises
     ------

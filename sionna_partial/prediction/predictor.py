@@ -372,7 +372,7 @@ class Predictor(Shown):
     archive : bytes
         The model as a `.keras` file.
     settings : PredictorSettings
-        Of the training.
+        Settings of the training.
     homes : tuple of str
         Names of the homes that it was trained on.
     links : mapping of str to int
@@ -380,7 +380,7 @@ class Predictor(Shown):
     metrics : mapping
         Metrics on homes that it was not trained on.
     versions : mapping of str to str
-        Of the packages that trained it.
+        Versions of the packages that trained it.
     name : str
         "fitted", a shipped name, or the file's path.
 
@@ -431,13 +431,13 @@ class Predictor(Shown):
         Parameters
         ----------
         features : LinkFeatures
-            Of N links on partial maps.
+            Features of N links on partial maps.
         link_state : (N,) array-like of LinkState
             Link state on the complete map.
         gain_db : (N,) array-like
             Omnidirectional path gain on the complete map [dB].
         homes : sequence of str
-            Where the links come from, to be recorded.
+            Names of the homes of the links, to be recorded.
         settings : PredictorSettings, optional
             The paper's networks by default.
         progress : bool or callable, optional
@@ -492,9 +492,9 @@ class Predictor(Shown):
         Parameters
         ----------
         features : LinkFeatures
-            Of N links whose receivers are drawn uniformly over the part of the map area for which it is wanted.
+            Features of N links whose receivers are drawn uniformly over the wanted part of the map area.
         inside : (N,) array-like of bool
-            Whether the receiver is indoors.
+            True where the receiver is indoors.
 
         Returns
         -------
@@ -518,12 +518,12 @@ class Predictor(Shown):
         Parameters
         ----------
         features : LinkFeatures
-            Of shape (N,) or (T, N); N may be 0.
+            Features of shape (N,) or (T, N); N may be 0.
 
         Returns
         -------
         LinkPrediction
-            Of the shape of the features.
+            Prediction in the shape of the features.
 
         Raises
         ------

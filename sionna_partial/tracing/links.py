@@ -97,7 +97,7 @@ class TracedLinks(Shown):
 
     @property
     def valid(self) -> Bools:
-        """Which links were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
+        """True for the links that were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
         return self.link_state != NO_RECEIVER
 
     @property
@@ -119,10 +119,9 @@ class TracedLinks(Shown):
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
         Channels have every path. Links that were traced with the default ``TraceSettings.power_tolerance_db`` lack weak
-        ones: such links are traced once more, without a tolerance, when channels are first asked for, and the paths of
-        a channel are then more than those of the links. Trace with ``power_tolerance_db=0.0`` to have the same paths in
-        both. A tolerance that was set, as 0.1 dB, is kept, as is that of links which were read from a folder or
-        changed. The attribute `power_tolerance_db` has the tolerance of the channels.
+        ones: such links are traced once more, without a tolerance, when channels are first asked for, and a channel has
+        more paths than its link then. Trace with ``power_tolerance_db=0.0`` to have the same paths in both. A tolerance
+        that was set, as 0.1 dB, is kept, and so is the tolerance of links which were read from a folder or changed. The attribute `power_tolerance_db` has the tolerance of the channels.
 
         Parameters
         ----------
