@@ -121,7 +121,8 @@ class TracedLinks(Shown):
         Channels have every path. Links that were traced with the default ``TraceSettings.power_tolerance_db`` lack weak
         ones: such links are traced once more, without a tolerance, when channels are first asked for, and a channel has
         more paths than its link then. Trace with ``power_tolerance_db=0.0`` to have the same paths in both. A tolerance
-        that was set, as 0.1 dB, is kept, and so is the tolerance of links which were read from a folder or changed. The attribute `power_tolerance_db` has the tolerance of the channels.
+        that was set, as 0.1 dB, is kept, and so is the tolerance of links which were read from a folder or changed. The
+        attribute `power_tolerance_db` has the tolerance of the channels.
 
         Parameters
         ----------
