@@ -260,9 +260,8 @@ class TestPredictorSettings:
 
 def test_materials_by_name() -> None:
     assert SceneSettings(material="concrete") == SceneSettings(material=Material(itu="concrete", thickness_m=0.2))  # type: ignore[arg-type]
-    assert Material.named("drywall") == SceneSettings().traced_material == Material() == Material(thickness_m=0.1)
-    assert replace(Material(), conductivity_s_m=0.2).conductivity_exponent == Material().conductivity_exponent > 0.0
-    assert Material(4.0, 0.05).conductivity_exponent == Material(itu="brick").conductivity_exponent == 0.0
+    assert Material.named("drywall") == SceneSettings().traced_material
+    assert replace(Material.named("drywall"), conductivity_exponent=0.0) == Material() == Material(thickness_m=0.1)
     assert repr(Material.named("brick")) == "Material(itu='brick', thickness_m=0.11)"
     custom = Material(4.0, 0.05, 0.2)
     assert eval(repr(custom)) == custom

@@ -222,7 +222,7 @@ def test_rays_are_announced(caplog: pytest.LogCaptureFixture) -> None:
         ((np.nan, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = \(nan, 1.0, 1.5\) is not finite"),
         ((0.05, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = .* is inside a wall"),
         ((9.0, 1.0, 1.5), [[1.0, 1.0, 1.0]], r"tx = .* is outside the map"),
-        ([(1.0, 1.0, 1.5), (0.05, 1.0, 1.5)], [[2.0, 1.0, 1.5]], r"^tx\[1\] = \(0.05, 1.0, 1.5\) is inside a wall"),
+        ([(1.0, 1.0, 1.5), (0.05, 1.0, 1.5)], [[2.0, 1.0, 1.5]], r"^tx2 = \(0.05, 1.0, 1.5\) is inside a wall"),
         ((1.0, 1.0, 1.5), [[1.0, 1.0, 3.0]], r"rx\[0\] = .* is not between floor and ceiling"),
         ([[(1.0, 1.0, 1.5)]], [[1.0, 1.0, 1.0]], r"tx has shape \(1, 1, 3\): give x, y, z in metres, \(3,\) or \(N"),
         ((1.0, 1.0, 1.5), [[1.0, 1.0, 1.0], [1.0]], r"rx = .* is not numeric: give x, y, z in metres\."),
