@@ -68,7 +68,8 @@ class Page:
         self.picture.points.on_change("data", self._on_points)
         self.picture.points.selected.on_change("indices", self._on_selected)
         self._make_choices()
-        self._make_controls()
+        self._make_transmitter_controls()
+        self._make_radio_controls()
         for name, model in self._roots().items():
             model.name = name
             document.add_root(model)
@@ -104,8 +105,8 @@ class Page:
         self.summary = Div(name="summary", sizing_mode="stretch_width")
         self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
 
-    def _make_controls(self) -> None:
-        from bokeh.models.widgets.inputs import Select, Spinner, TextAreaInput, TextInput
+    def _make_transmitter_controls(self) -> None:
+        from bokeh.models.widgets.inputs import Select, Spinner, TextInput
         from bokeh.models.widgets.markups import Div
 
         homes: list[Any] = [("", "choose one"), *((name, name) for name in demo_homes())]
@@ -141,6 +142,11 @@ class Page:
                 ("downtilt_deg", "Downtilt [\u00b0]", -90, 90),
             )
         }
+
+    def _make_radio_controls(self) -> None:
+        from bokeh.models.widgets.inputs import Select, Spinner, TextAreaInput
+        from bokeh.models.widgets.markups import Div
+
         self.walls = self._on(
             Select(title="Paths through walls", options=list[Any](_WALLS.items()), value=""),
             lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),

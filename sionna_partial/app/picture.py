@@ -48,15 +48,7 @@ class Picture:
     """Plot of one window."""
 
     def __init__(self) -> None:
-        from bokeh.models import (
-            ColumnDataSource,
-            CustomJS,
-            DataRange1d,
-            FixedTicker,
-            HoverTool,
-            LinearColorMapper,
-            PointDrawTool,
-        )
+        from bokeh.models import ColumnDataSource, DataRange1d, FixedTicker, LinearColorMapper
         from bokeh.plotting import figure
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
@@ -95,6 +87,13 @@ class Picture:
             if name in LEVELS:
                 bar.ticker = FixedTicker()
         plot.image(image="cells", source=self.ground, color_mapper=walls, **where)
+        self._add_marks()
+
+    def _add_marks(self) -> None:
+        """Draw measured points, routes, views and transmitters on top, with the tools that read and move them."""
+        from bokeh.models import CustomJS, HoverTool, PointDrawTool
+
+        plot = self.plot
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
