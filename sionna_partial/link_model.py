@@ -254,19 +254,21 @@ class LinkModel:
         Networks predict with the traced material.
         """
         if phi.path_power is None:
-            return self._predict_under([phi], complete)[0]
-        parts = self._predict_under(self.wall_materials.under(phi), complete)
+            return self._predict_under([phi], complete, phi)[0]
+        parts = self._predict_under(self.wall_materials.under(phi), complete, phi)
         return LinkPrediction.over_materials(parts, self.wall_materials.prior, RESIDUAL_DB)
 
-    def _predict_under(self, features: Sequence[LinkFeatures], complete: Bools) -> list[LinkPrediction]:
-        """Predict links under each candidate."""
+    def _predict_under(
+        self, features: Sequence[LinkFeatures], complete: Bools, traced: LinkFeatures
+    ) -> list[LinkPrediction]:
+        """Predict links under each candidate; networks predict from the features as traced."""
         traces = [LinkPrediction.of_trace(phi) for phi in features]
         if complete.all():
             return traces
         if isinstance(self.predictor, MeanLosses):
             predicted = self.predictor.predict_each(features)
         else:
-            predicted = [self.predictor.predict(features[0])] * len(features)
+            predicted = [self.predictor.predict(traced)] * len(features)
         return [one.where(complete, trace) for one, trace in zip(predicted, traces, strict=True)]
 
     @property

@@ -128,6 +128,16 @@ class TestPrediction:
         assert np.all(np.diff(means_db) < 0.0)
         assert min(part.gain_mean_db.min() for part in parts) >= GAIN_FLOOR_DB
 
+    @pytest.mark.filterwarnings("ignore")
+    def test_networks_predict_from_the_trace_and_not_from_a_candidate(self):
+        state = FLAT.state.copy()
+        state[:, 60:] = sp.CellState.UNKNOWN
+        model = sp.LinkModel(sp.PartialMap(state, FLAT.resolution_m), "paper", WIFI)
+        phi, found = model.features(TX, RX), model.predict(TX, RX)
+        expected = sp.Predictor.load("paper").predict(phi)
+        assert phi.path_power is not None
+        assert np.allclose(found.gain_nlos_mean_db, expected.gain_nlos_mean_db)
+
 
 class TestMeasurements:
     @pytest.mark.parametrize(("material", "least"), [("drywall", 0.5), ("brick", 0.5), ("concrete", 0.8)])

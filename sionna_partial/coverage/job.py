@@ -228,10 +228,8 @@ class CoverageJob:
         def predict(tx_m: Floats, rx_m: Floats) -> tuple[LinkPrediction, Floats, Floats]:
             return self._prior(tx_m, rx_m, transmitter.antenna, at_rx=True)
 
-        part, through_walls = (
-            part_of(report, 0.0, LOCATING_FRACTION),
-            self.model.simulation.trace_settings.through_walls,
-        )
+        part = part_of(report, 0.0, LOCATING_FRACTION)
+        through_walls = self.model.simulation.trace_settings.through_walls
         return locate_transmitter(partial, measured, allowed, predict, part, through_walls=through_walls)
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:

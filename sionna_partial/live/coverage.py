@@ -275,7 +275,7 @@ class LiveCoverage:
         self._closed = False
         self._newest: _Grid | None = None
         self._waiting: _Grid | None = None
-        self._answered, self._moved, self._gave_way, self._stepped_s = 0, False, False, -math.inf
+        self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
         self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
@@ -339,8 +339,8 @@ class LiveCoverage:
         added = {} if position_m is None else _named_positions({name: position_m})
         with self._changed:
             self.tx_m = {known: at_m for known, at_m in self.tx_m.items() if known != name} | added
-            self._powers = {known: self._powers.get(known, {}) if known != name else {} for known in self.tx_m}
-            self._waiting, self._moved = self._newest, True
+            self._powers = {known: {} if known == name else self._powers[known] for known in self.tx_m}
+            self._waiting, self._answered = self._newest, 0
             self._changed.notify_all()
 
     def request_views(self) -> None:
@@ -427,11 +427,11 @@ class LiveCoverage:
         if self._model is None:
             self._model = LinkModel(grid.partial, **self._model_settings)
         self._model.update(grid.partial)
-        if grid.number != self._answered or self._moved:
-            self._moved = False
+        if grid.number != self._answered:
+            self._answered = grid.number
             self._clear_removed()
             self._each(grid, is_final=False)
-        self._answered, may_give_way, self._gave_way = grid.number, not self._gave_way, False
+        may_give_way, self._gave_way = not self._gave_way, False
         try:  # once a newer map comes first, and then not, so that there is a fine answer now and then
             self._each(grid, is_final=True, report=self._give_way if may_give_way else no_progress)
         except _NewerMap:
