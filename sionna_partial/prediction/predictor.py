@@ -29,7 +29,6 @@ from sionna_partial.prediction.features import (
     link_states,
     require_each,
 )
-from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MapReader,
@@ -44,6 +43,7 @@ from sionna_partial.prediction.paper_networks import (
     evaluate_paper,
     fit_indoor_networks,
     fit_networks,
+    free_space_gain_db,
     import_keras,
     network_ranges,
     parts,
