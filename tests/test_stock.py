@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import build_scene, export_scene, write_scene
