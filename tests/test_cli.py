@@ -264,11 +264,13 @@ class TestExplore:
             assert animation.n_frames == 7
 
     def test_own_home_and_errors(self, map_path: Path, tmp_path: Path, room: PartialMap) -> None:
-        errors = ["--range-noise", "0.6", "--drift", "0.2", "--missed-walls", "0.5"]
+        errors = ["--range-noise", "0.6", "--drift", "0.2", "--missed-walls", "0.5", "--heading-noise", "3"]
+        errors += ["--missed-returns", "0.1", "--fusion", "cartographer"]
         result = run("explore", "--home", map_path, "--out", tmp_path / "maps", "--steps", "4", *errors)
         assert result.exit_code == 0, result.output
         assert load_map(tmp_path / "maps" / "complete.yaml") == room
-        (partial,) = explore(room, (4,), sensor=SensorSettings(0.6, 0.2, 0.5))
+        sensor = SensorSettings(0.6, 0.2, 0.5, heading_noise_deg=3.0, missed_return_fraction=0.1, fusion="cartographer")
+        (partial,) = explore(room, (4,), sensor=sensor)
         assert np.array_equal(load_map(tmp_path / "maps" / "steps_004.yaml").state, partial.state)
 
     @pytest.mark.parametrize(
