@@ -26,7 +26,6 @@ from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.wall_evidence import (
     FADINGS_DB,
-    LIKELY_STD_DB,
     OTHERS_WEIGHT,
     OWN_WEIGHT,
     STDS_DB,
@@ -36,6 +35,7 @@ from sionna_partial.measurements.wall_evidence import (
 )
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.wall_materials import LIKELY_STD_DB
 from sionna_partial.settings import FREQUENCIES_HZ
 
 CELL_M = 0.3
@@ -628,9 +628,8 @@ class Assimilation(Shown):
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
-        materials = prior.by_material[0] if len(self._fits) > 1 else (prior,)
         updated, across = [], None
-        for fit, links in zip(self._fits, materials, strict=True):
+        for fit, links in zip(self._fits, prior.by_material[0], strict=True):
             if fit is not None:
                 across = self._links.correlation(rx_m, fit.kind) if across is None else across
                 updated.append(self._updated(fit, across, rx_m, links))
