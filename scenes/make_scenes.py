@@ -127,7 +127,7 @@ def _write_vacuum(folder: Path) -> None:
     home = {"__class": "ValetudoMap", "metaData": {"version": 2}, "size": size_cm, "pixelSize": PIXEL_CM}
     home |= {"layers": layers, "entities": []}
     rows, columns = np.nonzero(ndimage.binary_erosion(seen, iterations=4))
-    lanes = (rows % 12 == 0) & (columns % 8 == 0)  # 0.6 m apart, a power every 0.4 m
+    lanes = (rows % 16 == 0) & (columns % 12 == 0)  # 0.8 m apart, a power every 0.6 m
     x_cm, y_cm = ((index[lanes] + 0.5) * PIXEL_CM for index in (columns, rows))
     rx = np.column_stack([x_cm, size_cm["y"] - y_cm, np.full(len(x_cm), 10.0)]) / 100.0
     truth, brick = PartialMap(state[::-1].copy(), PIXEL_CM / 100.0), SceneSettings(material=Material.named("brick"))
