@@ -8,11 +8,11 @@ from numpy.typing import NDArray
 from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import build_scene, export_scene, write_scene
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.settings import ITU_BANDS_GHZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import load_sionna, open_scene
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.stock import listed_before, stock_paths
@@ -164,3 +164,10 @@ class TestListedBefore:
 
     def test_no_paths(self) -> None:
         assert listed_before(np.zeros((0, 2), np.uint8), np.zeros((0, 2, 3))).shape == (0,)
+
+
+def test_itu_bands_are_those_of_sionna() -> None:
+    load_sionna()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    assert {name: tuple(bands) for name, bands in ITU_MATERIALS_PROPERTIES.items()} == ITU_BANDS_GHZ
