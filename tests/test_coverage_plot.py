@@ -79,9 +79,14 @@ def test_other_panels_show_their_variable_with_fixed_scales(coverage):
         np.testing.assert_allclose(at_receivers(panel, coverage), expected)
 
 
+def test_gains_through_walls_have_a_scale_of_their_own(coverage):
+    (panel,) = panels(plot_coverage(coverage.assign_attrs(walls="through walls"), layers=["gain_mean_db"]))
+    assert panel.images[0].get_clim() == (-110, -30)
+
+
 def test_the_probability_of_more_than_a_threshold(coverage):
     """By integration: the gain is the mixture of a normal distribution for LOS, one for NLOS, and the outage."""
-    panel = panels(plot_coverage(coverage, threshold_db=-80.0))[3]
+    panel = panels(plot_coverage(coverage, threshold_db=-80.0001))[3]
     assert panel.get_title() == "P(path gain > \N{MINUS SIGN}80 dB)"
     known = coverage.stack(rx=("y", "x")).isel(rx=coverage["valid"].to_numpy().ravel())
     draws = np.random.default_rng(0).normal(size=(20_000, 1))
