@@ -39,6 +39,9 @@ FREE_STANDING_M = 2.5
 ODD_CELLS = 1000
 """Number of cells from which a map has free and wall cells."""
 
+OUTLINE_M = 0.3
+"""Largest distance of an outline of a wall from the cells of this wall [m]."""
+
 ROOM_M, BODY_M = 0.6, 0.3
 """Radius of the largest disc in an unknown region from which it may be a room, and of what gets into one [m]."""
 
@@ -334,6 +337,28 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def wall_noise(self) -> float:
         """Range noise of the walls, from their thickness where they are rough: 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
+
+    @property
+    def unnamed_walls(self) -> float:
+        """Fraction of the wall cells whose material the map does not name."""
+        walls = self.state == CellState.WALL
+        if self.wall_material is None or self.material is not None or not walls.any():
+            return float(self.material is None)
+        return float((self.wall_material[walls] == 0).mean())
+
+    @cached_property
+    def _near_named_walls(self) -> Bools:
+        """Whether the nearest wall of each cell is within `OUTLINE_M` and has a material that the map names."""
+        if self.wall_material is None:
+            return np.zeros(self.shape, dtype=bool)
+        away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
+        return (self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)
+
+    def at_named_walls(self, points_m: NDArray[np.floating]) -> Bools:
+        """Return whether points (..., 3) [m] on outlines of walls, or NaN, are on walls whose material is named."""
+        cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
+        column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)
+        return self._near_named_walls[row, column]
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:
