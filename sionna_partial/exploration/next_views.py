@@ -18,14 +18,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import entr
 
 from sionna_partial.arrays import Floats, largest_part, read_only
-from sionna_partial.checks import (
-    float_array,
-    require_choice,
-    require_number,
-    require_whole,
-    settings_or_default,
-    shown,
-)
+from sionna_partial.checks import float_array, require_choice, require_number, require_whole, settings_or_default, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
 from sionna_partial.coverage.job import POSITIONS, transmitter_positions
