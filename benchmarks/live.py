@@ -117,10 +117,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--updates", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--spacing", type=float, default=0.15, help="of the receivers in the depot [m]")
     parser.add_argument("--depot", type=Path, help="map of SLAM; measures nothing else")
     given = parser.parse_args()
     if given.depot:
-        drive(depot_maps(given.depot, range(1, 802, 100)), 0.15)
+        drive(depot_maps(given.depot, range(1, 402, 100)), given.spacing)
         return
     apartment = [sp.load_map(APARTMENT / f"step{step:03d}/map.yaml") for step in (50, 100, 150)]
     large = [half_seen_hall(fraction) for fraction in (0.5, 0.6, 0.7)]
