@@ -24,7 +24,7 @@ from test_app import pixel
 MODEL = "Bokeh.documents[0].get_model_by_name"
 READY = f"{MODEL}('message').text.includes('Ready')"
 WIDTH, HEIGHT, WAIT_S = 1400, 950, 600.0
-PLACES_M = ((7.0, 9.8), (8.6, 8.6), (7.5, 3.5), (7.0, 9.8))
+PLACES_M = ((7.0, 9.8), (8.0, 6.6), (7.5, 3.5), (7.0, 9.8))
 """Positions [m] from which the transmitter is dragged to the next one."""
 MOVES, MOVE_MS, COARSE_MS, FINE_MS = 8, 80, 400, 1600
 GIF_WIDTH, COLOURS = 760, 64
