@@ -14,8 +14,8 @@ from sionna_partial.arrays import States
 from sionna_partial.checks import require
 from sionna_partial.constants import PICTURE_SUFFIXES, WALL_THICKNESS_M, CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.drawings import read_picture, wall_shades
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.pictures import read_picture, wall_shades
 from sionna_partial.settings import WALL_MATERIALS
 
 LENGTH, WALL, FREE = "length", "wall", "free"
