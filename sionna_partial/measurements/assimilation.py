@@ -33,7 +33,7 @@ from sionna_partial.measurements.wall_evidence import (
     log_std_prior,
     mean_square,
 )
-from sionna_partial.prediction.inputs import free_space_gain_db
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.wall_materials import LIKELY_STD_DB
 from sionna_partial.settings import FREQUENCIES_HZ

@@ -29,7 +29,6 @@ from sionna_partial.prediction.features import (
     link_states,
     require_each,
 )
-from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MapReader,
@@ -44,6 +43,7 @@ from sionna_partial.prediction.paper_networks import (
     evaluate_paper,
     fit_indoor_networks,
     fit_networks,
+    free_space_gain_db,
     import_keras,
     network_ranges,
     parts,
@@ -726,7 +726,7 @@ def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
 
 
 def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
-    path, name = predictor_path(name_or_path), None if name_or_path is None else str(name_or_path)
+    path, name = predictor_path(name_or_path), SHIPPED[0] if name_or_path is None else str(name_or_path)
     try:
         files = [each.stat() for each in (path, path.with_suffix(".json"))]
     except (OSError, ValueError):
@@ -735,7 +735,7 @@ def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
 
 
 @lru_cache(maxsize=4)
-def _read_once(name: str | None, *identity: object) -> Predictor:
+def _read_once(name: str, *identity: object) -> Predictor:
     return Predictor.load(name)
 
 
