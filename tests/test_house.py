@@ -44,7 +44,7 @@ ROOMS = {
     "scene": ("outlines", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
-        *("plan.room", "plan.beams", "plan.reflections", "plan.edges"),
+        *("plan.room", "plan.clipping", "plan.beams", "plan.reflections", "plan.edges"),
         *("mesh.sequences", "mesh.reflections", "stock", "finder"),
         *("path_set", "simulation", "gradients"),
     ),
