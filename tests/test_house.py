@@ -53,7 +53,7 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
-    "measurements": ("measurements", "recordings", "wall_evidence", "assimilation", "localisation"),
+    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
     "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),
