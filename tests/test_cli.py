@@ -105,10 +105,14 @@ ARGUMENTS = [
     ),
     (
         "explore --home MAP --seed 3 --steps 6 --steps 2 --policy coverage --tx 1 2 --range-noise 0.6 --drift 0.2 "
-        "--missed-walls 0.5 --field-of-view 90 --range 5",
+        "--missed-walls 0.5 --field-of-view 90 --range 5 --heading-noise 3 --missed-returns 0.1 --fusion cartographer",
         "explore_trajectory",
         {"steps": [*range(7)], "seed": 3, "policy": "coverage", "tx": (1.0, 2.0)}
-        | {"sensor": SensorSettings(0.6, 0.2, 0.5, 90.0, 5.0)},
+        | {
+            "sensor": SensorSettings(
+                *(0.6, 0.2, 0.5, 90.0, 5.0), heading_noise_deg=3.0, missed_return_fraction=0.1, fusion="cartographer"
+            )
+        },
     ),
     (
         "dataset --homes 2 --first-seed 7 --links 20 --transmitters 2 --stage 50 --stage 0 --seed 3 "

@@ -1,4 +1,5 @@
 import io
+import re
 
 import numpy as np
 import pytest
@@ -10,10 +11,10 @@ from matplotlib.path import Path
 from PIL import Image
 
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage
+from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage, report_figure
 from sionna_partial.plots.style import STATE_COLOURS, figure_png, sheet_columns
 
 LOS, NLOS, OUTAGE = (
@@ -82,6 +83,11 @@ def test_other_panels_show_their_variable_with_fixed_scales(coverage):
         assert panel.images[0].get_clim() == limits
         expected = coverage[name].to_numpy()[coverage["valid"].to_numpy()]
         np.testing.assert_allclose(at_receivers(panel, coverage), expected)
+
+
+def test_gains_through_walls_have_a_scale_of_their_own(coverage):
+    (panel,) = panels(plot_coverage(coverage.assign_attrs(walls="through walls"), layers=["gain_mean_db"]))
+    assert panel.images[0].get_clim() == (-110, -30)
 
 
 def test_the_probability_of_more_than_a_threshold(coverage, figure):
@@ -163,6 +169,18 @@ def test_several_transmitters_have_a_row_each(several, figure):
         assert row[1].images[0].get_clim() == (-150, -60)
     assert found.get_suptitle() == "Coverage for receivers that are indoors\n2 transmitters, 28 GHz, opaque walls"
     assert legend(found) == legend(figure)
+
+
+def test_the_report_has_names_any_transmitter_uncertainty_and_material(several):
+    figure = report_figure(several, [20.0, 30.0], -67.0, ("flat_2.png", "2026-11-25"))
+    (text,) = [text.get_text() for axis in figure.axes for text in axis.texts if "Uncertainty" in text.get_text()]
+    rows = text.split("\n\n")[0].splitlines()
+    assert [row.split(" ")[0] for row in rows] == ["Observed", *several["tx"].to_numpy(), "any"]
+    assert "20 dBm" in rows[1]
+    assert [row.count("%") for row in rows] == [0, 8, 8, 8]
+    assert re.search(r"Material of the walls: \w+", text)
+    assert "flat_2.png" in figure.get_suptitle()
+    assert len([axis for axis in figure.axes if axis.get_title()]) == 4
 
 
 def test_the_comparison_has_a_column_for_each_map(coverage):

@@ -14,7 +14,7 @@ from scipy.stats import norm
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.placement.placement import (

@@ -22,9 +22,8 @@ from predictor_links import (
 
 from sionna_partial.errors import OutputError, PredictorError
 from sionna_partial.prediction import predictor_files
-from sionna_partial.prediction.inputs import GAIN_INPUTS, LINK_INPUTS
-from sionna_partial.prediction.map_networks import LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
-from sionna_partial.prediction.paper_networks import assemble, import_keras, parts
+from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
+from sionna_partial.prediction.paper_networks import GAIN_INPUTS, assemble, import_keras, parts
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.predictor_files import CHECKSUMS, FORMAT, digest, pack, shipped_bytes
 from sionna_partial.resources import PREDICTORS_FOLDER

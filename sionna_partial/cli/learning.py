@@ -62,7 +62,7 @@ def dataset(
     seed: Annotated[int, typer.Option(help="Seed of positions and robots.")] = DatasetSettings.seed,
     sensor: opt.Sensor,
     mixed_sensors: Annotated[
-        bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the five options above.")
+        bool, typer.Option("--mixed-sensors", help="Draw a sensor for each home, in place of the options above.")
     ] = False,
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     material: opt.MaterialText = "",

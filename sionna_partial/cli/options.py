@@ -17,7 +17,7 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.display import reporting
 from sionna_partial.files import require_writable
-from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import Fusion, Material, SceneSettings, SensorSettings, TraceSettings
 
 GROUPS = {
     "Transmitter": ("tx", "tx_power", "power", "tx_antenna", "azimuth", "tilt"),
@@ -151,6 +151,9 @@ Range = Annotated[float, typer.Option("--range", help="Range of its sensor [m]."
 RangeNoise = Annotated[float, typer.Option(help="Standard deviation of its range readings [m].")]
 Drift = Annotated[float, typer.Option(help="Odometry drift per metre travelled [1].")]
 MissedWalls = Annotated[float, typer.Option(help="Fraction of walls that it does not detect, as glass [1].")]
+HeadingNoise = Annotated[float, typer.Option(help="Standard deviation of its heading in each picture [degree].")]
+MissedReturns = Annotated[float, typer.Option(help="Fraction of rays that return no reading [1].")]
+Mapper = Annotated[Fusion, typer.Option(help="Mapper that makes the map of readings with errors.")]
 
 
 def in_options(message: str) -> str:
@@ -332,8 +335,12 @@ def _sensor(
     range_noise: RangeNoise = SensorSettings.range_noise_m,
     drift: Drift = SensorSettings.drift_m_per_m,
     missed_walls: MissedWalls = SensorSettings.missed_wall_fraction,
+    heading_noise: HeadingNoise = SensorSettings.heading_noise_deg,
+    missed_returns: MissedReturns = SensorSettings.missed_return_fraction,
+    fusion: Mapper = SensorSettings.fusion,
 ) -> SensorSettings:
-    return SensorSettings(range_noise, drift, missed_walls, field_of_view, range_m)
+    errors = range_noise, drift, missed_walls
+    return SensorSettings(*errors, field_of_view, range_m, heading_noise, missed_returns, fusion)
 
 
 Settings = Annotated[dict[str, Any], settings_of]

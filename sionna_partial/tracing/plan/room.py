@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import Plan
+from sionna_partial.scene.outlines import Plan
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
@@ -70,7 +70,8 @@ class Room(NamedTuple):
         """Take it from a scene, whose faces have these materials."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
-        of_walls = material_of_face[: 2 * len(geometry.segments) : 2].copy()  # contiguous: numba compiles for each layout
+        # Contiguous: numba compiles for each layout.
+        of_walls = material_of_face[: 2 * len(geometry.segments) : 2].copy()
         return cls(float(geometry.height_m), *flats, tx_m, rx_m, of_walls, of_flats, geometry.top_m, gains)
 
 
