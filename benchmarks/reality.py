@@ -222,8 +222,6 @@ class Floor:
                 fitted = self.fit(tx, known, [self.fitted[other] for other in others if other != tx])
                 after = fitted.update(self.links[tx][rest, 3:6], self.prior[tx].take(rest))
                 weights, means_db, stds_db = after.by_state
-                if not len(known):
-                    stds_db = np.hypot(stds_db, np.std([self.fitted[other].offset_db for other in others]))
                 parts = weights, means_db + fitted.offset_db, stds_db
                 error_db = after.gain_mean_db + fitted.offset_db - power
                 found[name] = error_db, *scores(parts, power), weights[LinkState.OUTAGE] > 0.5

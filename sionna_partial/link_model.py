@@ -252,13 +252,17 @@ class LinkModel:
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
         """Predict links from their features; the trace is the prediction of those that are complete.
 
-        Where the material of walls is unknown, this is the mixture over its candidates, with the residuals of traces.
-        Networks predict with the traced material.
+        Through walls it has the residuals of traces as well. Where the material of walls is unknown, it is the mixture
+        over its candidates. Networks predict with the traced material.
         """
-        if phi.path_power is None:
-            return self._predict_under([phi], complete, phi)[0]
-        parts = self._predict_under(self.wall_materials.under(phi), complete, phi)
-        return LinkPrediction.over_materials(parts, self.wall_materials.prior, RESIDUAL_DB)
+        features, prior = [phi], np.ones(1)
+        if phi.path_power is not None:
+            features = self.wall_materials.under(phi, self.partial.unnamed_walls)
+            prior = self.wall_materials.prior
+        parts = self._predict_under(features, complete, phi)
+        if not self.simulation.trace_settings.through_walls:
+            return parts[0]
+        return LinkPrediction.over_materials(parts, prior, RESIDUAL_DB)
 
     def _predict_under(
         self, features: Sequence[LinkFeatures], complete: Bools, traced: LinkFeatures

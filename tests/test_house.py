@@ -49,7 +49,7 @@ ROOMS = {
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "features", "inputs"),
+        *("unobserved", "features"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
@@ -58,7 +58,7 @@ ROOMS = {
     "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),
     "differentiable": ("scene",),
-    "calibration": ("measured_building", "material_fit", "calibration"),
+    "calibration": ("material_fit", "calibration"),
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
     "live": ("coverage", "topics"),

@@ -39,19 +39,22 @@ from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of, link_features
-from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
     distribution,
+    feature_values,
+    link_inputs,
     read_links,
     read_maps,
     reads_maps,
 )
 from sionna_partial.prediction.paper_networks import (
+    GAIN_INPUTS,
     GAIN_NETWORKS,
     STATE_NETWORKS,
     distribution_by_paper,
+    free_space_gain_db,
     import_keras,
     parts,
     tf,

@@ -11,16 +11,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sionna_partial.arrays import Floats
+from sionna_partial.prediction.wall_materials import LIKELY_FADING_DB, LIKELY_STD_DB
 
-STDS_DB, LIKELY_STD_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 5.0, 0.4
-"""Standard deviations of the process that are tried [dB], the most probable one before any measurement, and the
-standard deviation of its logarithm."""
+STDS_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 0.4
+"""Standard deviations of the process that are tried [dB], and the standard deviation of their logarithm."""
 
 FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
 """Standard deviations of what differs from receiver to receiver that are tried [dB]."""
 
-LIKELY_FADING_DB, FADING_SPREAD = 3.0, 0.5
-"""The most probable one before any measurement, and the standard deviation of its logarithm [dB]."""
+FADING_SPREAD = 0.5
+"""Standard deviation of their logarithm before any measurement."""
 
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
 """Exponents of the evidence of a transmitter, and of other transmitters of the building: errors of a trace are

@@ -39,9 +39,10 @@ from sionna_partial.settings import Material, material_name
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
-_NARROW_IN, _WIDE_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0, 11.0, 0.75, 0.35, 170, 3000
+_NARROW_IN, _WIDE_IN, _HIGHEST_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0, 11.0, 16.0, 0.75, 0.35, 170, 3000
 _ROW_NAME, _LOW_ASPECT, _OUTAGE_NOTE = 16, 0.2, "an outage counts as a path gain of \N{MINUS SIGN}150 dB"
 _NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
+_GAINS_DB, _GAINS_THROUGH_WALLS_DB = (GAIN_FLOOR_DB, -60.0), (-110.0, -30.0)
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
@@ -70,8 +71,9 @@ def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) 
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
-def coverage_layers(threshold_db: float) -> dict[str, Layer]:
-    """Return every layer that a panel can show, by name."""
+def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> dict[str, Layer]:
+    """Return every layer that a panel can show, by name; gains of a coverage through walls are less spread."""
+    through_walls = coverage is not None and coverage.attrs.get("walls") == "through walls"
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
     layers = {
@@ -82,7 +84,7 @@ def coverage_layers(threshold_db: float) -> dict[str, Layer]:
         "gain_mean_db": Layer(
             "Mean path gain",
             _variable("gain_mean_db"),
-            Normalize(-150.0, -60.0),
+            Normalize(*(_GAINS_THROUGH_WALLS_DB if through_walls else _GAINS_DB)),
             "viridis",
             "dB",
         ),
@@ -90,7 +92,7 @@ def coverage_layers(threshold_db: float) -> dict[str, Layer]:
             "Std. dev. of the path gain", _variable("gain_std_db"), Normalize(0.0, 40.0), "magma_r", "dB"
         ),
         "p_above": Layer(
-            f"P(path gain > {threshold_db:g} dB)".replace("-", "\N{MINUS SIGN}"),
+            f"P(path gain > {round(threshold_db, 1):g} dB)".replace("-", "\N{MINUS SIGN}"),
             lambda data: probability_above(data, threshold_db),
             *probability,
         ),
@@ -142,7 +144,7 @@ def plot_coverage(
     >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
     maps = transmitters_of(coverage)
-    chosen = _choose(layers, threshold_db)
+    chosen = _choose(layers, threshold_db, coverage)
     figure = _plot_rows(maps, chosen) if len(maps) > 1 else _plot_sheet(next(iter(maps.values())), chosen)
     figure.suptitle(headline("Coverage", maps).replace(": ", "\n", 1))
     _add_legend(figure, [*maps.values()], chosen)
@@ -188,7 +190,7 @@ def plot_comparison(
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     coverages = {title: require_coverage(coverage) for title, coverage in coverages.items()}
     first, *others = coverages.values()
-    chosen = _choose(layers, -100.0)
+    chosen = _choose(layers, -100.0, first)
     figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], keys_in=1.6)
     for row, layer in zip(axes, chosen, strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
@@ -202,9 +204,9 @@ def plot_comparison(
     return figure
 
 
-def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
+def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) -> list[Layer]:
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
-    known = coverage_layers(threshold_db)
+    known = coverage_layers(threshold_db, coverage)
     named = isinstance(layers, Sequence) and not isinstance(layers, str) and len(layers) > 0
     require(named, "layers", layers, f"give some of {', '.join(known)}.")
     for name in layers:
@@ -234,7 +236,8 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
-    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), 12.0)
+    highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
+    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
     figure = Figure(figsize=(page, rows * (height + 0.35) + 1.6), dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axis in axes.flat:
