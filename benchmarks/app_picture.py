@@ -1,4 +1,4 @@
-"""Picture and animation of the app's page, and times from drops: two access points in the example home at 5 GHz, in headless Chromium.
+"""Picture and animation of the app's page, two access points in the example home at 5 GHz, and times from drops.
 
 python benchmarks/app_picture.py [--out docs/app.png] [--gif docs/app.gif]
 
