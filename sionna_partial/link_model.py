@@ -22,7 +22,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.display import later
+from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
@@ -219,7 +219,10 @@ class LinkModel:
 
         `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m], which have been checked.
         """
-        return self._predict_paths(ends_m, [self.simulation.blocks(*each_m, report) for each_m in ends_m])
+        share = 1.0 / max(1, len(ends_m))
+        parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
+        paths = [self.simulation.blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
+        return self._predict_paths(ends_m, paths)
 
     def _predict_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]

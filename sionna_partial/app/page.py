@@ -127,7 +127,6 @@ class Page:
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
             lambda value: self.session.measure(self._line_m, float(value)),
-            "value_throttled",
         )
         self.dark = self._on(
             Slider(title="Walls up to shade", name="dark", start=0, end=254, step=1, value=127),
@@ -386,7 +385,7 @@ class Page:
         partial, session = self.session.partial, self.session
         self.picture.show_map(partial, session.plan)
         self._line_m = []
-        self.length.update(value=None, value_throttled=None)
+        self.length.value = None
         self.stroke.value = "" if self.stroke.value == LENGTH else self.stroke.value
         self.more.visible = self.truth.visible = session.home is not None
         self.example.value = session.title if session.home is not None else ""

@@ -80,7 +80,8 @@ class Picture:
         from bokeh.plotting import figure
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
-        self.values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)})
+        of_values = ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)
+        self.values = ColumnDataSource({name: [] for name in of_values}, name="values")
         self.shades = ColumnDataSource({name: [] for name in ("cells", "x", "y", "dw", "dh")})
         self.outline = ColumnDataSource({"xs": [], "ys": []})
         self.stroke, self._live = (

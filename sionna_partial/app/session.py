@@ -493,8 +493,8 @@ class Session:
                 self.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
-            report(0.2, "comparing poses")
-            views = next_views(self._model("map", partial, settings), tx_m, threshold_db=threshold_db)
+            model = self._model("map", partial, settings)
+            views = next_views(model, tx_m, threshold_db=threshold_db, progress=report)
             yield functools.partial(take, views)
 
         self.begin(work)
