@@ -628,8 +628,10 @@ class Assimilation(Shown):
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
+        opaque = self._fits[0] is not None and self._fits[0].kind.exact
+        materials = (prior,) if opaque else prior.by_material[0]
         updated, across = [], None
-        for fit, links in zip(self._fits, prior.by_material[0], strict=True):
+        for fit, links in zip(self._fits, materials, strict=True):
             if fit is not None:
                 across = self._links.correlation(rx_m, fit.kind) if across is None else across
                 updated.append(self._updated(fit, across, rx_m, links))
