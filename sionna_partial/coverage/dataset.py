@@ -566,7 +566,7 @@ class CoverageAccessor:
         ----------
         scene : sionna.rt.Scene
             The scene of `export_scene`, loaded by `sionna.rt.load_scene`.
-        scene_offset_m : (2,) sequence of float
+        scene_offset_m : (2,) or (3,) sequence of float
             `scene_offset` in `map.yaml` of the exported scene, which is not 0 on maps far from the origin [m].
 
         Returns
@@ -615,7 +615,7 @@ class CoverageAccessor:
         maps, offset_m = transmitters_of(self._coverage), np.array([*scene_offset_m, 0.0])[:3]
         x_m, y_m = (self._coverage[name].to_numpy() - offset_m[axis] for axis, name in enumerate("xy"))
         attributes = self._coverage.attrs
-        plane = MapPlane(x_m, y_m, float(attributes["spacing_m"]), float(attributes["rx_height_m"]))
+        plane = MapPlane(x_m, y_m, float(attributes["spacing_m"]), float(attributes["rx_height_m"] - offset_m[2]))
         tx = {name or "tx": np.subtract(one.attrs["transmitter_m"], offset_m) for name, one in maps.items()}
         return plane, tx, [*maps.values()]
 
