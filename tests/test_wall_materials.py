@@ -135,6 +135,20 @@ class TestPrediction:
     def test_known_materials(self, partial, settings):
         assert not sp.Simulation(partial, settings).material_unknown
 
+    @pytest.mark.parametrize("material", [None, "brick"])
+    def test_differentiable_links_have_the_same_distribution(self, material):
+        import tensorflow as tf
+
+        model = model_of(material, EVERY_PATH)
+        links = sp.DifferentiableScene(model).links(TX, RX[:20])
+        tx_m, expected = tf.Variable(links.base.tx_m), model.predict(TX, RX[:20])
+        with tf.GradientTape() as tape:
+            found = links(tx_m=tx_m)
+            mean_db = tf.reduce_mean(found.gain_mean_db)
+        np.testing.assert_allclose(found.gain_mean_db, expected.gain_mean_db, atol=0.05)
+        np.testing.assert_allclose(found.gain_std_db, expected.gain_std_db, atol=0.05)
+        assert np.isfinite(tape.gradient(mean_db, tx_m)).all()
+
     def test_28_ghz_through_walls(self):
         simulation = sp.Simulation(FLAT, sp.TraceSettings(28e9, refraction=True))
         assert simulation.material_unknown
