@@ -411,9 +411,7 @@ class Page:
         if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
             self.stroke.value = self.stroke.options[0][0]
         self.brush.visible = self.stroke.value not in ("", *STRAIGHT)
-        axes = zip(self.picture.plot.axis, "xy", strict=True)
-        for axis, name in axes:
-            axis.axis_label = f"{name} [{'m' if is_measured else 'pixels'}]"
+        self._once("unit", (is_measured,), lambda: self.picture.show_unit("m" if is_measured else "pixels"))
 
     def _show_transmitters(self) -> None:
         session = self.session

@@ -168,6 +168,11 @@ class Picture:
         code = "walls.low = slider.value + 1; plan.visible = true"
         threshold.js_on_change("value", CustomJS(args=shown, code=code))
 
+    def show_unit(self, unit: str) -> None:
+        """Name the unit of both axes."""
+        for name, axis in (("x", self.plot.xaxis), ("y", self.plot.yaxis)):
+            axis.axis_label = f"{name} [{unit}]"
+
     def show_map(self, partial: PartialMap | None, plan: Plan | None) -> None:
         """Draw the cells of a map, or a plan that has no scale yet."""
         self.stroke.data = {"x": [], "y": [], "r": []}
