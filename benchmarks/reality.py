@@ -114,7 +114,7 @@ def locate(name: str, model: sp.LinkModel, links: dict[str, Floats], draws: int)
         measured = sp.Measurements((np.nan, np.nan, rows[0, 2]), given[:, 3:6], given[:, 6])
         found = sp.predict_map(model, measurements=measured, spacing_m=3.0)
         errors_m.append(np.linalg.norm(found.transmitter_m - rows[0, :3]))
-        cell = np.abs(found.tx_y - rows[0, 1]).argmin().item(), np.abs(found.tx_x - rows[0, 0]).argmin().item()
+        cell = tuple(np.abs(found[axis].values - rows[0, at]).argmin() for axis, at in (("tx_y", 1), ("tx_x", 0)))
         inside.append(likely_region(found.p_transmitter.values)[cell])
     errors = f"median {np.median(errors_m):.2f} m, mean {np.mean(errors_m):.2f} m"
     print(f"\n{name}: {errors}, in the 90 % region {np.mean(inside):.2f} of {len(inside)}", flush=True)
