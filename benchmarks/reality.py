@@ -9,6 +9,9 @@ P(outage) > 0.5. The last table is the mean over folders of the figures of each 
 
     python benchmarks/reality.py ../shared/measured/bleflat ../shared/measured/ble_floor
 
+Without a FOLDER, buildings are procedural: their powers are traced with other walls (`BUILDINGS`), and have a spatial
+process of 4 dB, fading of 4 dB and an offset of each transmitter.
+
 Baselines: path loss with fitted exponent; multi-wall (COST 231), whose loss per wall comes from the other transmitters
 of the floor; a Gaussian process about each of the two (Matern 3/2 over the receiver's position); the traced gain.
 Without given powers (N = 0), their constants are those of the other transmitters, which give the offset. Their
@@ -25,7 +28,9 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import ndimage
 from scipy.special import ndtr
+from through_walls import ends
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
@@ -39,12 +44,22 @@ FIGURES = "RMSE [dB]", "CRPS [dB]", "in 90 %", "P(out) > .5"
 EXPONENT, EXPONENT_STD, NOISE_DB, OFFSET_STD_DB = 2.0, 0.5, 6.0, 8.0
 COLUMNS = "tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "power_dbm"
 NO_INFORMATION_DB = 30.0
+BUILDINGS = {
+    "office of brick": ("office", 11, 2.4e9, ("brick", "brick", "brick")),
+    "office of concrete": ("office", 1, 2.4e9, ("concrete", "concrete", "concrete")),
+    "office, outer concrete, inner brick": ("office", 3, 5.2e9, ("concrete", "brick", "brick")),
+    "floor, glass, plasterboard, concrete core": ("floor", 2, 1.9e9, ("glass", "drywall", "concrete")),
+    "house of drywall": ("house", 12, 5.2e9, ("drywall", "drywall", "drywall")),
+}
+"""Procedural buildings: kind, seed, frequency [Hz], and the materials of outer walls, inner walls and core."""
+OUTER_M, CORE, BUILDING_TRANSMITTERS = 1.0, 0.7, 4
+PROCESS_DB, PROCESS_M, FADING_DB, OFFSET_DB, SENSITIVITY_DBM = 4.0, 4.0, 4.0, (-30.0, 4.0), -125.0
 
 
 def main() -> None:
     """Measure, and print a table for each floor, and the mean lead over the baselines."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", type=Path, nargs="+")
+    parser.add_argument("folders", type=Path, nargs="*")
     parser.add_argument("--map", default="map.yaml", help="name of the map in each folder")
     parser.add_argument("--material", default="unknown", help="of the walls; unknown is the default of SceneSettings")
     parser.add_argument("--opaque-walls", action="store_true")
@@ -54,16 +69,18 @@ def main() -> None:
     arguments = parser.parse_args()
     scene = sp.SceneSettings(**{} if arguments.material == "unknown" else {"material": arguments.material})
     leads = defaultdict(list)
-    for folder in arguments.folders:
-        partial, links, frequency_hz = read_floor(folder, arguments.map, arguments.transmitters)
+    floors = {f"{folder.name}, {arguments.map}": (folder, arguments.map) for folder in arguments.folders}
+    for name, source in (floors or BUILDINGS).items():
+        partial, links, frequency_hz = read_floor(*source) if floors else procedural(*source)
+        links = dict([*links.items()][: arguments.transmitters])
         if not links:
-            print(f"\n{folder.name}: no transmitter with a known position and {POINTS} powers")
+            print(f"\n{name}: no transmitter with a known position and {POINTS} powers")
             continue
         trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
         maps = halves(partial) if arguments.half else [partial]
         tables = [Floor(each, links, sp.Simulation(each, trace, scene)).table(arguments.draws) for each in maps]
         table = {method: np.mean([each[method] for each in tables], axis=0) for method in tables[0]}
-        print_table(f"{folder.name}, {arguments.map}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
+        print_table(f"{name}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
         for method, figures in table.items():
             leads[method].append(figures[:2] - table["ours"][:2])
     print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
@@ -90,10 +107,8 @@ def halves(partial: sp.PartialMap) -> list[sp.PartialMap]:
     return [replace(partial, state=np.where(mask, np.uint8(CellState.UNKNOWN), partial.state)) for mask in hidden]
 
 
-def read_floor(
-    folder: Path, name: str, transmitters: int | None = None
-) -> tuple[sp.PartialMap, dict[str, Floats], float]:
-    """Return the map, the rows (N, 7) of the first transmitters, and the frequency [Hz]."""
+def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats], float]:
+    """Return the map, the rows (N, 7) of each transmitter, and the frequency [Hz]."""
     partial = sp.load_map(folder / name)
     with (folder / "measurements.csv").open(encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["tx_x"]]
@@ -105,8 +120,31 @@ def read_floor(
         stands = clear_of_walls(partial, values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
         if stands.sum() >= POINTS:
             links[tx] = values[stands]
-    links = dict(list(links.items())[:transmitters])
     return partial, links, float((rows and rows[0].get("frequency_hz")) or 2.44e9)
+
+
+def procedural(
+    kind: str, seed: int, frequency_hz: float, materials: tuple[str, str, str]
+) -> tuple[sp.PartialMap, dict[str, Floats], float]:
+    """Return a building without its materials, with powers that were traced with them, as `read_floor`."""
+    partial, rng = sp.make_home(seed, kind), np.random.default_rng(seed)
+    inside = ndimage.binary_fill_holes(partial.state != CellState.UNKNOWN)
+    depth_m = ndimage.distance_transform_edt(inside) * partial.resolution_m
+    zone, truth = np.digitize(depth_m, [OUTER_M, CORE * depth_m.max()]), partial
+    for number, material in enumerate(materials):
+        truth = truth.with_wall_material(material, (partial.state == CellState.WALL) & (zone == number))
+    simulation, links = sp.Simulation(truth, sp.TraceSettings(frequency_hz)), {}
+    for number in range(BUILDING_TRANSMITTERS):
+        tx_m, rx_m = ends(partial, 2 * POINTS, 100 * seed + number)
+        apart_m = np.linalg.norm(rx_m[:, None] - rx_m, axis=-1)
+        process_db = np.linalg.cholesky(np.exp(-apart_m / PROCESS_M) + 1e-9 * np.eye(len(rx_m))) @ rng.normal(
+            size=len(rx_m)
+        )
+        errors_db = PROCESS_DB * process_db + FADING_DB * rng.normal(size=len(rx_m))
+        power = simulation.links(tx_m, rx_m).gain_db + errors_db + rng.normal(*OFFSET_DB)
+        rows = np.column_stack([np.tile(tx_m, (len(rx_m), 1)), rx_m, power])
+        links[f"{number}"] = rows[power > SENSITIVITY_DBM]
+    return partial, {tx: rows for tx, rows in links.items() if len(rows) >= POINTS}, frequency_hz
 
 
 class Floor:

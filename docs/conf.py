@@ -50,6 +50,8 @@ nb_execution_mode = "cache"
 nb_execution_cache_path = str(ROOT / "build" / "notebooks")
 nb_execution_raise_on_error = True
 nb_execution_timeout = 600
+nb_ipywidgets_js = {}  # pages load nothing from other sites
+nb_output_stderr = "remove"  # progress bars
 
 autodoc_typehints = "none"
 numpydoc_show_class_members = False

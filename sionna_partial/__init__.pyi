@@ -8,8 +8,8 @@ from sionna_partial.channels.samples import ChannelSamples as ChannelSamples
 from sionna_partial.channels.samples import sample_channels as sample_channels
 from sionna_partial.constants import CellState as CellState
 from sionna_partial.constants import LinkState as LinkState
+from sionna_partial.coverage.job import predict_map as predict_map
 from sionna_partial.coverage.network import network_map as network_map
-from sionna_partial.coverage.predict import predict_map as predict_map
 from sionna_partial.datasets.dataset import build_dataset as build_dataset
 from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene

@@ -10,7 +10,7 @@ import xarray as xr
 from sionna_partial.arrays import Bools
 from sionna_partial.checks import Progress, no_progress
 from sionna_partial.constants import CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SceneError
 from sionna_partial.export import FORMATS, save_coverage
 from sionna_partial.files import atomic_files, output_path

@@ -34,9 +34,8 @@ from sionna_partial.prediction.predictor import (
     Predictor,
     warm_predictor,
 )
-from sionna_partial.prediction.unobserved import is_enclosed
+from sionna_partial.prediction.unobserved import is_enclosed, map_windows
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
-from sionna_partial.prediction.windows import map_windows
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.paths import SolvedPaths
@@ -314,7 +313,7 @@ class LinkModel:
 
     def coverage(self, tx: ArrayLike | Mapping[str, ArrayLike] | None = None, **options: Any) -> xr.Dataset:
         """Predict links everywhere on the map: `predict_map` of this model, with the same options."""
-        found: xr.Dataset = later("coverage.predict:predict_map")(self, tx, **options)
+        found: xr.Dataset = later("coverage.job:predict_map")(self, tx, **options)
         return found
 
     def _complete(self, tx_m: Floats, rx_m: Floats) -> Bools:

@@ -5,7 +5,7 @@ from functools import cache
 import xarray as xr
 from extruded import drawn
 
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
 

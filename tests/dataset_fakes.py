@@ -15,7 +15,7 @@ import numpy as np
 from predictor_links import walls_of_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.settings import DatasetSettings
@@ -36,7 +36,7 @@ def processes_make_fakes(folder: Path) -> str:
 
 
 _CODE = """
-if "home_process" in " ".join(sys.orig_argv):
+if "home_links import serve" in " ".join(sys.orig_argv):
     import dataset_fakes
     dataset_fakes.install()
 """

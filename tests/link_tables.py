@@ -6,8 +6,7 @@ import json
 import numpy as np
 from predictor_links import corridor_of, corridors, make_context, make_links, quick_predictor
 
-from sionna_partial.datasets.link_table import COLUMNS, LinkTable
-from sionna_partial.datasets.shards import INDEX_FILE, shard_path, write_shard
+from sionna_partial.datasets.shards import COLUMNS, INDEX_FILE, LinkTable, shard_path, write_shard
 from sionna_partial.evaluation.evaluate import Baselines, Majority
 
 

@@ -13,9 +13,8 @@ from scipy.stats import norm
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage.dataset import ATTRIBUTES, WALL_PARTS, require_coverage
-from sionna_partial.coverage.job import transmitter_positions
+from sionna_partial.coverage.job import predict_map, transmitter_positions
 from sionna_partial.coverage.link_budget import schemes
-from sionna_partial.coverage.predict import predict_map
 from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
 from sionna_partial.export import load_coverage
 from sionna_partial.link_model import LinkModel

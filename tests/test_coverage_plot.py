@@ -10,7 +10,7 @@ from matplotlib.path import Path
 from PIL import Image
 
 from sionna_partial.constants import LinkState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage

@@ -20,10 +20,9 @@ import pytest
 from dataset_fakes import HANGS, KILLS, KILLS_ONCE, RAISES, UNWRITABLE, fake_links, processes_make_fakes
 from link_tables import assert_same
 
-from sionna_partial.datasets import dataset, home_process
+from sionna_partial.datasets import dataset, home_links
 from sionna_partial.datasets.dataset import DatasetReport, build_dataset
-from sionna_partial.datasets.home_links import HomeSource
-from sionna_partial.datasets.home_process import HomeTask, run_home
+from sionna_partial.datasets.home_links import HomeSource, HomeTask, run_home
 from sionna_partial.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
 from sionna_partial.files import locked_folder
@@ -108,7 +107,7 @@ class TestBuild:
         index = json.loads((unbroken / "dataset.json").read_text())
         assert [home["name"] for home in index["homes"]] == [*NAMES]
         assert index["settings"]["stages"] == [0, 50]
-        assert index["versions"].keys() == set(home_process.PACKAGES)
+        assert index["versions"].keys() == set(home_links.PACKAGES)
         assert sorted(path.name for path in unbroken.iterdir()) == [".lock", "dataset.json", "shards"]
 
     def test_second_run_makes_nothing(self, unbroken: Path) -> None:
@@ -247,7 +246,7 @@ class TestRefused:
         assert files(unbroken) == before
 
     def test_other_versions(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        now = home_process.installed_versions() | {"sionna-rt": "9.9"}
+        now = home_links.installed_versions() | {"sionna-rt": "9.9"}
         monkeypatch.setattr(dataset, "installed_versions", lambda: now)
         with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
             build_dataset(unbroken, SEEDS, SETTINGS)
@@ -303,7 +302,7 @@ def test_numbers_of_numpy_are_noted_as_numbers() -> None:
 
 
 def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "") -> HomeTask:
-    return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_process.installed_versions(), 4.0)
+    return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_links.installed_versions(), 4.0)
 
 
 class TestWorker:
@@ -324,7 +323,7 @@ class TestWorker:
     def test_other_versions(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (tmp_path / "dataset.json").write_text("{}")
         mine = task("make_home(1)", 1, tmp_path, hashlib.sha256(b"{}").hexdigest())
-        monkeypatch.setattr(home_process, "installed_versions", lambda: mine.versions | {"mitsuba": "1.0"})
+        monkeypatch.setattr(home_links, "installed_versions", lambda: mine.versions | {"mitsuba": "1.0"})
         result = run_home(mine)
         assert result.outcome == "unusable"
         assert f"has mitsuba 1.0, the data set is made with {mine.versions['mitsuba']}: install" in result.error

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 from sionna_partial import cli, demo
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table, demo_scene
 from sionna_partial.errors import SceneError
 from sionna_partial.export import load_coverage

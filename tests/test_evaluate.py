@@ -7,7 +7,7 @@ import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
 
-from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation.evaluate import (
     ALWAYS_OUTAGE,
@@ -17,8 +17,8 @@ from sionna_partial.evaluation.evaluate import (
     Majority,
     evaluate,
     home_scores,
+    measure,
 )
-from sionna_partial.evaluation.metrics import measure
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 

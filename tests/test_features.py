@@ -10,7 +10,7 @@ from traced import made_links
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.prediction.windows import map_windows
+from sionna_partial.prediction.unobserved import map_windows
 
 
 def phi_of(count=3):

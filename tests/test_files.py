@@ -8,6 +8,7 @@ import subprocess
 import sys
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import h5py
 import pytest
@@ -118,7 +119,7 @@ def test_files_have_the_usual_permissions(tmp_path: Path) -> None:
     assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "usual").stat().st_mode
 
 
-def test_links_stay_and_pipes_are_refused(tmp_path: Path) -> None:
+def test_links_stay(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "file")
     with atomic_write(tmp_path / "link") as stream:
         stream.write(b"new")
@@ -129,12 +130,6 @@ def test_links_stay_and_pipes_are_refused(tmp_path: Path) -> None:
         (folder / "other").write_bytes(b"whole")
     assert (tmp_path / "link").is_symlink()
     assert tree(tmp_path) == {"link": b"newer", "file": b"newer", "other": b"whole"}
-    os.mkfifo(tmp_path / "pipe")
-    message = r"pipe' is a pipe or a device: give the name of a file"
-    with pytest.raises(OutputError, match=message), atomic_write(tmp_path / "pipe"):
-        pass
-    with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
-        (folder / "pipe").touch()
 
 
 def test_path_keeps_the_name_and_drops_side_files(tmp_path: Path) -> None:
@@ -199,26 +194,37 @@ def test_error_without_number(tmp_path: Path) -> None:
         raise OSError("odd library")
 
 
-@pytest.mark.parametrize("opened", [atomic_write, atomic_path, atomic_folder])
-def test_file_in_the_way(tmp_path: Path, opened: object) -> None:
+IN_THE_WAY = [
+    *(
+        (opened, "file/below/a", "a part of the path is a file; choose")
+        for opened in (atomic_write, atomic_path, atomic_folder)
+    ),
+    (atomic_write, ".", "this path is a folder; give the name of a file"),
+    *((atomic_write, name, "choose a shorter name") for name in ("a" * 300, "a" * 300 + "/b")),
+    *((atomic_folder, name, "is a file: choose a new or an empty folder") for name in ("file", "dangling")),
+    (atomic_write, "pipe", "pipe' is a pipe or a device: give the name of a file"),
+    *(
+        (require_writable, name, "a part of the path is a file; choose another folder")
+        for name in ("file", "file/deep")
+    ),
+    (
+        require_writable,
+        "/proc/new",
+        r"path = '/proc/new' could not be .* \(No such file.*: nothing can be made there; choose",
+    ),
+]
+"""Functions that write, names, and what is said about them."""
+
+
+@pytest.mark.parametrize(("opened", "name", "message"), IN_THE_WAY)
+def test_what_is_in_the_way_is_named_and_stays(tmp_path: Path, opened: Any, name: str, message: str) -> None:
     (tmp_path / "file").write_bytes(b"old")
-    target = tmp_path / "file" / "below" / "a.bin"
-    with pytest.raises(OutputError, match="a part of the path is a file; choose another folder"), opened(target):  # type: ignore[operator]
+    (tmp_path / "dangling").symlink_to("nowhere")
+    os.mkfifo(tmp_path / "pipe")
+    before = tree(tmp_path)
+    with pytest.raises(OutputError, match=message), opened(tmp_path / name):
         pytest.fail("must not be entered")
-    assert tree(tmp_path) == {"file": b"old"}
-
-
-def test_folder_in_the_way(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="this path is a folder; give the name of a file"), atomic_write(tmp_path):
-        pytest.fail("must not be entered")
-
-
-def test_name_too_long(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="choose a shorter name"), atomic_write(tmp_path / ("a" * 300)):
-        pytest.fail("must not be entered")
-    with pytest.raises(OutputError, match="choose a shorter name"), atomic_write(tmp_path / ("a" * 300) / "b"):
-        pytest.fail("must not be entered")
-    assert tree(tmp_path) == {}
+    assert tree(tmp_path) == before
 
 
 SCENE = {"map.yaml": b"map", "scene.xml": b"scene", "meshes/walls.ply": b"walls"}
@@ -264,17 +270,6 @@ def test_other_folders_are_refused(tmp_path: Path, names: tuple[str, ...]) -> No
     with pytest.raises(OutputError, match=message), atomic_folder(tmp_path):
         pytest.fail("must not be entered")
     assert tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("dangling", [False, True])
-def test_file_is_no_folder(tmp_path: Path, dangling: bool) -> None:
-    target = tmp_path / "a"
-    if dangling:
-        target.symlink_to("nowhere")
-    else:
-        target.write_bytes(b"old")
-    with pytest.raises(OutputError, match="is a file: choose a new or an empty folder"), atomic_folder(target):
-        pytest.fail("must not be entered")
 
 
 @pytest.mark.parametrize("existing", [False, True])
@@ -325,21 +320,6 @@ def test_writable_folder_is_left_as_it_was(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"a.bin": b"old"}
 
 
-@pytest.mark.parametrize(
-    ("folder", "message"),
-    [
-        ("a.bin", r"path = '.*a\.bin' could not be written .*: a part of the path is a file"),
-        ("a.bin/deep", "a part of the path is a file; choose another folder"),
-        ("/proc/new", r"path = '/proc/new' could not be written \(No such file.*: nothing can be made there; choose"),
-    ],
-)
-def test_unwritable_folder_is_named(tmp_path: Path, folder: str, message: str) -> None:
-    (tmp_path / "a.bin").write_bytes(b"old")
-    with pytest.raises(OutputError, match=message):
-        require_writable(tmp_path / folder)
-    assert tree(tmp_path) == {"a.bin": b"old"}
-
-
 def test_files_appear_together_and_keep_others(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(b"old")
     (tmp_path / "other").write_bytes(b"kept")
@@ -364,12 +344,16 @@ def test_failed_files_leave_what_was(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"a.bin": b"old"}
 
 
-def test_folder_in_the_way_of_a_file_is_named(tmp_path: Path) -> None:
+def test_in_the_way_of_several_files(tmp_path: Path) -> None:
     (tmp_path / "a.bin").mkdir()
-    message = re.escape(f"path = '{tmp_path / 'a.bin'}' could not be written (Is a directory): this path is a folder")
-    with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
-        (folder / "a.bin").write_bytes(b"new")
-    assert tree(tmp_path) == {"a.bin": None}
+    os.mkfifo(tmp_path / "pipe")
+    for name, message in (
+        ("a.bin", r"path = '.*/a.bin' could not be written \(Is a directory\): this path is a folder"),
+        ("pipe", "pipe' is a pipe or a device: give the name of a file"),
+    ):
+        with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
+            (folder / name).write_bytes(b"new")
+    assert tree(tmp_path) == {"a.bin": None, "pipe": None}
 
 
 def test_full_temporary_folder_is_named() -> None:

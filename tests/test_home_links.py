@@ -11,7 +11,7 @@ from link_tables import assert_same, make_table
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
-from sionna_partial.datasets.link_table import LinkTable, stage_name
+from sionna_partial.datasets.shards import LinkTable, stage_name
 from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features

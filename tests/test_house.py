@@ -38,10 +38,10 @@ ROOMS = {
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "pictures", "map_files"),
+        *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "map_files"),
     ),
     "worlds": ("buildings", "homes", "camera", "robot"),
-    "scene": ("outlines", "floor_plan", "scene"),
+    "scene": ("outlines", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
         *("plan.room", "plan.beams", "plan.reflections", "plan.edges"),
@@ -49,29 +49,26 @@ ROOMS = {
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "windows", "features", "inputs"),
+        *("unobserved", "features", "inputs"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
     "measurements": ("measurements", "recordings", "wall_evidence", "assimilation", "localisation"),
-    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job", "coverage.predict"),
-    "channels": (
-        *("responses", "beams", "files"),
-        *("joint", "samples"),
-    ),
+    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
+    "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),
-    "differentiable": ("smooth_lengths", "scene"),
+    "differentiable": ("scene",),
     "calibration": ("measured_building", "material_fit", "calibration"),
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
     "live": ("coverage", "topics"),
-    "datasets": ("link_table", "home_links", "shards", "home_process", "dataset"),
-    "evaluation": ("metrics", "evaluate"),
+    "datasets": ("shards", "home_links", "dataset"),
+    "evaluation": ("evaluate",),
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
     "app": ("jobs", "files", "radio", "project", "answer", "session", "picture", "page", "server"),
-    "cli": ("options", "prediction", "learning", "planning", "live", "app"),
+    "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
@@ -103,7 +100,7 @@ HOMES = {
 
 STRAYS = {
     ("scene.scene", "sionna"): "the table of ITU materials",
-    ("datasets.home_process", "drjit"): "the threads of a worker",
+    ("datasets.home_links", "drjit"): "the threads of a worker",
 }
 """Modules that import one of them all the same, and what for."""
 
@@ -112,9 +109,9 @@ PLOTS_ARE_FOR = ("plots.", "app.", "cli.", "export", "demo", "reports")
 
 LATER = {
     "export:save_coverage": "`coverage.radio.save`",
-    "coverage.predict:predict_map": "`LinkModel.coverage`",
+    "coverage.job:predict_map": "`LinkModel.coverage`",
     **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
-    "channels.beams:beam_gains": "`TracedLinks.beam_gains`",
+    "channels.responses:beam_gains": "`TracedLinks.beam_gains`",
 }
 """What `later` imports from later rooms, besides plots, and the method that it is for."""
 

@@ -12,8 +12,7 @@ from typer.testing import CliRunner, Result
 
 from sionna_partial import cli
 from sionna_partial.constants import CellState
-from sionna_partial.datasets.home_links import Home, home_sources
-from sionna_partial.datasets.home_process import HomeTask, installed_versions
+from sionna_partial.datasets.home_links import Home, HomeTask, home_sources, installed_versions
 from sionna_partial.datasets.shards import shard_path, write_shard
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap

@@ -457,14 +457,6 @@ class TestListener:
         with pytest.raises(SettingsError, match=rf"powers\['/rssi'\] = {name!r} is not allowed: name one of the"):
             Listener(heard.live, Topics(powers=powers))
 
-    @pytest.mark.parametrize(
-        "given",
-        [{"map": "map"}, {"prefix": "/"}, {"powers": {"rssi": None}}, {"key_values": "/a b"}, {"robot_frame": ""}],
-    )
-    def test_names_that_no_topic_has(self, given: Any) -> None:
-        with pytest.raises(SettingsError, match=f"{next(iter(given))}.* is not allowed: give "):
-            Topics(**given)
-
     def test_powers_and_views(self) -> None:
         heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
         listener = Listener(heard.live, Topics(powers={"/rssi": "door"}, key_values="/wifi"))

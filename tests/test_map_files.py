@@ -14,6 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from meshes import OBSERVED, room, surface_m2
+from small_maps import HOUSE
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
@@ -412,24 +413,22 @@ def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, 
         FUNCTIONS[kind](*arrays, 0.05, **options)  # type: ignore[operator]
 
 
-@pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="the Gibson plans are not here")
-def test_every_gibson_plan_loads(tmp_path: Path) -> None:
-    sheets = sorted((SHARED / "gibson").glob("*/map.yaml"))
-    assert len(sheets) == 20
+@pytest.mark.parametrize("folder", ["gibson", "ros", None])
+def test_maps_of_robots_come_back(tmp_path: Path, folder: str | None) -> None:
+    """The cluttered house of this repository, and real maps where they are."""
+    sheets = sorted((SHARED / folder).rglob("*.yaml")) if folder else [HOUSE]
+    if not sheets:
+        pytest.skip("the real maps are not here")
     for sheet in sheets:
-        partial = load_map(sheet)
-        assert partial.shape == (480, 480)
-        assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
-        assert partial.is_complete == (sheet.parent.name != "Kerrtown"), "Kerrtown is cut off at its right border"
-        save_map(partial, tmp_path / "copy.yaml")
-        assert load_map(tmp_path / "copy.yaml") == partial
-        written, shipped = (path.read_bytes() for path in (tmp_path / "copy.pgm", sheet.parent / "map.pgm"))
-        assert written[-partial.state.size :] == shipped[-partial.state.size :]
-
-
-@pytest.mark.skipif(not (SHARED / "ros").is_dir(), reason="the ROS maps are not here")
-def test_every_ros_map_loads() -> None:
-    for sheet in (SHARED / "ros").glob("*.yaml"):
         partial = load_map(sheet)
         assert partial == load_map(sheet, strict=True)
         assert {FREE, WALL, UNKNOWN} == set(np.unique(partial.state).tolist())
+        save_map(partial, tmp_path / "copy.yaml")
+        assert load_map(tmp_path / "copy.yaml") == partial
+        if folder == "gibson":
+            assert (len(sheets), partial.shape) == (20, (480, 480))
+            assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
+            assert partial.is_complete == (sheet.parent.name != "Kerrtown"), "Kerrtown is cut off at its right border"
+            written, shipped = (path.read_bytes() for path in (tmp_path / "copy.pgm", sheet.parent / "map.pgm"))
+            assert written[-partial.state.size :] == shipped[-partial.state.size :]
+    assert folder or np.bincount(partial.state.ravel()).tolist() == [20_661, 5_813, 80_206]

@@ -27,7 +27,7 @@ from sionna_partial.prediction.map_networks import (
     scaled_inputs,
 )
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
-from sionna_partial.prediction.windows import CELLS_M, WINDOW_CELLS, WINDOWS
+from sionna_partial.prediction.unobserved import CELLS_M, WINDOW_CELLS, WINDOWS
 
 pytestmark = QUIET
 

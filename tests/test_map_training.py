@@ -23,7 +23,7 @@ from sionna_partial.prediction.map_networks import (
     receiver_offsets_m,
     scaled_inputs,
 )
-from sionna_partial.prediction.windows import WINDOW_CELLS
+from sionna_partial.prediction.unobserved import WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET

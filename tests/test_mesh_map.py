@@ -12,7 +12,7 @@ from meshes import OBSERVED, box, room, scene_mesh, surface_m2
 from scipy import ndimage
 
 from sionna_partial.constants import CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map

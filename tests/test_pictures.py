@@ -10,7 +10,7 @@ from PIL import Image
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.pictures import otsu_threshold
+from sionna_partial.maps.drawings import otsu_threshold
 
 PIXEL_M = 0.02
 FREE, WALL, UNKNOWN = CellState

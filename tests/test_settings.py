@@ -2,8 +2,6 @@
 
 import math
 import re
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
@@ -22,19 +20,10 @@ from sionna_partial.settings import (
     ITU_BANDS_GHZ,
     DatasetSettings,
     Material,
-    PredictorSettings,
     SceneSettings,
     SensorSettings,
     TraceSettings,
 )
-
-ITU_BANDS_OF_SIONNA = """
-from sionna_partial.llvm import load_llvm
-load_llvm()
-from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
-from sionna_partial.settings import ITU_BANDS_GHZ
-assert {name: tuple(bands) for name, bands in ITU_MATERIALS_PROPERTIES.items()} == ITU_BANDS_GHZ
-"""
 
 
 def test_link_and_cell_states() -> None:
@@ -44,127 +33,194 @@ def test_link_and_cell_states() -> None:
 
 
 NO_NUMBERS = (math.nan, math.inf, -math.inf, "1", None, True, [1.0])
-RANGES = {
-    (Material, "relative_permittivity"): ("[1, 1e+06]", (1, 1.0, 1e6), (0.999, -1, 1.1e6)),
-    (Material, "conductivity_s_m"): ("[0, 1e+09]", (0, 0.0, 1e9), (-1e-9, 2e9)),
-    (Material, "thickness_m"): ("(0, 10]", (1e-9, 10), (0, -0.1, 10.1)),
-    (Material, "conductivity_exponent"): ("[0, 2]", (0, 0.0, 2), (-0.1, 2.1)),
-    (SceneSettings, "bridge_gap_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "range_noise_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "drift_m_per_m"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "missed_wall_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "missed_return_fraction"): ("[0, 1]", (0, 1.0), (-0.1, 1.1)),
-    (SensorSettings, "heading_noise_deg"): ("[0, 180]", (0, 180.0), (-0.1, 180.1)),
-    (SensorSettings, "field_of_view_deg"): ("(0, 360]", (1e-9, 90, 360.0), (0, -0.1, 360.1)),
-    (SensorSettings, "range_m"): ("(0, 100]", (1e-9, 3.2, 100), (0, -0.1, 100.1)),
-    (TraceSettings, "frequency_hz"): ("[1e+06, 1e+12]", (1e6, 28e9, 1e12), (0, -28e9, 1.1e12)),
-    (TraceSettings, "max_depth"): ("[0, 10]", (0, 10), (-1, 11)),
-    (TraceSettings, "diffraction_walls"): ("[0, 2]", (0, 2), (-1, 3)),
-    (TraceSettings, "samples_per_tx"): ("[1, 100000000]", (1, 10**8), (0, 10**8 + 1)),
-    (TraceSettings, "seed"): ("[0, 2147483647]", (0, 2**31 - 1), (-1, 2**31)),
+RANGES = """
+Material relative_permittivity number [1, 1e+06], conductivity_s_m number [0, 1e+09], thickness_m number (0, 10],
+    conductivity_exponent number [0, 2]
+SceneSettings bridge_gap_m number [0, 1]
+TraceSettings frequency_hz number [1e+06, 1e+12], max_depth whole [0, 10], diffraction_walls whole [0, 2],
+    power_tolerance_db number [0, 1], max_walls whole [1, 16], wall_depth_m number [0, 10],
+    samples_per_tx whole [1, 100000000], seed whole [0, 2147483647]
+SensorSettings range_noise_m number [0, 1], drift_m_per_m number [0, 1], missed_wall_fraction number [0, 1],
+    field_of_view_deg number (0, 360], range_m number (0, 100], heading_noise_deg number [0, 180],
+    missed_return_fraction number [0, 1]
+DatasetSettings links_per_home whole [1, 1000000], transmitters_per_home whole [1, 1000], seed whole [0, 2147483647],
+    tx_height_m number (0, 1000], rx_height_m number (0, 1000], margin_m number [0, 1000],
+    short_link_fraction number [0, 1]
+PredictorSettings frequency_hz number [1e+06, 1e+12], passes whole [1, 1000000], steps whole [1, 1000000],
+    batch_size whole [1, 1000000], learning_rate number (0, 1], minimum_links whole [1, 1000000],
+    seed whole [0, 1000000000]
+PlacementSettings threshold_db number (-150, 0], seed whole [0, 9223372036854775807]
+Antenna azimuth_deg number [-360, 360], downtilt_deg number [-90, 90], rows whole [1, 64], columns whole [1, 64],
+    beam whole [0, 4095]
+Transmitter x_m number [-1e+06, 1e+06], y_m number [-1e+06, 1e+06], z_m number [0, 1000], eirp_dbm number [-200, 200]
+RadioSettings frequency_hz number [1e+06, 1e+12], rx_height_m number [0, 1000], spacing_m number [0.02, 10],
+    bandwidth_hz number [1000, 1e+11], threshold_dbm number [-200, 100], eirp_dbm number [-200, 200]
+LinkBudget noise_figure_db number [0, 100], bandwidth_hz number [1, 1e+11], load number [0, 1],
+    sinr_threshold_db number [-200, 200]
+LiveSettings threshold_db number [-150, 0], spacing_m number (0, 10], rx_height_m number [0, 100],
+    tx_power_dbm number [-200, 200], refresh_s number [0.1, 1e+06], views_every_s number [0, 1e+06],
+    max_cost whole [1, 100]
+"""
+"""Class, fields, and for each a number (or a whole number) in an interval."""
+
+BESIDE = {
+    ("DatasetSettings", "links_per_home"): {"transmitters_per_home": 1},
+    ("DatasetSettings", "transmitters_per_home"): {"links_per_home": 1000},
+    ("Antenna", "beam"): {"rows": 64, "columns": 64},
+    **{("Transmitter", name): {"x_m": 0.0, "y_m": 0.0} for name in ("x_m", "y_m", "z_m", "eirp_dbm")},
 }
-WHOLE = ("max_depth", "diffraction_walls", "samples_per_tx", "seed")
+"""Other fields that make the ends of an interval valid."""
 
 
-@pytest.mark.parametrize(("kind", "name"), RANGES)
-def test_ranges(kind: type, name: str) -> None:
-    """Both ends are allowed; each message has the name, the value and what is allowed."""
-    span, allowed, refused = RANGES[kind, name]
-    for value in allowed:
-        assert getattr(kind(**{name: value}), name) == value
-    for value in NO_NUMBERS:
-        with pytest.raises(SettingsError, match=re.escape(f"{name} = {value!r} is not allowed: give a ")):
-            kind(**{name: value})
-    for value in refused:
-        number = "whole number" if name in WHOLE else "number"
-        expected = f"{name} = {value!r} is not allowed: give a {number} in {span}."
-        with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
-            kind(**{name: value})
-
-
-SWITCHES = {
-    (TraceSettings, "diffraction"): None,
-    (TraceSettings, "open_ends"): False,
-    (TraceSettings, "refraction"): None,
-    (TraceSettings, "diffuse_reflection"): False,
-    (SceneSettings, "ceiling"): True,
-}
-
-
-@pytest.mark.parametrize(("kind", "name"), SWITCHES)
-def test_switches(kind: type, name: str) -> None:
-    default = SWITCHES[kind, name]
-    assert getattr(kind(), name) is default
-    for allowed in (True, False, default):
-        assert getattr(kind(**{name: allowed}), name) is allowed
-    assert getattr(kind(**{name: np.bool_(True)}), name) is True
-    for value in (1, 0, "yes", *([] if default is None else [None])):
-        expected = f"{name} = {value!r} is not allowed: give True or False."
-        with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
-            kind(**{name: value})
-
-
-def all_settings(kind: type = Checked) -> list[type]:
-    """Return the settings classes of all modules."""
+def settings_classes(kind: type = Checked) -> dict[str, type]:
+    """Return the settings classes of all modules by name."""
     for module in ("app.session", "coverage.link_budget", "live.topics", "tracing.antennas"):
         import_module(f"sionna_partial.{module}")
-    return [each for own in kind.__subclasses__() for each in (own, *all_settings(own))]
+    own = {each.__name__: each for each in kind.__subclasses__()}
+    return own | {name: each for child in own.values() for name, each in settings_classes(child).items()}
 
 
-def texts() -> list[tuple[type, str]]:
-    """Return each settings class, and a field of it that holds text."""
-    fields = [(kind, name, str(hint)) for kind in all_settings() for name, hint in get_type_hints(kind).items()]
-    return [(kind, name) for kind, name, hint in fields if re.search(r"\bstr\b", hint)]
+CLASSES = settings_classes()
+FIELDS = {
+    (name, field): hint
+    for name, kind in CLASSES.items()
+    for field, hint in get_type_hints(kind, include_extras=True).items()
+}
 
 
-@pytest.mark.parametrize(("kind", "name"), texts())
-def test_texts(kind: type, name: str) -> None:
-    for value in (3, 2.5, True, b"map", ["map"]):
-        with pytest.raises(SettingsError, match=f"^{name}.* is not allowed: "):
-            kind(**{name: value})
+def ranges() -> list[tuple[str, str, str, str]]:
+    """Return class, field, kind of number and interval of each entry of RANGES."""
+    return [
+        (row.split()[0], *entry)
+        for row in re.sub(r",\n +", ", ", RANGES.strip()).splitlines()
+        for entry in re.findall(r"(\w+) (number|whole) ([\[(].*?\])", row)
+    ]
 
 
-def test_texts_are_found() -> None:
-    assert {"LiveSettings.frame", "Topics.robot_frame", "Antenna.pattern"} <= {
-        f"{kind.__name__}.{name}" for kind, name in texts()
+def test_every_range_is_in_the_table() -> None:
+    assert {(name, field) for name, field, *_ in ranges()} == {
+        key for key, hint in FIELDS.items() if "Within" in str(hint)
     }
 
 
-def test_scene_choices() -> None:
-    with pytest.raises(SettingsError, match=r"material = 5 is not allowed: give Material\(\.\.\.\)"):
-        SceneSettings(material=5)  # type: ignore[arg-type]
-    for extent in ("observed", "none"):
-        assert SceneSettings(floor_extent=extent).floor_extent == extent  # type: ignore[arg-type]
-    expected = "floor_extent = 'all' is not allowed: choose one of observed, none."
-    with pytest.raises(SettingsError, match=re.escape(expected)):
-        SceneSettings(floor_extent="all")  # type: ignore[arg-type]
-    for outline in ("lines", "cells"):
-        assert SceneSettings(outline=outline).outline == outline  # type: ignore[arg-type]
-    expected = "outline = 'walls' is not allowed: choose one of lines, cells."
-    with pytest.raises(SettingsError, match=f"^{re.escape(expected)}$"):
-        SceneSettings(outline="walls")  # type: ignore[arg-type]
+@pytest.mark.parametrize(("name", "field", "number", "span"), ranges())
+def test_ranges(name: str, field: str, number: str, span: str) -> None:
+    """Both ends are allowed, and nothing beyond; each message has the name, the value and the interval."""
+    kind, beside = CLASSES[name], BESIDE.get((name, field), {})
+    low, high = map(int if number == "whole" else float, span[1:-1].split(", "))
+    if number == "whole":
+        first, below, above = low, low - 1, high + 1
+    else:
+        first, below, above = low, math.nextafter(low, -math.inf), math.nextafter(high, math.inf)
+    if span[0] == "(":
+        first, below = math.nextafter(low, math.inf), low
+    for value in (first, high):
+        assert getattr(kind(**beside | {field: value}), field) == value
+    default = kind.__dataclass_fields__[field].default
+    wrong = [below, above, -1e300, 1e300, *[low + 0.5] * (number == "whole"), *NO_NUMBERS]
+    for value in (value for value in wrong if value is not default):
+        with pytest.raises(SettingsError) as caught:
+            kind(**beside | {field: value})
+        words = f"{field} = {value!r} is not allowed: give a {number.replace('whole', 'whole number')} in {span}."
+        assert str(caught.value).partition(" Did you mean ")[0] == words
+
+
+SWITCHES = """
+TraceSettings diffraction None, open_ends False, refraction None, diffuse_reflection False
+SceneSettings ceiling True
+PredictorSettings diffraction True, through_walls False
+RadioSettings through_walls None
+Topics unknown False
+"""
+"""Class, switches and their defaults."""
+
+
+def switches() -> dict[tuple[str, str], str]:
+    """Return the default of each switch."""
+    rows = (row.partition(" ") for row in SWITCHES.strip().splitlines())
+    return {(name, entry.split()[0]): entry.split()[1] for name, _, entries in rows for entry in entries.split(", ")}
+
+
+def test_every_switch_is_in_the_table() -> None:
+    assert {*switches()} == {key for key, hint in FIELDS.items() if hint is bool or hint == bool | None}
+
+
+@pytest.mark.parametrize(("name", "field"), switches())
+def test_switches(name: str, field: str) -> None:
+    kind, default = CLASSES[name], {"None": None, "False": False, "True": True}[switches()[name, field]]
+    assert getattr(kind(), field) is default
+    for allowed in (True, False, default):
+        assert getattr(kind(**{field: allowed}), field) is allowed
+    assert getattr(kind(**{field: np.bool_(True)}), field) is True
+    for value in (1, 0, "yes", *([] if default is None else [None])):
+        with pytest.raises(SettingsError, match=f"^{field} = {value!r} is not allowed: give True or False.$"):
+            kind(**{field: value})
+
+
+@pytest.mark.parametrize(("name", "field"), [key for key, hint in FIELDS.items() if re.search(r"\bstr\b", str(hint))])
+def test_texts(name: str, field: str) -> None:
+    for value in (3, 2.5, True, b"map", ["map"]):
+        with pytest.raises(SettingsError, match=f"^{field}.* is not allowed: "):
+            CLASSES[name](**{field: value})
 
 
 @pytest.mark.parametrize(
-    ("frequency_hz", "end"),
+    ("name", "field", "allowed"),
     [
-        (28, " Did you mean 28e9?"),
-        (3.5, " Did you mean 3.5e9?"),
-        (3500, " Did you mean 3500e6?"),
-        (0, "."),
-        (2e12, "]."),
+        ("SceneSettings", "floor_extent", "observed, none"),
+        ("SceneSettings", "outline", "lines, cells"),
+        ("SensorSettings", "fusion", "slam_toolbox, gmapping, cartographer, vacuum"),
+        ("PredictorSettings", "networks", "paper, paths, map"),
+        ("PlacementSettings", "objective", "coverage, percentile"),
     ],
 )
-def test_frequency_in_another_unit(frequency_hz: float, end: str) -> None:
-    with pytest.raises(SettingsError, match=re.escape("is not allowed: give a number in [1e+06, 1e+12].")) as error:
-        TraceSettings(frequency_hz=frequency_hz)
-    assert str(error.value).endswith(end)
+def test_choices(name: str, field: str, allowed: str) -> None:
+    kind = CLASSES[name]
+    for word in allowed.split(", "):
+        assert getattr(kind(**{field: word}), field) == word
+    for value in ("all", None):
+        message = f"{field} = {value!r} is not allowed: choose one of {allowed}."
+        with pytest.raises(SettingsError, match=f"^{re.escape(message)}$"):
+            kind(**{field: value})
+
+
+STAGES = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
+FREQUENCIES = "give a number in [1e+06, 1e+12]."
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "value", "remedy"),
+    [
+        ("SceneSettings", "material", 5, "give Material(...)."),
+        ("SceneSettings", "material", "cheese", "choose one of drywall, brick"),
+        ("Material", "itu", "cheese", "choose one of vacuum, concrete, brick, "),
+        ("TraceSettings", "frequency_hz", 28, f"{FREQUENCIES} Did you mean 28e9?"),
+        ("TraceSettings", "frequency_hz", 3.5, f"{FREQUENCIES} Did you mean 3.5e9?"),
+        ("TraceSettings", "frequency_hz", 3500, f"{FREQUENCIES} Did you mean 3500e6?"),
+        *(("TraceSettings", "frequency_hz", value, f"{FREQUENCIES}$") for value in (0, 2e12)),
+        ("DatasetSettings", "links_per_home", 3, "give at least 4, one for each of the transmitters_per_home."),
+        *(("DatasetSettings", "stages", value, STAGES) for value in ((), [0, 50], (50, 0), (0, 0), (0, 2.5), (-1, 2))),
+        ("DatasetSettings", "sensor", TraceSettings(), "give SensorSettings(...), or 'mixed'."),
+        ("DatasetSettings", "scene", None, "give SceneSettings(...)."),
+        ("DatasetSettings", "trace", SceneSettings(), "give TraceSettings(...)."),
+        ("Topics", "map", "map", "give the full name of a topic, such as /map."),
+        ("Topics", "prefix", "/", "give the full name of a topic"),
+        ("Topics", "powers", {"rssi": None}, "give the full name of a topic"),
+        ("Topics", "powers", 3, "give a mapping of topics to transmitters."),
+        ("Topics", "key_values", "/a b", "give the full name of a topic"),
+        ("Topics", "robot_frame", "", "give a frame, such as base_link."),
+        ("RadioSettings", "material", "cheese", "choose one of "),
+    ],
+)
+def test_refused(name: str, field: str, value: object, remedy: str) -> None:
+    given = "'rssi'" if value == {"rssi": None} else shown(value)
+    message = f"{re.escape(given)} is not allowed: {re.escape(remedy)}".replace(r"\$", "$")
+    with pytest.raises(SettingsError, match=f"^{field}.* = {message}"):
+        CLASSES[name](**{field: value})
 
 
 def test_itu_names() -> None:
     assert {Material(itu=name).itu for name in ITU_BANDS_GHZ} == set(ITU_BANDS_GHZ)
-    with pytest.raises(SettingsError, match="itu = 'cheese' is not allowed: choose one of vacuum, concrete, brick, "):
-        Material(itu="cheese")
 
 
 @pytest.mark.parametrize(
@@ -193,69 +249,16 @@ def test_frequency_is_allowed_inside_a_band_alone(name: str, frequency_ghz: floa
             Material(itu=name).require_frequency(frequency_ghz * 1e9)
 
 
-def test_itu_bands_are_those_of_sionna() -> None:
-    """In a process of its own, since Sionna starts Dr.Jit."""
-    done = subprocess.run([sys.executable, "-c", ITU_BANDS_OF_SIONNA], capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_defaults_of_data_sets_are_the_papers() -> None:
+    settings = DatasetSettings()
+    assert (settings.links_per_home, settings.stages) == (400, (0, 50, 100, 150, 200))
+    assert (settings.tx_height_m, settings.rx_height_m) == (1.5, 1.5)
+    assert (settings.sensor, settings.scene, settings.trace) == (SensorSettings(), SceneSettings(), TraceSettings())
 
 
-class TestDatasetSettings:
-    def test_defaults_are_the_papers(self) -> None:
-        settings = DatasetSettings()
-        assert (settings.links_per_home, settings.stages) == (400, (0, 50, 100, 150, 200))
-        assert (settings.tx_height_m, settings.rx_height_m) == (1.5, 1.5)
-        assert (settings.sensor, settings.scene, settings.trace) == (SensorSettings(), SceneSettings(), TraceSettings())
-
-    @pytest.mark.parametrize(
-        ("name", "value", "remedy"),
-        [
-            ("links_per_home", 0, "give a whole number in [1, 1000000]."),
-            ("links_per_home", 3, "give at least 4, one for each of the transmitters_per_home."),
-            ("links_per_home", 400.0, "give a whole number in [1, 1000000]."),
-            ("transmitters_per_home", 0, "give a whole number in [1, 1000]."),
-            ("seed", -1, "give a whole number in [0, 2147483647]."),
-            ("stages", (), "give increasing whole numbers of 0 or more"),
-            ("stages", [0, 50], "give increasing whole numbers of 0 or more"),
-            ("stages", (50, 0), "give increasing whole numbers of 0 or more"),
-            ("stages", (0, 0), "give increasing whole numbers of 0 or more"),
-            ("stages", (0, 2.5), "give increasing whole numbers of 0 or more"),
-            ("stages", (-1, 2), "give increasing whole numbers of 0 or more"),
-            ("tx_height_m", 0.0, "give a number in (0, 1000]."),
-            ("rx_height_m", math.nan, "give a number in (0, 1000]."),
-            ("margin_m", -0.1, "give a number in [0, 1000]."),
-            ("sensor", TraceSettings(), "give SensorSettings(...), or 'mixed'."),
-            ("scene", None, "give SceneSettings(...)."),
-            ("trace", SceneSettings(), "give TraceSettings(...)."),
-        ],
-    )
-    def test_refused(self, name: str, value: object, remedy: str) -> None:
-        with pytest.raises(SettingsError, match=re.escape(f"{name} = {shown(value)} is not allowed: {remedy}")):
-            DatasetSettings(**{name: value})
-
-    def test_material_that_the_frequency_does_not_suit(self) -> None:
-        with pytest.raises(SettingsError, match=r"ITU material 'carpet_tile' is defined for 1-40 GHz"):
-            DatasetSettings(scene=SceneSettings(Material(itu="carpet_tile")), trace=TraceSettings(frequency_hz=60e9))
-
-
-class TestPredictorSettings:
-    @pytest.mark.parametrize(
-        ("change", "message"),
-        [
-            ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed"),
-            ({"learning_rate": 0.0}, "learning_rate = 0.0 is not allowed: give a number in (0, 1]"),
-            ({"networks": "Map"}, "networks = 'Map' is not allowed: choose one of paper, paths, map."),
-            ({"networks": None}, "networks = None is not allowed: choose one of"),
-            ({"diffraction": 1}, "diffraction = 1 is not allowed: give True or False."),
-            ({"passes": 0}, "passes = 0 is not allowed: give a whole number in [1, 1000000]."),
-            ({"steps": 1.5}, "steps = 1.5 is not allowed: give a whole number in [1, 1000000]."),
-            ({"batch_size": 0}, "batch_size = 0 is not allowed: give a whole number in [1, 1000000]."),
-            ({"minimum_links": True}, "minimum_links = True is not allowed: give a whole number in [1, 1000000]."),
-            ({"seed": -1}, "seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
-        ],
-    )
-    def test_refused(self, change: dict[str, object], message: str) -> None:
-        with pytest.raises(SettingsError, match=re.escape(message)):
-            PredictorSettings(**change)
+def test_material_that_the_frequency_does_not_suit() -> None:
+    with pytest.raises(SettingsError, match=r"ITU material 'carpet_tile' is defined for 1-40 GHz"):
+        DatasetSettings(scene=SceneSettings(Material(itu="carpet_tile")), trace=TraceSettings(frequency_hz=60e9))
 
 
 def test_materials_by_name() -> None:
@@ -265,8 +268,6 @@ def test_materials_by_name() -> None:
     assert repr(Material.named("brick")) == "Material(itu='brick', thickness_m=0.11)"
     custom = Material(4.0, 0.05, 0.2)
     assert eval(repr(custom)) == custom
-    with pytest.raises(SettingsError, match="material = 'cheese' is not allowed: choose one of drywall, brick"):
-        SceneSettings(material="cheese")  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

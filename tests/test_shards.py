@@ -15,9 +15,10 @@ from dataset_fakes import fake_links
 from link_tables import assert_same, make_dataset, make_table
 
 from sionna_partial.datasets import shards
-from sionna_partial.datasets.link_table import COLUMNS, LinkTable
 from sionna_partial.datasets.shards import (
+    COLUMNS,
     FORMAT,
+    LinkTable,
     LinkTraces,
     file_stem,
     open_links,

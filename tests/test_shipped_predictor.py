@@ -9,7 +9,7 @@ from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links
-from sionna_partial.datasets.link_table import LinkTable
+from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.evaluation.evaluate import WITH_INDOOR, Evaluation
 from sionna_partial.prediction.features import LEAST_NOISE, excess_noise
 from sionna_partial.prediction.map_networks import SEEN_WIDENING, WIDENING

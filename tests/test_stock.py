@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
-from sionna_partial.errors import BackendError
+from sionna_partial.coverage.job import predict_map
+from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import build_scene, write_scene
-from sionna_partial.settings import SceneSettings, TraceSettings
+from sionna_partial.scene.scene import build_scene, export_scene, write_scene
+from sionna_partial.settings import ITU_BANDS_GHZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import load_sionna, open_scene
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.stock import listed_before, stock_paths
@@ -122,6 +123,33 @@ class TestStockPaths:
             list(stock_paths(open_scene(room_xml, 28e9), TraceSettings(), TX, RX))
 
 
+class TestRadioMap:
+    def test_coverage_and_solver_on_one_grid(self, tmp_path: Path) -> None:
+        settings = TraceSettings(max_depth=1, diffraction=False, samples_per_tx=200_000)
+        tx = {"door": (1.03, 0.52, 2.3), "wall": (4.1, 2.2, 2.1)}
+        coverage = predict_map(_room(), tx, spacing_m=0.5, predictor="paper", trace_settings=settings, progress=False)
+        scene = load_sionna().load_scene(str(export_scene(_room(), tmp_path / "scene") / "scene.xml"))
+        floor = coverage.radio.radio_map(scene)
+        x, y = np.meshgrid(coverage.x, coverage.y)
+        np.testing.assert_allclose(floor.cell_centers.numpy()[..., :2], np.stack([x, y], axis=-1), atol=1e-5)
+        mean_db = coverage.gain_mean_db.to_numpy()
+        expected = np.where(mean_db > -150.0, 10.0 ** (mean_db / 10.0), 0.0)
+        np.testing.assert_allclose(floor.path_gain.numpy(), expected, rtol=1e-5)
+        assert [*scene.transmitters] == ["door", "wall"]
+        stock = coverage.radio.stock_gain(scene)
+        assert stock.dims == ("tx", "y", "x")
+        in_sight = (coverage.partial_link_state == 1) & (coverage.distance_m > 1.0)
+        assert in_sight.sum() > 20
+        assert abs(stock - coverage.partial_gain_db).where(in_sight).quantile(0.9) < 1.0
+
+    def test_what_cannot_be_compared_is_named(self, room_xml: Path) -> None:
+        coverage = predict_map(_room(), (1.03, 0.52, 1.5), spacing_m=0.5, predictor="paper", progress=False)
+        with pytest.raises(SettingsError, match=r"scene = 'scene.xml' is not allowed: give a scene of sionna.rt.load"):
+            coverage.radio.radio_map("scene.xml")
+        with pytest.raises(SettingsError, match=r"rx_height_m = 1.5 is the height of tx, and RadioMapSolver misses"):
+            coverage.radio.stock_gain(open_scene(room_xml, 28e9))
+
+
 class TestListedBefore:
     def test_one_path_of_each_kind_is_kept(self) -> None:
         interactions = np.array([[1, 0], [1, 0], [1, 0], [4, 0], [1, 1], [1, 1], [0, 0], [0, 0]], np.uint8)
@@ -136,3 +164,10 @@ class TestListedBefore:
 
     def test_no_paths(self) -> None:
         assert listed_before(np.zeros((0, 2), np.uint8), np.zeros((0, 2, 3))).shape == (0,)
+
+
+def test_itu_bands_are_those_of_sionna() -> None:
+    load_sionna()
+    from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+    assert {name: tuple(bands) for name, bands in ITU_MATERIALS_PROPERTIES.items()} == ITU_BANDS_GHZ

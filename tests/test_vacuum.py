@@ -10,6 +10,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
+from small_maps import VACUUM
 from vacuum_files import LEFT, PIXEL_CM, ROOMS, SIZE_CM, TOP, recording, valetudo_map, write_json, write_recording
 
 import sionna_partial as sp
@@ -18,10 +19,11 @@ from sionna_partial.errors import MapError, MeasurementError
 
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "vacuum"
 SIZES = {
-    "3irobotix_converted_3790": (9.55, 11.25, 7, 20718),
-    "3irobotix_viomi_v7_47_cleaned_segment_ids": (4.35, 10.2, 2, 4333),
-    "dreame_d9_1093_multi_map": (6.2, 11.6, 7, 17604),
-    "roborock_S5_FW2020_with_segments": (22.9, 15.95, 8, 44832),
+    VACUUM: (8.6, 8.05, 0, 11220),
+    SHARED / "3irobotix_converted_3790.json": (9.55, 11.25, 7, 20718),
+    SHARED / "3irobotix_viomi_v7_47_cleaned_segment_ids.json": (4.35, 10.2, 2, 4333),
+    SHARED / "dreame_d9_1093_multi_map.json": (6.2, 11.6, 7, 17604),
+    SHARED / "roborock_S5_FW2020_with_segments.json": (22.9, 15.95, 8, 44832),
 }
 """Extent along x and y [m], number of rooms, and free pixels (the sum of `pixelCount`, or of half of `pixels`)."""
 
@@ -66,12 +68,12 @@ def test_names_of_rooms(tmp_path: Path) -> None:
     assert sp.load_map(write_json(tmp_path / "home.json", content)).room_names == ("room 7", "k\\x1b[2Jitchen 2")
 
 
-@pytest.mark.parametrize("name", SIZES)
-def test_maps_of_real_homes(name: str) -> None:
-    if not SHARED.is_dir():
+@pytest.mark.parametrize("path", SIZES, ids=lambda path: path.stem)
+def test_maps_of_real_homes(path: Path) -> None:
+    if not path.is_file():
         pytest.skip("needs the maps of the shared folder")
-    partial = sp.load_map(SHARED / f"{name}.json")
-    x_m, y_m, rooms, free = SIZES[name]
+    partial = sp.load_map(path)
+    x_m, y_m, rooms, free = SIZES[path]
     report = partial.import_report
     assert report is not None
     assert (report.extent_m, len(partial.room_names)) == (pytest.approx((x_m, y_m)), rooms)

@@ -8,7 +8,7 @@ from hypothesis.extra import numpy as hnp
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.windows import (
+from sionna_partial.prediction.unobserved import (
     CELLS_M,
     CHANNELS,
     WINDOW_CELLS,

@@ -24,7 +24,7 @@ PIXEL_CM, SIZE_CM, LEFT, TOP = 50, 2000, 10, 20
 POINTS = [{"bssid": f"00:11:22:33:44:{end}", "ssid": "home", "signal": -50} for end in ("aa", "bb")]
 
 
-def valetudo_map(rows: str = ROOMS, *, compressed: bool = True) -> dict[str, Any]:
+def valetudo_map(rows: str = ROOMS, *, compressed: bool = True, pixel_cm: int = PIXEL_CM) -> dict[str, Any]:
     """Return a ValetudoMap as its JSON has it."""
     cells = np.array([[*row] for row in rows.split()])
     layers = []
@@ -37,13 +37,13 @@ def valetudo_map(rows: str = ROOMS, *, compressed: bool = True) -> dict[str, Any
         kind = {"#": "wall", "f": "floor", ".": "unknown"}.get(mark, "segment")
         content = {"compressedPixels": runs.ravel().tolist()} if compressed else {"pixels": pixels.ravel().tolist()}
         layers.append({"__class": "MapLayer", "type": kind, "metaData": data} | content)
-    charger = {"type": "charger_location", "points": [PIXEL_CM * (LEFT + 1.5), PIXEL_CM * (TOP + 1.5)]}
+    charger = {"type": "charger_location", "points": [pixel_cm * (LEFT + 1.5), pixel_cm * (TOP + 1.5)]}
     forbidden = {"type": "no_go_area", "points": [600, 1050, 700, 1050, 700, 1150, 600, 1150]}
     return {
         "__class": "ValetudoMap",
         "metaData": {"version": 2 if compressed else 1},
         "size": {"x": SIZE_CM, "y": SIZE_CM},
-        "pixelSize": PIXEL_CM,
+        "pixelSize": pixel_cm,
         "layers": layers,
         "entities": [charger, forbidden],
     }

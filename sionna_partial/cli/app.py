@@ -13,9 +13,8 @@ from typer.core import TyperGroup
 import sionna_partial.cli.options as opt
 from sionna_partial import __version__
 from sionna_partial.cli.learning import dataset, evaluate, train
-from sionna_partial.cli.live import live, open_app
 from sionna_partial.cli.options import OnceCommand, TransmitterCommand
-from sionna_partial.cli.planning import calibrate, next_views, place
+from sionna_partial.cli.planning import calibrate, live, next_views, open_app, place
 from sionna_partial.cli.prediction import channels, demo, explore, export_scene, info, network, predict
 from sionna_partial.errors import SionnaPartialError, one_line
 from sionna_partial.process import end_at_signals, end_process

@@ -2,7 +2,7 @@
 
 import json
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -24,8 +24,10 @@ from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction
+from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.antennas import MAX_GAIN_DBI
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.stock import MapPlane, planar_radio_map, stock_gain_db
 
 WALL_PARTS = 6
 """`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
@@ -548,6 +550,69 @@ class CoverageAccessor:
         """Return P(path gain > threshold), thresholds () or (T, 1, 1); an outage is never above."""
         columns = {name: self._coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
         return LinkPrediction(**columns).probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
+
+    def radio_map(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> Any:
+        """Return the mean path gain as a radio map of Sionna RT, for `scene.preview`, `scene.render` and its own plots.
+
+        Cells without receiver, or with an outage, are empty, as in Sionna RT. The transmitters of the scene are
+        replaced by the transmitters of the coverage.
+
+        Parameters
+        ----------
+        scene : sionna.rt.Scene
+            The scene of `export_scene`, loaded by `sionna.rt.load_scene`.
+        scene_offset_m : (2,) sequence of float
+            `scene_offset` in `map.yaml` of the exported scene, which is not 0 on maps far from the origin [m].
+
+        Returns
+        -------
+        sionna.rt.PlanarRadioMap
+
+        Raises
+        ------
+        SettingsError
+            For something else than a scene.
+        """
+        plane, tx, maps = self._plane(scene_offset_m)
+        return planar_radio_map(scene, plane, tx, np.stack([one["gain_mean_db"].to_numpy() for one in maps]))
+
+    def stock_gain(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> xr.DataArray:
+        """Return the path gain [dB] that Sionna RT's `RadioMapSolver` finds in the exported scene, on the same grid.
+
+        Frequency, depth, kinds of interactions, rays and transmitters are taken from the coverage. Compare with
+        `partial_gain_db`, the trace of the same scene by this package: the solver averages over a cell the power that
+        enters it, misses rays, and counts crossed walls in the depth. `gain_mean_db` also predicts unobserved walls.
+
+        Parameters
+        ----------
+        scene, scene_offset_m
+            As of `radio_map`.
+
+        Returns
+        -------
+        xarray.DataArray
+            On (y, x) or (tx, y, x): -150 dB where no ray arrives, NaN where no receiver can stand.
+
+        Raises
+        ------
+        SettingsError
+            For something else than a scene, or a transmitter at the height of the receivers.
+        """
+        plane, tx, maps = self._plane(scene_offset_m)
+        settings = TraceSettings(**json.loads(maps[0].attrs["trace_settings"]))
+        gain_db, like = stock_gain_db(scene, plane, tx, settings), self._coverage["partial_gain_db"]
+        attributes = {"long_name": "path gain by the RadioMapSolver of Sionna RT", "units": "dB"}
+        found = like.copy(data=np.float32(gain_db.reshape(like.shape))).where(self._coverage["valid"] == 1)
+        return found.rename("stock_gain_db").assign_attrs(attributes)
+
+    def _plane(self, scene_offset_m: Sequence[float]) -> tuple[MapPlane, dict[str, Floats], list[xr.Dataset]]:
+        """Return the plane of the receivers, the transmitters by name in the scene, and the map of each."""
+        maps, offset_m = transmitters_of(self._coverage), np.array([*scene_offset_m, 0.0])[:3]
+        x_m, y_m = (self._coverage[name].to_numpy() - offset_m[axis] for axis, name in enumerate("xy"))
+        attributes = self._coverage.attrs
+        plane = MapPlane(x_m, y_m, float(attributes["spacing_m"]), float(attributes["rx_height_m"]))
+        tx = {name or "tx": np.subtract(one.attrs["transmitter_m"], offset_m) for name, one in maps.items()}
+        return plane, tx, [*maps.values()]
 
     def at(self, x: float, y: float) -> xr.Dataset:
         """Return all variables at the receiver nearest to world x and y [m].

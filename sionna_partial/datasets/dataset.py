@@ -17,11 +17,13 @@ from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm import parse_address, parse_host_port
 
 from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
-from sionna_partial.datasets.home_links import Home, HomeSource, home_sources
-from sionna_partial.datasets.home_process import (
+from sionna_partial.datasets.home_links import (
+    Home,
     HomeResult,
+    HomeSource,
     HomeTask,
     allow_homes,
+    home_sources,
     installed_versions,
     run_home,
     settings_record,

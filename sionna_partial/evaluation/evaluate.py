@@ -1,27 +1,62 @@
-"""Evaluate a predictor against baselines, on homes that it was trained on and on others: Predictor -> Evaluation."""
+"""Figures of merit of predictions, and the evaluation of a predictor against baselines, on training and other homes."""
 
 import itertools
 import json
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.datasets.link_table import LinkTable, stage_name
-from sionna_partial.datasets.shards import Dataset, LinkTraces, open_links, require_like
+from sionna_partial.datasets.shards import Dataset, LinkTable, LinkTraces, open_links, require_like, stage_name
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation.metrics import Calibration, Metrics, calibration, gain_errors_db, measure
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
+
+CONFIDENCE_BINS = 15
+"""Equal-width bins of the confidence in the calibration error."""
+
+PIT_BINS = 20
+"""Equal-width bins of the probability integral transform of the gain in `Calibration`."""
+
+INTERVAL = (0.05, 0.95)
+"""Levels of the central 90 % interval of the gain."""
+
+_NO_SPREAD_DB = 1e-6
+"""A standard deviation below this is rounding [dB]."""
+
+LEAST_PROBABILITY = 1e-4
+"""Least probability of the true link state in a likelihood: a map with errors excludes true states now and then."""
+
+LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, but may be wrong."""
+
+DEFINITIONS = {
+    "links": "number of links that were measured.",
+    "accuracy": "fraction of links whose likeliest link state is the true one.",
+    "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
+    "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
+    "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
+    "nll": "mean of -log P(true link state) - log p(true gain in dB given it) [nat], P as before; an outage has no "
+    f"second term, a standard deviation counts at least {LEAST_STD_DB:g} dB, p at least {LEAST_DENSITY:.1g} per dB.",
+    "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
+    f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
+    "likeliest state.",
+    "coverage_90": "fraction of links whose true gain lies in the central 90 % interval, by the randomised probability "
+    "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
+}
+"""Definitions of the `Metrics`."""
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
 
@@ -42,6 +77,125 @@ WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
 
 ALWAYS_OUTAGE = "always outage"
 """The baseline where most receivers are outside."""
+
+
+@dataclass(frozen=True)
+class Metrics:
+    """Figures of merit of one prediction of N links, see `DEFINITIONS`; nan where one has no finite value.
+
+    That is so without links; for `rmse_linked_db` if all links are in outage; and for `coverage_90` of a prediction
+    without any spread.
+    """
+
+    links: int
+    accuracy: float
+    rmse_db: float
+    rmse_linked_db: float
+    nll_state: float
+    nll: float
+    calibration_error: float
+    coverage_90: float
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the figures by name, None for nan, which JSON does not have."""
+        return {name: None if math.isnan(value) else value for name, value in asdict(self).items()}
+
+
+@dataclass(frozen=True, eq=False)
+class Reliability(Shown):
+    """Links, mean confidence and accuracy in bins of the confidence (`CONFIDENCE_BINS`,); 0 in an empty bin."""
+
+    links: NDArray[np.int64]
+    confidence: Floats
+    accuracy: Floats
+
+    @property
+    def error(self) -> float:
+        """Expected calibration error; nan without links."""
+        total = self.links.sum()
+        return float((self.links * np.abs(self.accuracy - self.confidence)).sum() / total) if total else math.nan
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration(Shown):
+    """Calibration of link state and gain.
+
+    `gain_pit` (PIT_BINS,) has the fractions of the randomised probability integral transforms of the true gains in bins
+    of equal width; all are equal when calibrated.
+    """
+
+    state: Reliability
+    gain_pit: Floats
+
+
+def measure(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Metrics:
+    """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
+    outage = link_state == LinkState.OUTAGE
+    errors_db = gain_errors_db(prediction, link_state, gain_db)
+    nll_state, nll = _negative_log_likelihoods(prediction, link_state, gain_db)
+    low, high = pit_fractions(prediction, link_state, gain_db, np.array(INTERVAL))
+    return Metrics(
+        links=len(link_state),
+        accuracy=_mean(prediction.link_state == link_state),
+        rmse_db=math.sqrt(_mean(errors_db**2)),
+        rmse_linked_db=math.sqrt(_mean(errors_db[~outage] ** 2)),
+        nll_state=nll_state,
+        nll=nll,
+        calibration_error=reliability(prediction, link_state).error,
+        coverage_90=float(high - low) if (prediction.gain_std_db > _NO_SPREAD_DB).any() else math.nan,
+    )
+
+
+def calibration(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Calibration:
+    """Measure the calibration of link state and gain."""
+    fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
+    return Calibration(reliability(prediction, link_state), np.diff(fractions))
+
+
+def gain_errors_db(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Floats:
+    """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
+    return prediction.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+
+
+def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
+    """Compare confidence and accuracy of the link state, bin by bin."""
+    confidence = np.max([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
+    bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
+    links = np.bincount(bins, minlength=CONFIDENCE_BINS)
+    right = (prediction.link_state == link_state).astype(np.float64)
+    sums = (np.bincount(bins, weights, minlength=CONFIDENCE_BINS) for weights in (confidence, right))
+    return Reliability(links, *(total / np.maximum(links, 1) for total in sums))
+
+
+def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
+    """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
+
+    The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
+    in an outage, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
+    prediction returns the levels themselves.
+    """
+    if len(link_state) == 0:
+        return np.full(len(levels), np.nan)
+    gain_db = np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+    below, upto = (1.0 - prediction.probability_above(at_db) for at_db in (np.nextafter(gain_db, -np.inf), gain_db))
+    width = np.maximum(upto - below, 1e-12)
+    return np.array([np.clip((level - below) / width, 0.0, 1.0).mean() for level in levels])
+
+
+def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
+    """Return the loss of the link state, and of link state and gain."""
+    los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
+    p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
+    mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)
+    std_db = np.maximum(np.where(los, prediction.gain_los_std_db, prediction.gain_nlos_std_db), LEAST_STD_DB)
+    state = -np.log(np.maximum(p, LEAST_PROBABILITY))
+    gain = 0.5 * ((gain_db - mean_db) / std_db) ** 2 + np.log(std_db * math.sqrt(2.0 * math.pi))
+    gain = np.where(outage, 0.0, np.minimum(gain, -math.log(LEAST_DENSITY)))
+    return _mean(state), _mean(state + gain)
+
+
+def _mean(values: NDArray[Any]) -> float:
+    return float(values.mean()) if len(values) else math.nan
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,7 @@
-"""DXF floor plans -> PartialMap: lines of the wall layers on cells, and the areas that they enclose."""
+"""Floor plans -> PartialMap: DXF drawings and pictures.
+
+Walls are the lines of the wall layers of a drawing, or the dark lines of a picture; what they enclose is free.
+"""
 
 import math
 import os
@@ -11,9 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, ImageOps
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, States, largest_by_area
+from sionna_partial.arrays import Bools, Indices, States, largest_by_area
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
@@ -35,6 +39,7 @@ from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, Ma
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, crossed_cells, fitted_grid, require_unit
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.ros_map import bare_image, opened_image
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
@@ -48,6 +53,13 @@ OPENING_M, SOLID_M = 2.0, 0.5
 
 MAX_ADDED, MAX_GROWTH = 8, 2.5
 """Most layers that are tried where walls enclose hardly any area; largest extent with one of them, in their extents."""
+
+THIN_M, FILLED_FRACTION = 0.06, 0.3
+"""Width up to which lines are furniture, doors and dimensions [m], where at least that fraction of the dark pixels is
+wider: on such plans walls are filled."""
+
+MARK_M = 0.5
+"""Extent along x and y up to which separate marks are text or symbols [m]."""
 
 
 def map_from_drawing(
@@ -369,3 +381,88 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
     state[inside] = CellState.FREE
     state[wall | (inside & (widest_m <= SOLID_M)[area])] = CellState.WALL
     return state[margin:-margin, margin:-margin]
+
+
+def read_picture(path: Path, *, resolution_m: float | None = None) -> PartialMap:
+    """Read a floor plan from a picture with dark walls on a bright ground, or bright walls on a dark one.
+
+    `resolution_m` is the edge of a pixel [m]. World x and y begin at the lower-left corner of the picture.
+    """
+    if resolution_m is None:
+        raise bare_image(path)
+    pixel_m = number_of(resolution_m)
+    if not 1e-4 <= pixel_m <= 10.0:
+        remedy = "give the metres per pixel, a known length [m] over its number of pixels, from 0.0001 to 10."
+        raise MapError(f"resolution_m = {shown(resolution_m)} is not allowed: {remedy}")
+    notes = ImportNotes(path, pixel_m, "resolution_m, metres per pixel")
+    wall = _walls(path, pixel_m, notes)
+    factor = max(1, math.floor(DEFAULT_RESOLUTION_M / pixel_m + 1e-6))
+    wall = np.flipud(wall)
+    wall = np.pad(wall, [(0, -size % factor) for size in wall.shape])
+    ny, nx = (size // factor for size in wall.shape)
+    wall = np.asarray(wall.reshape(ny, factor, nx, factor).any(axis=(1, 3)))
+    rows, columns = (np.flatnonzero(wall.any(axis=axis)) for axis in (1, 0))
+    wall = np.pad(wall[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], 1)
+    cell_m = factor * pixel_m
+    extent_m = cell_m * max(wall.shape)
+    if not POSSIBLE_M[0] <= extent_m <= POSSIBLE_M[1]:
+        remedy = "give the metres per pixel, a known length [m] over its number of pixels."
+        raise MapError(f"resolution_m = {pixel_m:g} makes walls that span {extent_m:g} m: {remedy}")
+    origin_m = (columns[0] - 1) * cell_m, (rows[0] - 1) * cell_m
+    empty = PartialMap(np.full(wall.shape, CellState.UNKNOWN), cell_m, origin_m)
+    state = states_of_lines(np.zeros((0, 2, 2)), empty, wall)
+    if not (state == CellState.FREE).any():
+        remedy = "give a picture in which walls are the darkest lines and close rooms, up to doors of 2 m."
+        raise MapError(f"path = '{path}' has walls that enclose nothing with resolution_m = {pixel_m:g}: {remedy}")
+    remedy = "give the metres per pixel as resolution_m."
+    return notes.attached_to(replace(empty, state=state), size=remedy, doors=remedy)
+
+
+def _walls(path: Path, pixel_m: float, notes: ImportNotes) -> Bools:
+    """Return which pixels are walls, the top row first, and note what was taken for them."""
+    shade = _shades(path)
+    count = np.bincount(shade.ravel(), minlength=256)
+    if np.count_nonzero(count) < 2:
+        raise MapError(f"path = '{path}' has one shade alone: give a picture of walls on a ground of another shade.")
+    threshold = otsu_threshold(count)
+    wall, side = shade <= threshold, "up to"
+    if wall.mean() > 0.5:
+        wall, side = ~wall, "above"
+    notes.notes.append(f"walls: shades {side} {threshold} of 255 (Otsu's threshold)")
+    width = round(THIN_M / pixel_m)
+    if width > 1:
+        wide = ndimage.binary_opening(wall, np.ones((width, width), dtype=bool))
+        if wide.sum() >= FILLED_FRACTION * wall.sum():
+            notes.skip("thin lines", ndimage.label(wall & ~wide)[1], f"narrower than {width * pixel_m:.2g} m")
+            wall = wide
+    pieces, _ = ndimage.label(wall, np.ones((3, 3), dtype=bool))
+    most = MARK_M / pixel_m
+    small = [max(part.stop - part.start for part in extent) <= most for extent in ndimage.find_objects(pieces)]
+    notes.skip("separate marks", sum(small), f"text or symbols up to {MARK_M:g} m")
+    wall = np.array([False, *(not each for each in small)])[pieces]
+    notes.use("connected walls", len(small) - sum(small))
+    if not wall.any():
+        what = f"path = '{path}' has no connected walls longer than {MARK_M:g} m with resolution_m = {pixel_m:g}"
+        raise MapError(f"{what}: give the metres per pixel, or a picture with darker walls.")
+    return np.asarray(wall)
+
+
+def _shades(path: Path) -> States:
+    """Return the shades of grey (rows, columns); transparent pixels are white."""
+    image = ImageOps.exif_transpose(opened_image(path, f"path = '{path}'", ("PNG", "JPEG", "BMP")))
+    if image.mode.startswith(("I", "F")):
+        values = np.asarray(image, dtype=np.float64)
+        return np.asarray(255 * (values - values.min()) / max(float(np.ptp(values)), 1e-9), dtype=np.uint8)
+    if image.has_transparency_data:
+        image = Image.alpha_composite(Image.new("RGBA", image.size, "white"), image.convert("RGBA"))
+    return np.asarray(image.convert("L"))
+
+
+def otsu_threshold(count: Indices) -> int:
+    """Return the largest shade of the darker class by the frequencies of shades (Otsu, IEEE Trans. SMC-9, 1979)."""
+    shade = np.arange(len(count))
+    dark, total = np.cumsum(count)[:-1], count.sum()
+    mean_dark = np.cumsum(count * shade)[:-1] / np.maximum(dark, 1)
+    mean_bright = ((count * shade).sum() - np.cumsum(count * shade)[:-1]) / np.maximum(total - dark, 1)
+    between = dark * (total - dark) * (mean_dark - mean_bright) ** 2
+    return int(np.flatnonzero(between == between.max()).mean())

@@ -447,7 +447,7 @@ def _read_vacuum(source: Path) -> PartialMap:
 
 
 def _read_picture(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.pictures import read_picture
+    from sionna_partial.maps.drawings import read_picture
 
     return read_picture(source, **options)
 

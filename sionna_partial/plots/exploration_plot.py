@@ -20,7 +20,7 @@ from PIL import Image
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
-from sionna_partial.coverage.predict import predict_map
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.exploration.explore import Exploration
 from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path

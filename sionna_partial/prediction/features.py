@@ -19,15 +19,16 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.unobserved import (
     GRAZE,
+    draw_windows,
     in_cells,
     is_enclosed,
     lengths_in_unknown_m,
     map_line_fractions,
     parts_at_walls,
+    transmitters,
     unobserved_lengths_m,
     walled_lengths_m,
 )
-from sionna_partial.prediction.windows import draw_windows, transmitters
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db

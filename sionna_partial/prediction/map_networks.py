@@ -25,7 +25,7 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, context_of, excess_noise
 from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
-from sionna_partial.prediction.windows import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
+from sionna_partial.prediction.unobserved import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import NetworkKind, PredictorSettings
 
 if TYPE_CHECKING:

@@ -30,7 +30,7 @@ from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer, tf
 from sionna_partial.prediction.predictor_files import shipped_bytes
-from sionna_partial.prediction.windows import overlaps
+from sionna_partial.prediction.unobserved import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import TraceSettings
 

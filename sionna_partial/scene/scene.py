@@ -25,8 +25,7 @@ from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
 from sionna_partial.maps.wall_cells import row_runs
-from sionna_partial.scene.floor_plan import Plan, prepare_plan
-from sionna_partial.scene.outlines import Outlines, cut_by_material, lattice_outlines, wall_outlines
+from sionna_partial.scene.outlines import Outlines, Plan, cut_by_material, lattice_outlines, prepare_plan, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
 _log = logging.getLogger(__name__)

@@ -276,7 +276,7 @@ class TracedLinks(Shown):
         0
         """
         options = {key: value for key, value in locals().items() if key != "self"}
-        return later("channels.beams:beam_gains")(self, **options)
+        return later("channels.responses:beam_gains")(self, **options)
 
     def to_xarray(self) -> xr.Dataset:
         """Return the links and their paths as a labelled Dataset.

@@ -1,6 +1,7 @@
-"""Paths by Sionna RT's public path solver, which shoots rays and finds most paths of any kind, not all."""
+"""Paths and radio maps by Sionna RT's public solvers, which shoot rays and find most paths of any kind, not all."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
 
@@ -9,9 +10,11 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.errors import BackendError
+from sionna_partial.checks import require
+from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.tracing.engine import load_sionna, set_antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
 from sionna_partial.tracing.paths import SolvedPaths, Wedges
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS
@@ -24,6 +27,10 @@ SAME_POINT_M = 0.03
 
 SAME_EDGE_M = 1e-3
 """Distance from an edge within which a diffraction is at that edge [m]."""
+
+
+_MARKER_M = 0.15
+"""Radius of the ball of a transmitter in previews and renderings [m]."""
 
 
 def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats) -> Iterator[SolvedPaths]:
@@ -72,8 +79,12 @@ def _options(settings: TraceSettings) -> dict[str, Any]:
         "samples_per_src": rays,
         "los": True,
         "seed": settings.seed,
-        **{argument: kind.is_on(settings) for kind in INTERACTIONS for argument in kind.arguments},
+        **_switches(settings),
     }
+
+
+def _switches(settings: TraceSettings) -> dict[str, bool]:
+    return {argument: kind.is_on(settings) for kind in INTERACTIONS for argument in kind.arguments}
 
 
 def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
@@ -132,3 +143,63 @@ def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -
         few &= ((at_walls & before).sum(axis=1) <= walls_a_side) & ((at_walls & ~before).sum(axis=1) <= walls_a_side)
         kept[diffracted] = few & beside & (z > SAME_EDGE_M) & (z < top_m - SAME_EDGE_M)
     return kept
+
+
+@dataclass(frozen=True)
+class MapPlane:
+    """Measurement plane of a radio map: cell centres x (nx,) and y (ny,), step and height in the scene [m]."""
+
+    x_m: Floats
+    y_m: Floats
+    spacing_m: float
+    height_m: float
+
+    @property
+    def arguments(self) -> dict[str, list[float]]:
+        """Arguments of Sionna RT's radio maps, which round the size up to whole cells."""
+        centre = [float(axis[0] + axis[-1]) / 2.0 for axis in (self.x_m, self.y_m)]
+        size = [(len(axis) - 0.5) * self.spacing_m for axis in (self.x_m, self.y_m)]
+        return {
+            "center": [*centre, self.height_m],
+            "orientation": [0.0, 0.0, 0.0],
+            "size": size,
+            "cell_size": [self.spacing_m, self.spacing_m],
+        }
+
+
+def planar_radio_map(scene: Any, plane: MapPlane, tx: Mapping[str, Sequence[float]], gain_db: Floats) -> Any:
+    """Return path gains (T, ny, nx) as a PlanarRadioMap; the scene's transmitters are replaced by `tx`."""
+    rt = load_sionna()
+    import mitsuba as mi
+
+    require(isinstance(scene, rt.Scene), "scene", scene, "give a scene of sionna.rt.load_scene.")
+    for name in [*scene.transmitters]:
+        scene.remove(name)
+    for name, position_m in tx.items():
+        place = [float(value) for value in position_m]
+        scene.add(rt.Transmitter(name, position=place, display_radius=_MARKER_M))
+    found = rt.PlanarRadioMap(scene, **plane.arguments)
+    power = np.where(gain_db > GAIN_FLOOR_DB, 10.0 ** (gain_db / 10.0), 0.0)  # 0, not a floor, means no path; NaN, too
+    found._pathgain_map = mi.TensorXf(power.astype(np.float32))
+    return found
+
+
+def stock_gain_db(scene: Any, plane: MapPlane, tx: Mapping[str, Sequence[float]], settings: TraceSettings) -> Floats:
+    """Return the path gains (T, ny, nx) of Sionna RT's RadioMapSolver, -150 dB where it finds no path.
+
+    The frequency of the scene and its transmitters are replaced; it gets isotropic antennas if it has none.
+    """
+    level = [name for name, position_m in tx.items() if abs(position_m[2] - plane.height_m) < plane.spacing_m / 10.0]
+    if level:
+        raise SettingsError(
+            f"rx_height_m = {plane.height_m:g} is the height of {level[0]}, and RadioMapSolver "
+            "misses rays that stay in the plane of its map: predict at another height."
+        )
+    planar_radio_map(scene, plane, tx, np.zeros((1, 1, 1)))
+    scene.frequency = settings.frequency_hz
+    if scene.tx_array is None:
+        set_antennas(scene, 1)
+    options = {"samples_per_tx": settings.samples_per_tx, "max_depth": settings.max_depth, "seed": settings.seed}
+    found = load_sionna().RadioMapSolver()(scene, **plane.arguments, **options, **_switches(settings))
+    with np.errstate(divide="ignore"):
+        return np.maximum(10.0 * np.log10(found.path_gain.numpy().astype(np.float64)), GAIN_FLOOR_DB)

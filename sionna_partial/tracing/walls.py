@@ -17,7 +17,7 @@ from scipy.sparse.csgraph import connected_components
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import Plan
+from sionna_partial.scene.outlines import Plan
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes
 from sionna_partial.tracing.power import Materials

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import in_order, njit
-from sionna_partial.scene.floor_plan import grow
+from sionna_partial.scene.outlines import grow
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION
 from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, divide, face_at, faces_between, scratch

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import grow
+from sionna_partial.scene.outlines import grow
 from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, Met, faces_between, mix, scratch
 from sionna_partial.tracing.power import COSINES, Gains, gain_towards
 from sionna_partial.tracing.select import Limits, NeedsByDistance, discount_after, matters

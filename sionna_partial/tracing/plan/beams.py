@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices, span_in_strip
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import Plan, PointBins, grow
+from sionna_partial.scene.outlines import Plan, PointBins, grow
 from sionna_partial.tracing.plan.room import FACES, Building, Room
 from sionna_partial.tracing.power import COSINES, gain_between
 from sionna_partial.tracing.select import discount_after, matters, needs_by_distance

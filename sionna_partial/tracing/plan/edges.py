@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import in_order, njit
-from sionna_partial.scene.floor_plan import bin_points, grow
+from sionna_partial.scene.outlines import bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.paths import Candidates, Wedges

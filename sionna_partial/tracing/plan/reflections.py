@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import in_order, njit
-from sionna_partial.scene.floor_plan import bin_points, grow
+from sionna_partial.scene.outlines import bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION

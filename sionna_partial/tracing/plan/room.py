@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
-from sionna_partial.scene.floor_plan import Plan
+from sionna_partial.scene.outlines import Plan
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
