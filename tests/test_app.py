@@ -1,5 +1,6 @@
 """The app: what a window computes and in which order, what is sent to it, who may open it, the page in a browser."""
 
+import base64
 import io
 import json
 import os
@@ -22,6 +23,7 @@ import numpy as np
 import pytest
 from bokeh.document import Document
 from browser import CHROMIUM, Tab, chromium
+from PIL import Image
 from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 from websockets.typing import Origin
@@ -36,6 +38,7 @@ from sionna_partial.app.radio import PRESETS, RadioSettings, Transmitter
 from sionna_partial.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
+from sionna_partial.maps.partial_map import cell_centres_m
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -519,6 +522,94 @@ class TestUploads:
         assert window.session.partial is PARTIAL
 
 
+def picture() -> bytes:
+    """A plan of `ROOM`, 10 pixels a cell, with a pale line across it."""
+    shade = np.flipud(np.where(ROOM == 1, 20, 250)).repeat(10, axis=0).repeat(10, axis=1).astype(np.uint8)
+    shade[:, 300:310] = np.minimum(shade[:, 300:310], 180)
+    content = io.BytesIO()
+    Image.fromarray(shade).save(content, "PNG")
+    return content.getvalue()
+
+
+class TestDrawing:
+    def test_a_plan_gets_its_scale_from_a_known_length(self, window: Window, tmp_path: Path) -> None:
+        session = window.session
+        session.upload_map([("C:\\flat.PNG", picture())])
+        message = window.settle()
+        assert (session.partial, session.plan is not None) == (None, True)
+        for act in (session.add, session.predict, lambda: session.file("project")):
+            with pytest.raises(MapError, match="Drag along a length"):
+                act()
+        with pytest.raises(SettingsError, match="drag along it"):
+            session.measure([(5.0, 5.0)], 4.0)
+        assert session.plan is not None
+        assert message == session.status.message
+        session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+        window.settle()
+        (tmp_path / "flat.png").write_bytes(picture())
+        assert session.partial == sp.load_map(tmp_path / "flat.png", resolution_m=0.01)
+        assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0]])).tolist() == [1, 0]
+        session.put([("", 1.0, 1.0)])
+        session.draw("free", [(0.5, 0.05), (0.7, 0.05)], 0.3)
+        session.change_plan(threshold=190)
+        assert window.settle() == "Ready."
+        assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0], [0.6, 0.05]])).tolist() == [1, 1, 0]
+        assert [*session.transmitters] == ["tx1"]
+        before = session.partial, session.plan
+        session.measure([(0.0, 1.0), (0.0, 2.0)], 500.0)
+        assert "draw a known length again" in window.settle()
+        assert (session.status.is_error, session.partial, session.plan) == (True, *before)
+
+    def test_one_shade_is_no_plan(self, window: Window) -> None:
+        content = io.BytesIO()
+        Image.new("L", (9, 9), 255).save(content, "PNG")
+        window.session.upload_map([("white.png", content.getvalue())])
+        assert "one shade alone" in window.settle()
+        assert window.session.partial is PARTIAL
+
+    def test_strokes_are_undone_saved_and_in_python(
+        self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        session = window.session
+        session.put([("", 1.0, 1.0)])
+        session.draw("brick", [(2.05, 0.5)], 0.4)
+        session.draw("wall", [(2.05, 1.9), (2.05, 3.0)], 9.0)
+        session.draw("free", [(2.05, 0.8), (2.05, 1.2)], 0.3)
+        assert window.settle() == "Ready."
+        partial = session.partial
+        assert partial is not None
+        column = partial.state[:, 20].tolist()
+        assert column == [1] * 7 + [0] * 6 + [1] * 19
+        assert (partial.state[20:, 19:22].sum(), partial.wall_materials) == (14, (sp.Material.named("brick"),))
+        assert session.answer is not None
+        monkeypatch.chdir(tmp_path)
+        Path("map.npz").write_bytes(unzipped(session.file("project"), 10**7)["map.npz"])
+        names: dict[str, Any] = {}
+        exec(session.python(), names)
+        assert names["partial"] == partial
+        assert names["coverage"].identical(session.answer.coverage)
+        for _ in range(3):
+            session.undo()
+        window.settle()
+        assert session.partial == PARTIAL
+        with pytest.raises(SettingsError, match="stroke = 'cheese'"):
+            session.draw("cheese", [(1.0, 1.0)], 0.3)
+
+    def test_strokes_stay_while_the_robot_explores(self, window: Window) -> None:
+        session = window.session
+        session.open_example("apartment")
+        window.settle()
+        assert session.partial is not None
+        wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
+        session.set(spacing_m=1.0)
+        session.draw("metal", [(float(wall_m[0]), float(wall_m[1]))], 0.3)
+        session.explore_more(20)
+        window.settle()
+        assert session.partial.wall_materials == (sp.Material.named("metal"),)
+        session.open_map(PARTIAL, "room.yaml")
+        assert session.strokes == ()
+
+
 class TestProjects:
     def saved(self, window: Window) -> bytes:
         window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
@@ -682,6 +773,14 @@ def press(tab: Tab, label: str) -> None:
     tab.run(f"{there}; {button}.click() }})()")
 
 
+def type_into(tab: Tab, label: str, text: str) -> None:
+    """Replace the text of the field with this label, and press Enter."""
+    field = f"walk(document.body).find(n => n.tagName == 'LABEL' && n.textContent.trim() == {label!r})"
+    tab.run(f"(() => {{ {_WALK}; {field}.getRootNode().querySelector('input').select() }})()")
+    tab.send("Input.insertText", text=text)
+    tab.send("Input.dispatchKeyEvent", type="keyDown", key="Enter", code="Enter", windowsVirtualKeyCode=13, text="\r")
+
+
 def box(tab: Tab, selector: str) -> list[float]:
     """Return left, top, right and bottom of an element in the window."""
     edges = "['left', 'top', 'right', 'bottom'].map(edge => box[edge])"
@@ -758,3 +857,33 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         press(tab, "Cancel")
         tab.wait(f"{_MODEL}('message').text.includes('Cancelled')")
         assert other.run(f"{_MODEL}('points').data.name.length") == 0
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_a_plan_is_dropped_measured_and_corrected(url: str, tmp_path: Path) -> None:
+    with chromium(tmp_path) as open_tab:
+        tab = open_tab(url, 1400, 950)
+        tab.wait(f"{_MODEL}('message').text.includes('Click on the map')")
+        content = base64.b64encode(picture()).decode()
+        tab.run(
+            f"""(() => {{ const data = new DataTransfer()
+            data.items.add(new File([Uint8Array.from(atob('{content}'), c => c.charCodeAt())], 'flat.png'))
+            document.body.dispatchEvent(new DragEvent('drop', {{dataTransfer: data, bubbles: true}})) }})()"""
+        )
+        tab.wait(f"{_MODEL}('stroke').value == 'length' && {_MODEL}('picture').x_range.end > 400")
+        tab.drag(*pixel(tab, 5, 5), *pixel(tab, 415, 5))
+        type_into(tab, "Known length [m]", "4.1")
+        tab.wait(f"{_MODEL}('message').text.includes('Click on the map') && {_MODEL}('stroke').value == ''")
+        tab.wait(f"{_MODEL}('picture').x_range.end < 9")
+        tab.click(*pixel(tab, 1.0, 1.0))
+        tab.wait(_READY)
+        tab.run(f"{_MODEL}('stroke').value = 'brick', 0")
+        tab.drag(*pixel(tab, 2.05, 0.5), *pixel(tab, 2.05, 1.5))
+        tab.wait(f"{_MODEL}('map_text').text.includes('brick') && {_READY}")
+        assert tab.run(f"[{_MODEL}('points').data.x.length, {_MODEL}('stroke').value]") == [1, "brick"]
+        press(tab, "Undo")
+        tab.wait(f"!{_MODEL}('map_text').text.includes('brick') && {_READY}")
+        tab.run(f"{_MODEL}('stroke').value = '', 0")
+        tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
+        tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3.0) < 0.1")
+        assert tab.faults() == []

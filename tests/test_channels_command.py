@@ -4,11 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from commands import run
 from test_trace import _room
-from typer.testing import CliRunner, Result
 
 import sionna_partial as sp
-from sionna_partial import cli
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
@@ -19,16 +18,12 @@ def map_path(tmp_path: Path) -> Path:
     return tmp_path / "map.yaml"
 
 
-def run(*args: object) -> Result:
-    return CliRunner().invoke(cli.app, ["channels", *map(str, args)])
-
-
 def test_receivers_of_a_file(map_path: Path, tmp_path: Path) -> None:
     (tmp_path / "rx.csv").write_text("name, x, y, z\na, 2.0, 1.0, 1.5\nb, 5.0, 3.0, 1.2\n\n")
     arrays = ["--array", "2x4", "--rx-array", "2x1", "--polarization", "VH", "--pattern", "tr38901"]
     out = tmp_path / "out" / "channels.h5"
     options = ["--orientation", -0.5, 0.1, 0, "--max-depth", 1, "--frequency", 5e9, "--no-diffraction"]
-    result = run(map_path, "--tx", 1, 1, 1.4, "--rx", tmp_path / "rx.csv", "--out", out, *arrays, *options)
+    result = run("channels", map_path, "--tx", 1, 1, 1.4, "--rx", tmp_path / "rx.csv", "--out", out, *arrays, *options)
     assert result.exit_code == 0, result.output
     found = sp.load_channels(out)
     assert found.a.shape[:4] == (2, 4, 1, 16)
@@ -49,7 +44,9 @@ def test_receivers_of_a_file(map_path: Path, tmp_path: Path) -> None:
 
 def test_grid(map_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "channels.zarr"
-    result = run(map_path, "--tx", 1, 1, "--out", out, "--spacing", 0.8, "--max-depth", 0, "--layout", "deepmimo")
+    result = run(
+        "channels", map_path, "--tx", 1, 1, "--out", out, "--spacing", 0.8, "--max-depth", 0, "--layout", "deepmimo"
+    )
     assert result.exit_code == 0, result.output
     found = sp.load_channels(out)
     assert found.channel.dims == ("rx", "rx_ant", "tx_ant", "path")
@@ -81,7 +78,7 @@ def test_refused(map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     Path("cut.csv").write_text("x,y,z\n1,2,1\n3,4\n")
     Path("wall.csv").write_text("rx_x,rx_y,rx_z\n3.05,0.5,1.5\n")
     out = [] if "--out" in options else ["--out", tmp_path / "channels.nc"]
-    result = run(map_path, "--tx", 1, 1, *out, *options)
+    result = run("channels", map_path, "--tx", 1, 1, *out, *options)
     assert result.exit_code == 2
     assert message in " ".join(result.output.replace("│", " ").split())
     assert not (tmp_path / "channels.nc").exists()

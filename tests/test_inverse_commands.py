@@ -5,10 +5,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from commands import arguments_of, run
 
 import sionna_partial as sp
-from sionna_partial.cli.app import app
 
 pytestmark = pytest.mark.usefixtures("command_line", "short_search")
 
@@ -38,13 +37,10 @@ def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["calibrate", *map(str, arguments)])
-
-
 def test_calibrate(measured: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
     result = run(
+        "calibrate",
         *(measured / "room.yaml", "--measurements", measured / "measured.csv", "--out", out),
         *("--material", "2.94,0.1226,0.01", "--max-depth", 2),
     )
@@ -72,7 +68,7 @@ def test_calibrate(measured: Path, tmp_path: Path) -> None:
 
 def test_unusable_measurements_are_one_line(measured: Path, tmp_path: Path) -> None:
     (tmp_path / "bad.csv").write_text(f"{HEADER}\n1,1,1.5,3,3,1.5,loud\n")
-    result = run(measured / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
+    result = run("calibrate", measured / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "error: measurements = " in result.output
     assert "line 2: gain_db = 'loud' is not a number: correct the line" in result.output
@@ -82,7 +78,18 @@ def test_unusable_measurements_are_one_line(measured: Path, tmp_path: Path) -> N
 def test_too_few_measurements(measured: Path, tmp_path: Path) -> None:
     few = (measured / "measured.csv").read_text().splitlines()[:6]
     (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
-    result = run(measured / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
+    result = run("calibrate", measured / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
     assert "has 5 usable links of 5, fewer than 10" in result.output
     assert "Traceback" not in result.output
+
+
+def test_options_arrive(measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    files = [measured / "room.yaml", "--measurements", measured / "measured.csv", "--out", tmp_path / "out"]
+    words = ["calibrate", *files]
+    options = ["--material", "4,0.1,0.2", "--frequency", "60e9", "--max-depth", 2, "--no-diffraction"]
+    found = arguments_of(monkeypatch, "calibrate_materials", *words, *options)
+    assert found["start"] == found["scene_settings"].material == sp.Material(4.0, 0.1, 0.2)
+    assert found["trace_settings"] == sp.TraceSettings(60e9, 2, diffraction=False)
+    found = arguments_of(monkeypatch, "calibrate_materials", *words)
+    assert (found["start"], found["trace_settings"]) == (None, sp.TraceSettings())

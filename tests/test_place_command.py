@@ -4,11 +4,10 @@ import json
 from pathlib import Path
 
 import pytest
+from commands import run
 from PIL import Image
 from placement_cases import TWO_ROOMS, home
-from typer.testing import CliRunner, Result
 
-from sionna_partial import cli
 from sionna_partial.maps.map_files import save_map
 
 pytestmark = pytest.mark.usefixtures("command_line")
@@ -20,13 +19,9 @@ def map_path(tmp_path: Path) -> Path:
     return tmp_path / "map.yaml"
 
 
-def run(*args: object) -> Result:
-    return CliRunner().invoke(cli.app, ["place", *(str(arg) for arg in args)])
-
-
 def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "place"
-    result = run(map_path, "--out", out)
+    result = run("place", map_path, "--out", out)
     assert result.exit_code == 0, result.output
     record = json.loads((out / "placement.json").read_text())
     x, y, z = record["position_m"]
@@ -41,18 +36,8 @@ def test_what_it_writes_and_says(map_path: Path, tmp_path: Path) -> None:
 
 
 def test_worst_tenth(map_path: Path, tmp_path: Path) -> None:
-    result = run(map_path, "--out", tmp_path / "place", "--objective", "percentile")
+    result = run("place", map_path, "--out", tmp_path / "place", "--objective", "percentile")
     assert "\nthe worst tenth of the receivers is predicted at " in result.stdout
-
-
-def test_options(map_path: Path, tmp_path: Path) -> None:
-    options = ["--threshold", -90, "--height", 2, "--rx-height", 1, "--seed", 3, "--frequency", 27e9, "--max-depth", 0]
-    assert run(map_path, "--out", tmp_path / "place", *options, "--material", "concrete").exit_code == 0
-    settings = json.loads((tmp_path / "place" / "placement.json").read_text())["settings"]
-    expected = {"threshold_db": -90.0, "tx_height_m": 2.0, "rx_height_m": 1.0, "seed": 3, "objective": "coverage"}
-    assert {name: settings[name] for name in expected} == expected
-    assert (settings["trace_settings"]["frequency_hz"], settings["trace_settings"]["max_depth"]) == (27e9, 0)
-    assert settings["scene_settings"]["material"]["itu"] == "concrete"
 
 
 @pytest.mark.parametrize(
@@ -63,13 +48,13 @@ def test_options(map_path: Path, tmp_path: Path) -> None:
     ],
 )
 def test_errors_are_one_line(options: list[object], message: str, map_path: Path, tmp_path: Path) -> None:
-    result = run(map_path, "--out", tmp_path / "place", *options)
+    result = run("place", map_path, "--out", tmp_path / "place", *options)
     assert result.exit_code == 2
     assert result.stderr.splitlines()[-1] == message
     assert not (tmp_path / "place").exists()
 
 
 def test_unknown_objective(map_path: Path, tmp_path: Path) -> None:
-    result = run(map_path, "--out", tmp_path / "place", "--objective", "best")
+    result = run("place", map_path, "--out", tmp_path / "place", "--objective", "best")
     assert result.exit_code == 2
     assert "'best' is not one of 'coverage', 'percentile'" in result.stderr

@@ -15,6 +15,7 @@ from sionna_partial.constants import (
     DRAWING_SUFFIXES,
     IFC_SUFFIXES,
     MESH_SUFFIXES,
+    PICTURE_SUFFIXES,
     POINT_SUFFIXES,
     VACUUM_SUFFIXES,
 )
@@ -29,7 +30,7 @@ from sionna_partial.plots.coverage_plot import report_pdf
 MOST_BYTES = 200_000_000
 """Size of the files that are uploaded together [bytes]."""
 
-_IMAGES, _SHEETS = (".pgm", ".png", ".bmp"), (".yaml", ".yml")
+_IMAGES, _SHEETS = (".pgm", *PICTURE_SUFFIXES), (".yaml", ".yml")
 
 MAP_SUFFIXES = (
     *(*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES),
@@ -67,7 +68,7 @@ def uploaded_map(files: Sequence[tuple[str, bytes]]) -> PartialMap:
 
 
 def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
-    """Write an uploaded map under names of ours: of the names of its files only the suffixes count.
+    """Write an uploaded map, or a picture, under names of ours: of the names of its files only the suffixes count.
 
     Raises
     ------
@@ -81,6 +82,8 @@ def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
     images = [suffix for suffix in by_suffix if suffix in _IMAGES]
     names, one = ", ".join(shown(name) for name, _ in files[:3]), len(files) == 1
     both = "choose the YAML and the image of a ROS map together, or a zip of both."
+    if one and {*images} & {*PICTURE_SUFFIXES}:
+        sheets, images = images, []
     if one and (images or {*sheets} & {*_SHEETS}):
         raise MapError(f"{names} alone is not a map: {both}")
     if len(sheets) != 1 or len(by_suffix) != len(files) or len(sheets) + len(images) != len(files) or len(images) > 1:

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.app.answer import Answer
+from sionna_partial.app.drawing import LENGTH, STROKES
 from sionna_partial.app.files import FILES
-from sionna_partial.app.picture import LAYERS, Picture
+from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour, material_name
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
 from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
 
@@ -23,7 +25,6 @@ _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole"
 _AIM = 0.06
 _WALLS = {"": "below 24 GHz", "opaque": "never", "through": "always"}
 _COMPUTED_FOR = {"": "the partial map", "1": "the whole home (truth)"}
-_PROBABILITY = 0.9
 _STRONGEST = "the strongest"
 _FILE_NAMES = {
     "png": "PNG",
@@ -64,10 +65,13 @@ class Page:
         self.session = Session(document.add_next_tick_callback, self.show)
         self._is_showing = False
         self._drawn: dict[str, Any] = {}
+        self._line_m: list[tuple[float, float]] = []
         self.picture = Picture()
         self.picture.points.on_change("data", self._on_points)
         self.picture.points.selected.on_change("indices", self._on_selected)
+        self.picture.stroke.on_change("data", self._on_stroke)
         self._make_choices()
+        self._make_map_controls()
         self._make_transmitter_controls()
         self._make_radio_controls()
         for name, model in self._roots().items():
@@ -98,6 +102,10 @@ class Page:
             Slider(title="Threshold [dBm]", start=-130, end=-30, step=1, value=-80),
             lambda value: self.session.set(threshold_dbm=float(value)),
         )
+        self.outline = self._on(
+            Select(title="Line at the threshold", name="outline", value="p_above", options=list[Any](OUTLINES.items())),
+            lambda _: self.show(),
+        )
         self.message = Div(
             name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
         )
@@ -105,13 +113,32 @@ class Page:
         self.summary = Div(name="summary", sizing_mode="stretch_width")
         self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
 
-    def _make_transmitter_controls(self) -> None:
-        from bokeh.models.widgets.inputs import Select, Spinner, TextInput
+    def _make_map_controls(self) -> None:
+        from bokeh.models.widgets.inputs import Select, Spinner
         from bokeh.models.widgets.markups import Div
+        from bokeh.models.widgets.sliders import Slider
 
         homes: list[Any] = [("", "choose one"), *((name, name) for name in demo_homes())]
         self.example = self._on(Select(title="Example home", options=homes), self._open_example)
-        self.map_text = Div(sizing_mode="stretch_width")
+        self.map_text = Div(name="map_text", sizing_mode="stretch_width")
+        self.stroke = self._on(Select(title="Dragging on the map", name="stroke", value=""), lambda _: self.show())
+        self.brush = Spinner(title="Brush [m]", name="brush", low=0.05, high=20, step=0.05, value=0.5)
+        self.length = self._on(
+            Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
+            lambda value: self.session.measure(self._line_m, float(value)),
+            "value_throttled",
+        )
+        self.dark = self._on(
+            Slider(title="Walls up to shade", name="dark", start=0, end=254, step=1, value=127),
+            lambda value: self.session.change_plan(threshold=int(value)),
+            "value_throttled",
+        )
+        self.undo = self._button("Undo", lambda: self.session.undo())
+        self.picture.follow(self.stroke, self.brush, self.dark)
+
+    def _make_transmitter_controls(self) -> None:
+        from bokeh.models.widgets.inputs import Select, Spinner, TextInput
+
         self.chosen = self._on(Select(title="Transmitter"), self._choose)
         self.name = self._on(TextInput(title="Name"), lambda value: self._change(new_name=value))
         self.fields = {
@@ -192,7 +219,11 @@ class Page:
         session = self.session
         upload_map, upload_csv, copy = (
             self._button(name)
-            for name in ("Open a map or project\u2026", "Learn from measurements (CSV)\u2026", "Copy as Python")
+            for name in (
+                "Open a map, floor plan or project\u2026",
+                "Learn from measurements (CSV)\u2026",
+                "Copy as Python",
+            )
         )
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
@@ -204,11 +235,18 @@ class Page:
         return {
             "status": wide(row(self.message, self.cancel), self.warnings),
             "layers": pair(self.layer, self.which),
-            "choices": pair(self.threshold, self.truth),
+            "choices": pair(self.threshold, self.outline, self.truth),
             "picture": self.picture.plot,  # nothing above it changes its height with an answer: a drag would miss
             "summary": self.summary,
             "links": self.links,
-            "map": wide(self.example, upload_map, self.map_text),
+            "map": wide(
+                self.example,
+                upload_map,
+                self.map_text,
+                pair(self.length, self.dark),
+                self.stroke,
+                pair(self.brush, self.undo),
+            ),
             "transmitters": wide(
                 pair(self.chosen, self.name),
                 pair(x, y),
@@ -272,6 +310,17 @@ class Page:
         if new and not self._is_showing:
             self._choose(self.picture.points.data["name"][new[-1]])
 
+    def _on_stroke(self, _name: str, _old: Any, new: Any) -> None:
+        """Take a stroke: a length waits for its number, a correction is shown on the map."""
+        points_m = [*zip(map(float, new["x"]), map(float, new["y"]), strict=True)]
+        if not points_m or self._is_showing:
+            return
+        if self.stroke.value == LENGTH:
+            self._line_m = points_m
+            return
+        self.picture.stroke.data = {"x": [], "y": [], "r": []}
+        self._guarded(self.session.draw, self.stroke.value, points_m, float(self.brush.value or 0.0))
+
     def _open_example(self, name: str) -> None:
         if name:
             self.session.open_example(name)
@@ -302,7 +351,9 @@ class Page:
         self._is_showing = True
         try:
             self._show_status()
-            self._once("map", (self.session.partial, self.session.title, self.session.steps), self._show_map)
+            key = self.session.partial, self.session.title, self.session.steps, self.session.plan
+            self._once("map", key, self._show_map)
+            self._show_strokes()
             self._show_transmitters()
             self._show_measured()
             self._show_answer()
@@ -332,17 +383,36 @@ class Page:
 
     def _show_map(self) -> None:
         partial, session = self.session.partial, self.session
+        self.picture.show_map(partial, session.plan)
+        self._line_m = []
+        self.length.update(value=None, value_throttled=None)
+        self.stroke.value = "" if self.stroke.value == LENGTH else self.stroke.value
+        self.more.visible = self.truth.visible = session.home is not None
+        self.example.value = session.title if session.home is not None else ""
+        if session.plan is not None:
+            self.dark.value = session.plan.threshold
         if partial is None:
+            self.map_text.text = f"<b>{html.escape(session.title)}</b>"
             return
         x0, y0, x1, y1 = partial.bounds_m
-        self.picture.show_map(partial)
         seen = "complete" if partial.is_complete else f"{partial.observed_fraction:.0%} observed"
         size = f"{x1 - x0:.1f} x {y1 - y0:.1f} m, cells of {partial.resolution_m:g} m"
         robot = f"; robot after {session.steps} steps" if session.home is not None else ""
-        self.map_text.text = f"<b>{html.escape(session.title)}</b>: {size}, {seen}{robot}"
-        self.more.visible = session.home is not None
-        self.example.value = session.title if session.home is not None else ""
-        self.truth.visible = session.home is not None
+        self.map_text.text = f"<b>{html.escape(session.title)}</b>: {size}, {seen}{robot}{_legend(partial)}"
+
+    def _show_strokes(self) -> None:
+        plan = self.session.plan
+        self.length.visible = self.dark.visible = plan is not None
+        self.undo.visible = bool(self.session.strokes)
+        is_measured = plan is None or plan.pixel_m is not None
+        kinds = [kind for kind in STROKES if plan is not None or kind != LENGTH]
+        options = [("", "moves transmitters"), *((kind, STROKES[kind]) for kind in kinds)]
+        self.stroke.options = options if is_measured else [(LENGTH, STROKES[LENGTH])]
+        if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
+            self.stroke.value = self.stroke.options[0][0]
+        axes = zip(self.picture.plot.axis, "xy", strict=True)
+        for axis, name in axes:
+            axis.axis_label = f"{name} [{'m' if is_measured else 'pixels'}]"
 
     def _show_transmitters(self) -> None:
         session = self.session
@@ -418,7 +488,8 @@ class Page:
 
     def _show_answer(self) -> None:
         answer, name, threshold_dbm = self.session.answer, self.which.value, self.session.settings.threshold_dbm
-        self._once("answer", (answer, name, threshold_dbm, self.truth.value), self._show_values)
+        key = answer, name, threshold_dbm, self.truth.value, self.outline.value
+        self._once("answer", key, self._show_values)
         for layer, parts in self.picture.parts.items():
             for part in parts:
                 part.visible = layer == self.layer.value
@@ -436,7 +507,8 @@ class Page:
 
     def _show_values(self) -> None:
         answer, threshold_dbm = self.session.answer, self.session.settings.threshold_dbm
-        self.picture.show_answer(answer, self.which.value, threshold_dbm, truth=bool(self.truth.value))
+        of = {"truth": bool(self.truth.value), "outline": self.outline.value}
+        self.picture.show_answer(answer, self.which.value, threshold_dbm, **of)
         self.summary.text = "" if answer is None else _summary(answer, threshold_dbm)
 
 
@@ -455,14 +527,24 @@ def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
     return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
+def _legend(partial: PartialMap) -> str:
+    """Return the colours of walls whose material is known."""
+    used = [] if partial.wall_material is None else np.unique(partial.wall_material[partial.wall_material > 0])
+    materials = [partial.wall_materials[number - 1] for number in used]
+    return "".join(
+        f'<br><span style="color:{material_colour(each)}">\u25a0</span> {html.escape(material_name(each))}'
+        for each in materials
+    )
+
+
 def _summary(answer: Answer, threshold_dbm: float) -> str:
     """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
-    area = answer.coverage.radio.area(threshold_dbm, probability=_PROBABILITY, eirp_dbm=answer.eirp_dbm)["fraction"]
+    area = answer.coverage.radio.area(threshold_dbm, probability=LIKELY, eirp_dbm=answer.eirp_dbm)["fraction"]
     fractions = (
         f"<b>{html.escape(str(name))}</b> {float(seen):.0%} of the observed floor, {float(every):.0%} of all"
         for name, seen, every in zip(answer.coverage["tx"].to_numpy(), *area.to_numpy(), strict=True)
     )
-    text = f"Above {threshold_dbm:g} dBm with probability {_PROBABILITY:g}: {'; '.join(fractions)}."
+    text = f"Above {threshold_dbm:g} dBm with probability {LIKELY:g}: {'; '.join(fractions)}."
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."

@@ -4,22 +4,47 @@ import math
 from typing import Any
 
 import numpy as np
+from contourpy import contour_generator
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy import ndimage
 
 from sionna_partial.app.answer import LEVELS, Answer
+from sionna_partial.app.drawing import LENGTH, STRAIGHT, Plan
 from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import extent_m, outside
 from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes, radio_layers, server_codes
+from sionna_partial.settings import WALL_MATERIALS, Material
+
+LIKELY = 0.9
+"""Probability with which an area counts as covered."""
+
+OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
+"""Layers whose line at the threshold is drawn."""
 
 LAYERS = radio_layers(MOST_TRANSMITTERS)
 """Layers by the name of their variable."""
 
 _UNSELECT = "points.selection_manager.clear()"
 """Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
+
+_STROKE = """
+if (mode.value == "") return
+const {x, y} = cb_obj, data = name == "tap" || name == "panstart" ? {x: [], y: []} : live.data
+const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
+xs.push(x); ys.push(y)
+const drawn = {x: xs, y: ys, r: xs.map(() => mode.value == measures ? 0 : brush.value / 2)}
+const is_done = name == "tap" || name == "panend"
+live.data = is_done ? {x: [], y: [], r: []} : drawn
+if (is_done) stroke.data = drawn
+"""
+"""Draws a stroke, and gives it to the session at its end."""
+
+_COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc"]
+_OTHER, _PEN = "#004488", "#0066ff"
+"""Colours of walls of `WALL_MATERIALS`, of other ones, and of strokes."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
@@ -35,6 +60,9 @@ _TOOLTIPS = (
     ("SNR", "@snr_mean_db{0.0} dB"),
     ("P(above threshold)", "@p_above{0.00}"),
 )
+_GROUND, _WALLS = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9"), ("#00000000", "#000000", "#00000000", "#ffffff60")
+"""Colours of free cells, walls, unknown cells and their hatch, below the coverage and above it."""
+
 _LABEL: dict[str, Any] = {
     "text_baseline": "middle",
     "text_font_size": "13px",
@@ -53,6 +81,11 @@ class Picture:
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
         self.values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)})
+        self.shades = ColumnDataSource({name: [] for name in ("cells", "x", "y", "dw", "dh")})
+        self.outline = ColumnDataSource({"xs": [], "ys": []})
+        self.stroke, self._live = (
+            ColumnDataSource({"x": [], "y": [], "r": []}, name=name) for name in ("drawn", "live")
+        )
         self.points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
         self.aims = ColumnDataSource({"xs": [], "ys": []})
         self.routes = ColumnDataSource({"xs": [], "ys": []})
@@ -73,9 +106,10 @@ class Picture:
         self.plot = plot
         plot.toolbar.logo, plot.grid.visible = None, False
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
-        colours = LinearColorMapper(palette=["#ffffff", "#000000", "#b9bec4", "#e4e6e9"], low=-0.5, high=3.5)
-        walls = LinearColorMapper(palette=["#00000000", "#000000", "#00000000", "#ffffff60"], low=-0.5, high=3.5)
-        known = plot.image(image="cells", source=self.ground, color_mapper=colours, **where)
+        self._mappers = LinearColorMapper(palette=[*_GROUND], low=-0.5), LinearColorMapper(palette=[*_WALLS], low=-0.5)
+        greys = [f"#{shade:02x}{shade:02x}{shade:02x}" for shade in range(256)]
+        self.wall_shades = LinearColorMapper(palette=greys, low=0, high=255, low_color="#cc3311")
+        known = plot.image(image="cells", source=self.ground, color_mapper=self._mappers[0], **where)
         plot.x_range.renderers = plot.y_range.renderers = [known]  # the axes stay with the map, whatever is drawn
         geometry = {"source": self.values, **where}
         words = {"link_state": STATES, "best_server": [""] * MOST_TRANSMITTERS}
@@ -86,7 +120,10 @@ class Picture:
             bar.title = bar.title or LAYERS[name].title  # one height of all bars: the map stays where it is
             if name in LEVELS:
                 bar.ticker = FixedTicker()
-        plot.image(image="cells", source=self.ground, color_mapper=walls, **where)
+        for colour, width in (("white", 4), ("black", 2)):
+            plot.multi_line("xs", "ys", source=self.outline, line_color=colour, line_width=width)
+        plot.image(image="cells", source=self.ground, color_mapper=self._mappers[1], **where)
+        self.plan = plot.image(image="cells", source=self.shades, color_mapper=self.wall_shades, **where)
         self._add_marks()
 
     def _add_marks(self) -> None:
@@ -94,6 +131,9 @@ class Picture:
         from bokeh.models import CustomJS, HoverTool, PointDrawTool
 
         plot = self.plot
+        for source in (self.stroke, self._live):
+            plot.circle("x", "y", radius="r", source=source, fill_color=_PEN, line_color=None, alpha=0.4)
+            plot.line("x", "y", source=source, line_color=_PEN, line_width=3)
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
@@ -110,31 +150,72 @@ class Picture:
         )
         plot.add_tools(hover, tool)
         plot.toolbar.active_tap = tool
+        self._tools = tool, hover
         plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
 
-    def show_map(self, partial: PartialMap) -> None:
-        """Draw the cells of a map."""
-        x0, y0, x1, y1 = partial.bounds_m
-        cells = hatched_pixels(partial)
-        self.ground.data = {"cells": [cells], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+    def follow(self, mode: Any, brush: Any, threshold: Any) -> None:
+        """Draw strokes of a kind and a width that controls have, and the walls of a plan by a slider."""
+        from bokeh.models import CustomJS
 
-    def show_answer(self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool) -> None:
-        """Draw the layers of a transmitter, or of the strongest for "", with scales that follow the threshold."""
+        given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
+        given |= {"straight": [*STRAIGHT], "measures": LENGTH}
+        for name in ("panstart", "pan", "panend", "tap"):
+            self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
+        code = "for (const tool of tools) tool.active = !mode.value"
+        mode.js_on_change("value", CustomJS(args={"tools": [*self._tools], "mode": mode}, code=code))
+        shown = {"walls": self.wall_shades, "plan": self.plan, "slider": threshold}
+        code = "walls.low = slider.value + 1; plan.visible = true"
+        threshold.js_on_change("value", CustomJS(args=shown, code=code))
+
+    def show_map(self, partial: PartialMap | None, plan: Plan | None) -> None:
+        """Draw the cells of a map, or a plan that has no scale yet."""
+        self.stroke.data = {"x": [], "y": [], "r": []}
+        has_map = partial is not None
+        (x0, y0, x1, y1), cells = (0.0, 0.0, *(plan.size_m if plan else (1.0, 1.0))), np.zeros((1, 1), np.uint8)
+        colours = []
+        if partial is not None:
+            (x0, y0, x1, y1), cells = partial.bounds_m, hatched_pixels(partial)
+            colours = [material_colour(each) for each in partial.wall_materials]
+        for mapper, palette in zip(self._mappers, (_GROUND, _WALLS), strict=True):
+            mapper.update(palette=[*palette, *colours], high=len(palette) + len(colours) - 0.5)
+        self.ground.data = {"cells": [cells], "x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
+        if plan is not None:
+            width_m, height_m = plan.size_m
+            merge = math.ceil(max(plan.shade.shape) / _MOST_PIXELS)
+            shade = np.flipud(ndimage.minimum_filter(plan.shade, merge)[::merge, ::merge])
+            self.shades.data = {"cells": [shade], "x": [0.0], "y": [0.0], "dw": [width_m], "dh": [height_m]}
+            self.wall_shades.low = plan.threshold + 1
+        self.plan.visible = plan is not None and not has_map
+
+    def show_answer(
+        self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool, outline: str = ""
+    ) -> None:
+        """Draw the layers of a transmitter, or of the strongest for "", with scales that follow the threshold.
+
+        `outline` is one of `OUTLINES`.
+        """
         if answer is None:
             self.values.data = {column: [] for column in self.values.data}
+            self.outline.data = {"xs": [], "ys": []}
             return
         one = answer.layers_of(name, threshold_dbm, truth=truth)
         x0, x1, y0, y1 = extent_m(one)
         valid = (one["valid"].to_numpy() == 1) & ~outside(one)
         row, column = np.indices(valid.shape)
         if valid.any():  # a wall thinner than a cell leaves none without a value, for the eye alone
-            apart, (row, column) = distance_transform_edt(~valid, return_indices=True)
+            apart, (row, column) = ndimage.distance_transform_edt(~valid, return_indices=True)
             valid = apart < 2.0
         columns: dict[str, Any] = {"x": [x0], "y": [y0], "dw": [x1 - x0], "dh": [y1 - y0]}
         for layer in (*LAYERS, *_HOVERED):
             values = one[layer].to_numpy() if layer in one else np.full(valid.shape, np.nan)
             columns[layer] = [np.where(valid, values[row, column], np.nan).astype(np.float32)]
         self.values.data = columns
+        lines: list[Any] = []
+        if outline:
+            height = {"power_mean_dbm": threshold_dbm, "p_above": LIKELY}[outline]
+            field = contour_generator(one["x"], one["y"], np.ma.masked_invalid(columns[outline][0]))
+            lines = field.lines(height)
+        self.outline.data = {"xs": [line[:, 0] for line in lines], "ys": [line[:, 1] for line in lines]}
         self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
 
     def _show_scales(self, thresholds: dict[str, float], names: list[str]) -> None:
@@ -162,7 +243,10 @@ class Picture:
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown; 3 is a hatch."""
+    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown.
+
+    3 is a hatch, 3 + k a wall of material k.
+    """
     merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
     ny, nx = (math.ceil(n / merge) for n in partial.shape)
     padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
@@ -170,11 +254,27 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
     blocks = padded.reshape(ny, merge, nx, merge)
     free = np.where((blocks == CellState.FREE).any(axis=(1, 3)), CellState.FREE, CellState.UNKNOWN)
     cells = np.where((blocks == CellState.WALL).any(axis=(1, 3)), CellState.WALL, free).astype(np.uint8)
+    if partial.wall_material is not None:
+        padded[:] = 0
+        padded[: partial.shape[0], : partial.shape[1]] = partial.wall_material
+        number = padded.reshape(ny, merge, nx, merge).max(axis=(1, 3))
+        cells = np.where(number > 0, np.minimum(number, 255 - _HATCHED) + _HATCHED, cells)
     finer = max(1, round(_FEWEST_PIXELS / max(cells.shape)))
     cells = cells.repeat(finer, axis=0).repeat(finer, axis=1)
     row, column = np.indices(cells.shape)
     stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
     return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
+
+
+def material_name(material: Material) -> str:
+    """Return the name of a material of walls."""
+    known = {each: name for name, each in WALL_MATERIALS.items()}
+    return known.get(material) or material.itu or "another material"
+
+
+def material_colour(material: Material) -> str:
+    """Return the colour in which its walls are drawn."""
+    return dict(zip(WALL_MATERIALS, _COLOURS, strict=True)).get(material_name(material), _OTHER)
 
 
 def _state_words() -> Any:

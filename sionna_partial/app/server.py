@@ -151,7 +151,7 @@ def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) ->
         if kind == "map":
             session.upload_map(files)
         else:
-            session.learn(files[0][1])
+            session.learn(files[0][1], files[0][0])
     except SionnaPartialError as error:
         session.refuse(error)
 

@@ -17,6 +17,7 @@ import numpy as np
 import xarray as xr
 
 from sionna_partial.app.answer import Answer
+from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Stroke, uploaded_plan
 from sionna_partial.app.files import FILES, coverage_file, uploaded_map
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
 from sionna_partial.app.project import Project, project_file, uploaded_project
@@ -50,6 +51,9 @@ ROUNDING_M = 0.006
 FIRST_STEPS, MORE_STEPS = 100, 50
 """Steps of the simulated robot when an example is opened, and at each request."""
 
+_MEASURE = 'Drag along a length that you know, such as a wall; then type it in "Known length [m]" and press Enter.'
+_SAVED_MAP = 'partial = sp.load_map("map.npz")  # in the file that "Project" downloads, with everything drawn on it'
+
 _MOST_RECEIVERS, _NEAREST_CELLS = 30_000, 1000
 
 _log = logging.getLogger(__name__)
@@ -76,6 +80,9 @@ class Session:
         self._models: dict[str, tuple[LinkModel, list[str]]] = {}
         self._warnings: dict[str, list[str]] = {"map": [], "act": [], "job": []}
         self.partial: PartialMap | None = None
+        self.plan: Plan | None = None
+        self.strokes: tuple[Stroke, ...] = ()
+        self._bare: PartialMap | None = None
         self.home: PartialMap | None = None
         self.title, self.steps, self._seed = "", 0, 0
         self._python_map: list[str] = []
@@ -128,8 +135,7 @@ class Session:
 
     def open_map(self, partial: PartialMap, title: str, warnings: Sequence[str] = ()) -> None:
         """Take a map, with no transmitter yet, and the warnings of its reader."""
-        self._take_map(partial, title, [f"partial = sp.load_map({title!r})"])
-        self.home, self._warnings["map"] = None, [*warnings]
+        self._take_map(partial, title, [f"partial = sp.load_map({title!r})"], warnings)
         self.predict()
 
     def open_example(self, name: str) -> None:
@@ -144,7 +150,7 @@ class Session:
         self.begin(work)
 
     def _enter(self, name: str, home: PartialMap, seed: int, tx_m: Sequence[float]) -> None:
-        self.title, self.home, self.steps, self._seed = name, home, 0, seed
+        self.title, self.home, self.steps, self._seed, self.plan, self.strokes = name, home, 0, seed, None, ()
         x_m, y_m, z_m = tx_m
         self.transmitters, self.chosen, self.measured = {"tx1": Transmitter(x_m, y_m, z_m)}, "tx1", None
         self.explore_more(FIRST_STEPS)
@@ -162,10 +168,8 @@ class Session:
                 f'home = sp.load_map("scenes/{name}/complete/map.yaml")',
                 f"partial = sp.explore(home, steps=({total},), seed={seed})[0]",
             ]
-            transmitters, chosen, measured = self.transmitters, self.chosen, self.measured
-            self._take_map(partial, name, lines)
-            self.steps, self.chosen, self.measured = total, chosen, measured
-            self._take_transmitters(transmitters)
+            self.steps = total
+            self._change_map(partial, lines)
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             partial = explore_trajectory(home, (total,), seed, progress=report).maps[0]
@@ -180,27 +184,100 @@ class Session:
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, f"reading {title}")
             with collected_warnings() as warnings:
-                project = uploaded_project(files)
-                partial = uploaded_map(files) if project is None else project.partial
-            if project is None:
+                project, plan = uploaded_project(files), uploaded_plan(files)
+                partial = None if project or plan else uploaded_map(files)
+            if plan is not None:
+                yield functools.partial(self._open_plan, plan)
+            elif partial is not None:
                 yield functools.partial(self.open_map, partial, title, warnings)
-            else:
+            elif project is not None:
                 placed = {name: _placed(partial, each) for name, each in project.transmitters.items()}
                 yield functools.partial(self._open_project, replace(project, transmitters=placed), warnings)
 
         self.begin(work)
 
     def _open_project(self, project: Project, warnings: Sequence[str]) -> None:
-        self._take_map(project.partial, project.title, ['partial = sp.load_map("map.npz")  # of project.zip'])
-        self.home, self._warnings["map"] = None, [*warnings]
+        self._take_map(project.partial, project.title, [_SAVED_MAP], warnings)
         self.settings = project.settings or self.settings
         self.measured = project.measured if project.transmitters else None
         self._take_transmitters({**project.transmitters})
 
-    def _take_map(self, partial: PartialMap, title: str, python: list[str]) -> None:
-        self.partial, self.title, self._python_map = partial, title, python
+    def _open_plan(self, plan: Plan) -> None:
+        self._forget_map()
+        self.partial, self.plan, self.title = None, plan, plan.name
+        self._ask(_MEASURE)
+
+    def measure(self, line_m: Sequence[tuple[float, float]], length_m: float) -> None:
+        """Take the length [m] of a line that was drawn on the picture of a plan; its map has that scale."""
+        require(self.plan is not None, "known length", length_m, "open a floor plan as a picture first.")
+        assert self.plan is not None
+        drawn_m = math.dist(line_m[0], line_m[-1])
+        require(drawn_m > 0.0, "known length", length_m, "drag along it on the picture first.")
+        self.change_plan(pixel_m=(self.plan.pixel_m or 1.0) * length_m / drawn_m)
+
+    def change_plan(self, **values: Any) -> None:
+        """Read a plan with another scale, which ends what was on the map, or another threshold of walls."""
+        plan = replace(self.plan, **values) if self.plan else None
+        if plan is None or plan.pixel_m is None:
+            self.plan = plan
+            self._show()
+            return
+
+        def take(partial: PartialMap, warnings: Sequence[str]) -> None:
+            is_same = self.plan is not None and self.plan.pixel_m == plan.pixel_m
+            self.plan = plan
+            if is_same:
+                self._change_map(partial, [_SAVED_MAP])
+                self._warnings["map"] = [*warnings]
+            else:
+                self._take_map(partial, plan.name, [_SAVED_MAP], warnings)
+                self.plan = plan
+                self.predict()
+
+        def work(report: Progress) -> Iterator[Callable[[], None]]:
+            report(0.1, f"reading {plan.name}")
+            with collected_warnings() as warnings:
+                partial = plan.read()
+            yield functools.partial(take, partial, warnings)
+
+        self.begin(work)
+
+    def draw(self, kind: str, points_m: Sequence[tuple[float, float]], width_m: float) -> None:
+        """Correct the map by a stroke of a brush."""
+        require_choice("stroke", kind, [name for name in STROKES if name != LENGTH])
+        self._redraw((*self.strokes, Stroke(kind, tuple(points_m), width_m)))
+
+    def undo(self) -> None:
+        """Take the last stroke back."""
+        self._redraw(self.strokes[:-1])
+
+    def _redraw(self, strokes: tuple[Stroke, ...]) -> None:
+        self._map()
+        assert self._bare is not None
+        partial, self.strokes = _drawn(self._bare, strokes), strokes
+        self.partial = partial
+        self._take_transmitters(self.transmitters)
+
+    def _forget_map(self) -> None:
         self._warnings = {"map": [], "act": [], "job": []}
         self.transmitters, self.chosen, self.measured, self.views, self.answer = {}, "", None, None, None
+        self.plan, self.strokes, self.home = None, (), None
+
+    def _take_map(self, partial: PartialMap, title: str, python: list[str], warnings: Sequence[str] = ()) -> None:
+        """Take a map without transmitters."""
+        self._forget_map()
+        self.title, self._warnings["map"] = title, [*warnings]
+        self._fit(partial, python)
+
+    def _change_map(self, partial: PartialMap, python: list[str]) -> None:
+        """Take a map of the same building, in its coordinates, and predict."""
+        self._warnings, self.answer = {"map": [], "act": [], "job": []}, None
+        self._fit(partial, python)
+        self._take_transmitters(self.transmitters)
+
+    def _fit(self, partial: PartialMap, python: list[str]) -> None:
+        self._bare, self._python_map = partial, python
+        self.partial = partial = _drawn(partial, self.strokes)
         (x0, y0, x1, y1), (low_m, high_m) = partial.bounds_m, partial.height_range_m
         if not low_m < self.settings.rx_height_m < high_m:
             self.settings = replace(self.settings, rx_height_m=self._usual_height_m())
@@ -324,7 +401,7 @@ class Session:
 
     def _map(self) -> PartialMap:
         if self.partial is None:
-            raise MapError("there is no map yet: open one, or an example.")
+            raise MapError(_MEASURE if self.plan else "there is no map yet: open one, or an example.")
         return self.partial
 
     def _tx_m(self) -> dict[str, tuple[float, float, float]]:
@@ -334,13 +411,17 @@ class Session:
 
     # Jobs
 
+    def _ask(self, message: str) -> None:
+        self.cancel()
+        self.answer, self.status = None, Status(message)
+        self._show()
+
     def predict(self) -> None:
         """Predict the coverage: a coarse picture first, then the fine one."""
-        partial, settings, measured, home = self._map(), self.settings, self.measured, self.home
+        partial, settings, measured = self._map(), self.settings, self.measured
+        home = self.home and _drawn(self.home, self.strokes)
         if not self.transmitters:
-            self.cancel()
-            self.answer, self.status = None, Status('Click on the map to put a transmitter, or press "Add".')
-            self._show()
+            self._ask('Click on the map to put a transmitter, or press "Add".')
             return
         tx_m, eirp_dbm = self._tx_m(), np.array([each.eirp_dbm for each in self.transmitters.values()])
         of_all: dict[str, Any] = {
@@ -418,8 +499,8 @@ class Session:
 
         self.begin(work)
 
-    def learn(self, content: bytes) -> None:
-        """Take measured gains or powers, a CSV; those that name no transmitter are of the chosen one."""
+    def learn(self, content: bytes, name: str = "measured.csv") -> None:
+        """Take measured gains or powers, a CSV or a recording of Valeronoi; without transmitter, of the chosen one."""
         partial, all_m, tx_m = self._map(), self._tx_m(), self._tx_m()[self.chosen]
         frequency_hz = self.settings.frequency_hz
 
@@ -430,7 +511,7 @@ class Session:
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, "reading measurements")
             with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-                path = Path(folder) / "measured.csv"
+                path = Path(folder) / f"measured{'.vwm' if name.lower().endswith('.vwm') else '.csv'}"
                 path.write_bytes(content)
                 measured = load_measurements(path)
                 if not measured.tx_known.any():
@@ -544,7 +625,8 @@ class Session:
         if any(each != Antenna() for each in antennas):
             given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
         powers = [each.eirp_dbm for each in self.transmitters.values()]
-        lines = ["import sionna_partial as sp", "", *self._python_map, f"tx = {self._tx_m()!r}"]
+        python_map = [_SAVED_MAP] if self.strokes else self._python_map
+        lines = ["import sionna_partial as sp", "", *python_map, f"tx = {self._tx_m()!r}"]
         lines += ["coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"]
         lines += [f"power = coverage.radio.power(eirp_dbm={powers!r})"]
         lines += [
@@ -552,6 +634,12 @@ class Session:
             'coverage.radio.save("coverage.nc")',
         ]
         return "\n".join(lines) + "\n"
+
+
+def _drawn(partial: PartialMap, strokes: Sequence[Stroke]) -> PartialMap:
+    for stroke in strokes:
+        partial = stroke.on(partial)
+    return partial
 
 
 def _placed(partial: PartialMap, transmitter: Transmitter) -> Transmitter:

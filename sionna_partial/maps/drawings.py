@@ -383,10 +383,11 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
     return state[margin:-margin, margin:-margin]
 
 
-def read_picture(path: Path, *, resolution_m: float | None = None) -> PartialMap:
+def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
     """Read a floor plan from a picture with dark walls on a bright ground, or bright walls on a dark one.
 
-    `resolution_m` is the edge of a pixel [m]. World x and y begin at the lower-left corner of the picture.
+    `resolution_m` is the edge of a pixel [m], `threshold` the largest shade of walls in `wall_shades`, by default
+    Otsu's. World x and y begin at the lower-left corner of the picture.
     """
     if resolution_m is None:
         raise bare_image(path)
@@ -395,7 +396,7 @@ def read_picture(path: Path, *, resolution_m: float | None = None) -> PartialMap
         remedy = "give the metres per pixel, a known length [m] over its number of pixels, from 0.0001 to 10."
         raise MapError(f"resolution_m = {shown(resolution_m)} is not allowed: {remedy}")
     notes = ImportNotes(path, pixel_m, "resolution_m, metres per pixel")
-    wall = _walls(path, pixel_m, notes)
+    wall = _walls(path, pixel_m, threshold, notes)
     factor = max(1, math.floor(DEFAULT_RESOLUTION_M / pixel_m + 1e-6))
     wall = np.flipud(wall)
     wall = np.pad(wall, [(0, -size % factor) for size in wall.shape])
@@ -418,17 +419,25 @@ def read_picture(path: Path, *, resolution_m: float | None = None) -> PartialMap
     return notes.attached_to(replace(empty, state=state), size=remedy, doors=remedy)
 
 
-def _walls(path: Path, pixel_m: float, notes: ImportNotes) -> Bools:
-    """Return which pixels are walls, the top row first, and note what was taken for them."""
+def wall_shades(path: Path) -> tuple[States, int, bool]:
+    """Return shades of grey (rows, columns), inverted where walls are bright, Otsu's threshold, and if inverted."""
     shade = _shades(path)
     count = np.bincount(shade.ravel(), minlength=256)
     if np.count_nonzero(count) < 2:
         raise MapError(f"path = '{path}' has one shade alone: give a picture of walls on a ground of another shade.")
     threshold = otsu_threshold(count)
-    wall, side = shade <= threshold, "up to"
-    if wall.mean() > 0.5:
-        wall, side = ~wall, "above"
-    notes.notes.append(f"walls: shades {side} {threshold} of 255 (Otsu's threshold)")
+    if (shade <= threshold).mean() > 0.5:
+        return 255 - shade, 254 - threshold, True
+    return shade, threshold, False
+
+
+def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes) -> Bools:
+    """Return which pixels are walls, the top row first, and note what was taken for them."""
+    shade, otsu, is_inverted = wall_shades(path)
+    most, source = (otsu, "Otsu's threshold") if threshold is None else (threshold, "as given")
+    wall = shade <= most
+    side = f"above {254 - most}" if is_inverted else f"up to {most}"
+    notes.notes.append(f"walls: shades {side} of 255 ({source})")
     width = round(THIN_M / pixel_m)
     if width > 1:
         wide = ndimage.binary_opening(wall, np.ones((width, width), dtype=bool))
@@ -436,8 +445,8 @@ def _walls(path: Path, pixel_m: float, notes: ImportNotes) -> Bools:
             notes.skip("thin lines", ndimage.label(wall & ~wide)[1], f"narrower than {width * pixel_m:.2g} m")
             wall = wide
     pieces, _ = ndimage.label(wall, np.ones((3, 3), dtype=bool))
-    most = MARK_M / pixel_m
-    small = [max(part.stop - part.start for part in extent) <= most for extent in ndimage.find_objects(pieces)]
+    longest = MARK_M / pixel_m
+    small = [max(part.stop - part.start for part in extent) <= longest for extent in ndimage.find_objects(pieces)]
     notes.skip("separate marks", sum(small), f"text or symbols up to {MARK_M:g} m")
     wall = np.array([False, *(not each for each in small)])[pieces]
     notes.use("connected walls", len(small) - sum(small))

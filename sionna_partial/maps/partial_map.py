@@ -219,7 +219,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         materials = self.wall_materials if material in self.wall_materials else (*self.wall_materials, material)
         cells = np.zeros(self.shape, np.uint8) if self.wall_material is None else self.wall_material.copy()
         materials = _checked_materials(materials)
-        cells[self._cells_within(where)] = materials.index(material) + 1
+        cells[self.cells_within(where)] = materials.index(material) + 1
         return replace(self, wall_material=cells, wall_materials=materials)
 
     def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
@@ -251,13 +251,13 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         """
         height_m = _number("height_m", height_m, 0.01, 100.0)
         cells = np.zeros(self.shape, np.uint8) if self.obstacle is None else self.obstacle.copy()
-        area = free_standing(self.state, self.resolution_m) if where is None else self._cells_within(where)
+        area = free_standing(self.state, self.resolution_m) if where is None else self.cells_within(where)
         heights_m = tuple(dict.fromkeys((*self.obstacle_heights_m, height_m)))
         cells[area] = heights_m.index(height_m) + 1 if height_m < self.wall_height_m else 0
         return replace(self, obstacle=cells, obstacle_heights_m=heights_m)
 
-    def _cells_within(self, where: object) -> Bools:
-        """Cells (ny, nx) of a mask, or whose centres are in a polygon or a shapely geometry [m]."""
+    def cells_within(self, where: object) -> Bools:
+        """Return the cells (ny, nx) of an area, as `where` of `with_wall_material`, or raise a MapError."""
         if not isinstance(where, shapely.Geometry):
             area = real_array("where", where, MapError, "give cells (ny, nx) as booleans, or a polygon.", "biuf")
             if area.dtype == np.bool_ and area.shape == self.shape:

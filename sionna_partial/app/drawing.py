@@ -1,0 +1,103 @@
+"""Floor plans as pictures whose scale is drawn on them, and corrections that are drawn on a map."""
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
+
+import numpy as np
+import shapely
+
+from sionna_partial.app.files import stored_map
+from sionna_partial.app.jobs import logged_warnings
+from sionna_partial.arrays import States
+from sionna_partial.checks import require
+from sionna_partial.constants import PICTURE_SUFFIXES, WALL_THICKNESS_M, CellState
+from sionna_partial.errors import MapError
+from sionna_partial.maps.drawings import read_picture, wall_shades
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.settings import WALL_MATERIALS
+
+LENGTH, WALL, FREE = "length", "wall", "free"
+"""Strokes that measure a picture, add a wall and make cells free; others are names of materials."""
+
+STROKES = {
+    LENGTH: "measures a known length",
+    WALL: "adds a straight wall",
+    FREE: "erases walls",
+    **{name: f"makes walls of {name}" for name in WALL_MATERIALS},
+}
+"""Kinds of strokes on the map, and what they do."""
+
+STRAIGHT = (LENGTH, WALL)
+"""Strokes that are lines from their first to their last point."""
+
+_MOST_POINTS = 100_000
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """A floor plan as a picture: shades with dark walls (rows, columns), and the edge of a pixel [m], if known."""
+
+    name: str
+    content: bytes
+    shade: States
+    threshold: int
+    pixel_m: float | None = None
+
+    @property
+    def size_m(self) -> tuple[float, float]:
+        """Width and height of the picture [m], in pixels before its scale is known."""
+        rows, columns = self.shade.shape
+        return columns * (self.pixel_m or 1.0), rows * (self.pixel_m or 1.0)
+
+    def read(self) -> PartialMap:
+        """Return the map of the plan, whose scale must be known."""
+        with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
+            path = stored_map([(self.name, self.content)], Path(folder))
+            try:
+                return read_picture(path, resolution_m=self.pixel_m, threshold=self.threshold)
+            except MapError as error:
+                reason = str(error).replace(str(path), PurePath(self.name).name)
+                raise MapError(f"{reason} Move the threshold of the walls, or draw a known length again.") from error
+
+
+def uploaded_plan(files: Sequence[tuple[str, bytes]]) -> Plan | None:
+    """Read a picture of uploaded files (name, content); None if they are something else."""
+    if len(files) != 1 or PurePath(files[0][0]).suffix.lower() not in PICTURE_SUFFIXES:
+        return None
+    with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
+        shade, threshold, _ = wall_shades(stored_map(files, Path(folder)))
+    return Plan(*files[0], shade, threshold)
+
+
+@dataclass(frozen=True)
+class Stroke:
+    """A correction of a map: one of `STROKES` along points [m], with a brush [m] unless it adds a wall."""
+
+    kind: str
+    points_m: tuple[tuple[float, float], ...]
+    width_m: float
+
+    def on(self, partial: PartialMap) -> PartialMap:
+        """Return the corrected map.
+
+        Raises
+        ------
+        MapError
+            If it has a mesh.
+        """
+        require(0 < len(self.points_m) <= _MOST_POINTS, "points", len(self.points_m), "draw a shorter line.")
+        points = np.array(self.points_m if len(self.points_m) > 1 else self.points_m * 2)
+        width_m = WALL_THICKNESS_M if self.kind == WALL else self.width_m
+        area = shapely.LineString(points).buffer(max(width_m, 1.5 * partial.resolution_m) / 2.0)
+        if self.kind not in (WALL, FREE):
+            return partial.with_wall_material(self.kind, area)
+        if partial.mesh is not None:
+            raise MapError("walls are drawn on floor plans alone, and this map has a mesh: change its file.")
+        state = partial.state.copy()
+        if self.kind == WALL:
+            state[partial.cells_within(area)] = CellState.WALL
+        else:
+            state[partial.cells_within(area) & (state == CellState.WALL)] = CellState.FREE
+        return replace(partial, state=state)

@@ -1,0 +1,37 @@
+"""Commands run in this process, and the arguments with which they call a function of the package."""
+
+import inspect
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner, Result
+
+import sionna_partial as sp
+from sionna_partial import cli
+
+
+class Called(Exception):
+    """A function was called, with these arguments by name."""
+
+
+def run(*words: object) -> Result:
+    return CliRunner().invoke(cli.app, [str(word) for word in words])
+
+
+def arguments_of(monkeypatch: pytest.MonkeyPatch, functions: str, *words: object) -> dict[str, Any]:
+    """Run a command up to the last of some functions; those before return None."""
+    *before, last = functions.split()
+    signature = inspect.signature(getattr(sp, last))
+
+    def record(*arguments: Any, **options: Any) -> None:
+        raise Called(dict(signature.bind(*arguments, **options).arguments))
+
+    with monkeypatch.context() as patch:
+        for name in before:
+            patch.setattr(sp, name, lambda *_, **__: None)
+        patch.setattr(sp, last, record)
+        result = run(*words)
+    assert isinstance(result.exception, Called), result.output
+    found: dict[str, Any] = result.exception.args[0]
+    return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}
