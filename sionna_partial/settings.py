@@ -200,7 +200,7 @@ class SceneSettings(Checked):
     geometries : int or None
         Number of plausible geometries, 1 to 16, over which powers are averaged: the mapped outlines, and outlines whose
         vertices are moved at random by 3 cm. They count for links without line of sight on the mapped outlines. None is
-        4 on nearly complete maps with range noise (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1
+        3 on nearly complete maps with range noise (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1
         elsewhere. Gradients, channels, meshes, links with a folder and those with a
         `TraceSettings.power_tolerance_db` always have the mapped outlines.
 

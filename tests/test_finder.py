@@ -192,7 +192,7 @@ def test_powers_are_averaged_over_geometries(tmp_path: Path) -> None:
     one, three, again = (sp.Simulation(plan, None, sp.SceneSettings(geometries=count)) for count in (1, 3, 3))
     mapped, mean = one.links(TX, RX), three.links(TX, RX)
     hidden = mapped.link_state == sp.LinkState.NLOS
-    assert hidden.any() and not hidden.all()
+    assert 0 < hidden.sum() < len(RX)
     np.testing.assert_array_equal(mean.link_state, mapped.link_state)
     np.testing.assert_array_equal(mean.gain_db[~hidden], mapped.gain_db[~hidden])
     np.testing.assert_array_equal(mean.gain_db, again.links(TX, RX).gain_db)

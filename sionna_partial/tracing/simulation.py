@@ -42,7 +42,7 @@ from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
 
-GEOMETRIES = 4
+GEOMETRIES = 3
 """Default of `SceneSettings.geometries` on nearly complete maps with range noise."""
 
 DRAWN_TOLERANCE_DB = 0.5
