@@ -6,12 +6,14 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
+CORE := $(patsubst %,tests/test_%.py,arrays cli coverage export features files house link_model map_files measurements metrics \
+	network outlines paper_networks partial_map predictor ros_map scene settings slab trace unobserved)
 LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
-.PHONY: help demo test kernels docs hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test check core kernels-plan kernels-mesh docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -20,16 +22,27 @@ demo: $(READY) ## Predict a half-explored demo home, and compare with the truth 
 	@$(BIN)/sionna-partial demo --out demo-output
 
 test: $(READY) ## Check style and types, and run the tests
-	@$(MAKE) --no-print-directory -j 2 lint kernels
+	@$(MAKE) --no-print-directory -j 2 kernels-plan lint kernels-mesh
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile
 
-kernels: $(READY)
-	@$(ONE_THREAD) $(BIN)/python tests/compile_kernels.py
+check: $(READY) ## Check style and types, and run the tests of the core, in two minutes
+	@$(MAKE) --no-print-directory -j 2 core lint
+
+core: $(READY)
+	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -q $(CORE)
+
+kernels-plan kernels-mesh: kernels-%: $(READY)
+	@$(ONE_THREAD) $(BIN)/python tests/compile_kernels.py $*
 
 docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
-	@$(ONE_THREAD) $(BIN)/python -m pytest -q -n 2 -m pages tests/test_readme.py
-	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
+	@$(MAKE) --no-print-directory -j 2 site pages
 	@echo "the site is build/docs/index.html"
+
+site: $(READY)
+	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
+
+pages: $(READY)
+	@$(ONE_THREAD) $(BIN)/python -m pytest -q -m pages tests/test_readme.py
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
 	@mkdir -p build

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.datasets.shards import LinkTable, LinkTraces, open_links, require_like, settings_for
-from sionna_partial.evaluation.evaluate import DEFINITIONS, Metrics, home_scores, mean_and_error, measure
+from sionna_partial.evaluation import DEFINITIONS, Metrics, home_scores, mean_and_error, measure
 from sionna_partial.files import atomic_write
 from sionna_partial.reports import markdown_table
 from sionna_partial.settings import NetworkKind

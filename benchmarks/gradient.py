@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from stock import peak_memory_gb
 
 import sionna_partial as sp
-from sionna_partial.differentiable.scene import DifferentiableLinks, DifferentiableScene
+from sionna_partial.differentiable import DifferentiableLinks, DifferentiableScene
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.unobserved import CELLS_M
 from sionna_partial.tracing.path_set import PathSet

@@ -3,15 +3,21 @@
     .venv/bin/python benchmarks/live.py --updates 1000
 
 prints the table of docs/live.md: the shipped apartment, and a hall of 30 x 15 m that is half seen.
+
+    .venv/bin/python benchmarks/live.py --depot ../shared/slam/depot.yaml
+
+prints every update of a robot with a lidar of 8 m that maps a whole depot.
 """
 
 import argparse
 import resource
 import statistics
+import time
 from pathlib import Path
 from types import SimpleNamespace as Fields
 
 import numpy as np
+from stock import peak_memory_gb
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
@@ -80,12 +86,43 @@ def growth_mb(maps: list[sp.PartialMap], updates: int) -> tuple[float, float]:
     return early, memory_mb()
 
 
+def depot_maps(path: Path, steps: range) -> list[sp.PartialMap]:
+    """Return the maps of a robot that drives through a map of SLAM, whose unknown cells are taken for walls."""
+    known = sp.load_map(path)
+    state = np.where(known.state == CellState.UNKNOWN, CellState.WALL, known.state).astype(np.uint8)
+    whole = sp.PartialMap(state, known.resolution_m, known.origin_m)
+    return sp.explore(whole, steps=[*steps], sensor=sp.SensorSettings(field_of_view_deg=360.0, range_m=8.0))
+
+
+def drive(maps: list[sp.PartialMap], spacing_m: float) -> None:
+    """Print time and memory of every update of a robot that maps a building."""
+    grids: list[sp.LiveGrid] = []
+    live = sp.LiveCoverage(free_position(maps[0]), grids.append, sp.LiveSettings(spacing_m=spacing_m))
+    print("\n| map | observed cells | first grid [s] | final grid [s] | processor [s] | memory [GB] |")
+    print("|---|---|---|---|---|---|")
+    for number, partial in enumerate(maps):
+        grids.clear()
+        start_s = time.process_time()
+        live.on_map(message(partial))
+        live.step()
+        first_s, final_s = (next(grid.age_s for grid in grids if grid.is_final == final) for final in (False, True))
+        cells, used_s = int((partial.state != CellState.UNKNOWN).sum()), time.process_time() - start_s
+        times = f"{first_s:.1f} | {final_s:.1f} | {used_s:.1f}"
+        print(f"| {number} | {cells} | {times} | {memory_mb() / 1e3:.2f} |", flush=True)
+    print(f"peak memory: {peak_memory_gb():.2f} GB")
+
+
 def main() -> None:
-    """Measure, and print the table."""
+    """Measure, and print the tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--updates", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=2)
+    parser.add_argument("--spacing", type=float, default=0.15, help="of the receivers in the depot [m]")
+    parser.add_argument("--depot", type=Path, help="map of SLAM; measures nothing else")
     given = parser.parse_args()
+    if given.depot:
+        drive(depot_maps(given.depot, range(1, 402, 100)), given.spacing)
+        return
     apartment = [sp.load_map(APARTMENT / f"step{step:03d}/map.yaml") for step in (50, 100, 150)]
     large = [half_seen_hall(fraction) for fraction in (0.5, 0.6, 0.7)]
     print("| map | cells | first grid [s] | final grid [s] |\n|---|---|---|---|")

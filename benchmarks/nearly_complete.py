@@ -20,7 +20,7 @@ import numpy as np
 
 import sionna_partial as sp
 from sionna_partial.datasets.home_links import closed_home
-from sionna_partial.evaluation.evaluate import measure
+from sionna_partial.evaluation import measure
 from sionna_partial.maps.partial_map import cell_centres_m
 from sionna_partial.prediction.predictor import LinkPrediction
 

@@ -5,7 +5,8 @@ power_dbm, as ../shared/measured/bleflat does. Of each transmitter 60 random poi
 the powers at the others are predicted, 20 times; the offset of powers is not known. The table has the root mean square
 error (RMSE) and the continuous ranked probability score (CRPS), averaged over transmitters [dB], the fraction of powers
 in the central 90 % interval of the prediction, and the fraction of points, all of which received, with
-P(outage) > 0.5. The last table is the mean over folders of the figures of each baseline minus ours.
+P(outage) > 0.5. The last tables are the mean over folders of the figures of each baseline minus ours, and the residual
+spread about the trace: on each floor, and on average over the other floors, as a prior would have it.
 
     python benchmarks/reality.py ../shared/measured/bleflat ../shared/measured/ble_floor
 
@@ -17,10 +18,13 @@ of the floor; a Gaussian process about each of the two (Matern 3/2 over the rece
 Without given powers (N = 0), their constants are those of the other transmitters, which give the offset. Their
 predictions are Gaussian, with the standard deviation of their own errors for the other transmitters.
 "ours, alone" does without the links of the floor's other transmitters.
+
+With --locate, the position of each transmitter is unknown instead, and estimated from 40 random powers.
 """
 
 import argparse
 import csv
+import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,11 +39,12 @@ from through_walls import ends
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
 from sionna_partial.tracing.simulation import clear_of_walls
 
 Floats = NDArray[np.float64]
-NUMBERS, POINTS = (0, 5, 10, 20), 60
+NUMBERS, POINTS, LOCATE_POINTS = (0, 5, 10, 20), 60, 40
 FIGURES = "RMSE [dB]", "CRPS [dB]", "in 90 %", "P(out) > .5"
 EXPONENT, EXPONENT_STD, NOISE_DB, OFFSET_STD_DB = 2.0, 0.5, 6.0, 8.0
 COLUMNS = "tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "power_dbm"
@@ -63,12 +68,13 @@ def main() -> None:
     parser.add_argument("--map", default="map.yaml", help="name of the map in each folder")
     parser.add_argument("--material", default="unknown", help="of the walls; unknown is the default of SceneSettings")
     parser.add_argument("--opaque-walls", action="store_true")
+    parser.add_argument("--locate", action="store_true", help="estimate positions of transmitters instead")
     parser.add_argument("--half", action="store_true", help="hide each half of the plan in turn: left, right, ...")
     parser.add_argument("--transmitters", type=int, help="number of transmitters that are read of each floor")
     parser.add_argument("--draws", type=int, default=20)
     arguments = parser.parse_args()
     scene = sp.SceneSettings(**{} if arguments.material == "unknown" else {"material": arguments.material})
-    leads = defaultdict(list)
+    leads, spreads = defaultdict(list), {}
     floors = {f"{folder.name}, {arguments.map}": (folder, arguments.map) for folder in arguments.folders}
     for name, source in (floors or BUILDINGS).items():
         partial, links, frequency_hz = read_floor(*source) if floors else procedural(*source)
@@ -78,12 +84,40 @@ def main() -> None:
             continue
         trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
         maps = halves(partial) if arguments.half else [partial]
-        tables = [Floor(each, links, sp.Simulation(each, trace, scene)).table(arguments.draws) for each in maps]
+        if arguments.locate:
+            locate(name, sp.LinkModel(partial, None, trace, scene), links, arguments.draws)
+            continue
+        floors_of_maps = [Floor(each, links, sp.Simulation(each, trace, scene)) for each in maps]
+        spreads[name] = floors_of_maps[0].residual_stds_db()
+        tables = [floor.table(arguments.draws) for floor in floors_of_maps]
         table = {method: np.mean([each[method] for each in tables], axis=0) for method in tables[0]}
         print_table(f"{name}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
         for method, figures in table.items():
             leads[method].append(figures[:2] - table["ours"][:2])
+    if arguments.locate:
+        return
     print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
+    print(
+        "\n| residual spread [dB] | process | fading | both | both, mean of the other floors |\n|---|---|---|---|---|"
+    )
+    both = {name: np.hypot(*stds) for name, stds in spreads.items()}
+    for name, stds in spreads.items():
+        others = np.mean([total for other, total in both.items() if other != name] or [np.nan])
+        print(f"| {name} | {stds[0]:.1f} | {stds[1]:.1f} | {both[name]:.1f} | {others:.1f} |")
+
+
+def locate(name: str, model: sp.LinkModel, links: dict[str, Floats], draws: int) -> None:
+    """Print errors of the estimated positions of transmitters, and the fraction of transmitters in the 90 % region."""
+    errors_m, inside = [], []
+    for rows, draw in itertools.product(links.values(), range(draws)):
+        given = rows[np.random.default_rng(draw).permutation(len(rows))[:LOCATE_POINTS]]
+        measured = sp.Measurements((np.nan, np.nan, rows[0, 2]), given[:, 3:6], given[:, 6])
+        found = sp.predict_map(model, measurements=measured, spacing_m=3.0)
+        errors_m.append(np.linalg.norm(found.transmitter_m - rows[0, :3]))
+        cell = np.abs(found.tx_y - rows[0, 1]).argmin().item(), np.abs(found.tx_x - rows[0, 0]).argmin().item()
+        inside.append(likely_region(found.p_transmitter.values)[cell])
+    errors = f"median {np.median(errors_m):.2f} m, mean {np.mean(errors_m):.2f} m"
+    print(f"\n{name}: {errors}, in the 90 % region {np.mean(inside):.2f} of {len(inside)}", flush=True)
 
 
 def print_table(title: str, table: dict[str, Floats]) -> None:
@@ -166,6 +200,12 @@ class Floor:
             self.prior[tx] = model.predict(tx_m, rx_m)
         self.fitted = {tx: self.fit(tx, np.arange(len(rows))) for tx, rows in links.items()}
 
+    def residual_stds_db(self) -> Floats:
+        """Return the root mean square of the standard deviations of process and fading (2,), all powers given [dB]."""
+        fits = [fit for fitted in self.fitted.values() for fit in fitted._fits if fit is not None]
+        squares: Floats = np.mean([(fit.kind.trace_std_db**2, fit.fading_db**2) for fit in fits], axis=0)
+        return np.sqrt(squares)
+
     def table(self, draws: int) -> dict[str, Floats]:
         """Return the mean over transmitters of the figures (4, N) of each method."""
         shape = len(NUMBERS), draws, POINTS
@@ -222,8 +262,6 @@ class Floor:
                 fitted = self.fit(tx, known, [self.fitted[other] for other in others if other != tx])
                 after = fitted.update(self.links[tx][rest, 3:6], self.prior[tx].take(rest))
                 weights, means_db, stds_db = after.by_state
-                if not len(known):
-                    stds_db = np.hypot(stds_db, np.std([self.fitted[other].offset_db for other in others]))
                 parts = weights, means_db + fitted.offset_db, stds_db
                 error_db = after.gain_mean_db + fitted.offset_db - power
                 found[name] = error_db, *scores(parts, power), weights[LinkState.OUTAGE] > 0.5

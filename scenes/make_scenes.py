@@ -3,8 +3,8 @@
 usage: python scenes/make_scenes.py [FOLDER]
 
 Writes FOLDER/<home>/complete and FOLDER/<home>/step<steps> as scene folders, FOLDER/homes.json, and FOLDER/README.md;
-FOLDER/measured.csv and FOLDER/scan.ply, which the pages of the documentation read. Running it again gives the same
-bytes.
+FOLDER/measured.csv, FOLDER/scan.ply and FOLDER/vacuum, which the pages of the documentation read. Running it again
+gives the same bytes.
 """
 
 import json
@@ -14,17 +14,34 @@ from typing import Any
 
 import numpy as np
 import trimesh
+from numpy.typing import ArrayLike
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.explore import explore
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.scene.scene import export_scene
-from sionna_partial.settings import Material, SceneSettings
+from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing.simulation import trace_links
 from sionna_partial.worlds.homes import make_home
 
 STEPS = (50, 100, 150, 200)
+
+ROOMS = {
+    "living": (2, 82, 122, 178),
+    "kitchen": (124, 112, 200, 178),
+    "hall": (2, 56, 200, 80),
+    "bedroom": (2, 2, 80, 54),
+    "bath": (82, 2, 128, 54),
+    "study": (130, 2, 200, 54),
+}
+"""Rooms of the home of the vacuum robot [pixels]: x0, y0, x1, y1 with y down. The door of the study is closed."""
+
+DOORS = ((40, 80, 58, 82), (122, 136, 124, 154), (30, 54, 46, 56), (100, 54, 114, 56))
+PIXEL_CM, HOME_CELLS, ROUTER_M, ROUTER_DBM = 5, (180, 202), (0.8, 0.7, 1.5), 0.0
+"""Pixel [cm], rows and columns of that home, position of its access point, and received power less path gain."""
 
 HOMES: dict[str, dict[str, Any]] = {
     "apartment": {"kind": "apartment", "seed": 3, "exploration_seed": 3, "transmitter": [7.0, 9.8, 1.5]},
@@ -42,7 +59,9 @@ table, for programs.
 
 `measured.csv` holds path gains of 60 links in the apartment, all from its transmitter to positions that the robot had
 seen after 100 steps: those of walls of concrete, with 2 dB of noise. `scan.ply` is the mesh of two rooms with a door
-between them and a table.
+between them and a table. `vacuum` holds a synthetic home as a vacuum robot maps it (`home.json`, ValetudoMap) and a
+recording of its Wi-Fi (`home.vwm`, Valeronoi): 2.44 GHz, walls of brick, 3 dB of noise, the access point in the living
+room at (0.8, 0.7, 1.5) m, and a study whose door was closed.
 
 | home | kind | seed | robot's seed | grid [m] | free area [m2] | observed after {steps} steps | transmitter [m] |
 |---|---|---|---|---|---|---|---|
@@ -63,6 +82,7 @@ def main(folder: Path) -> None:
         if name == "apartment":
             _write_measurements(home, stages[STEPS.index(100)], recipe["transmitter"], folder / "measured.csv")
     _scan().export(folder / "scan.ply")
+    _write_vacuum(folder / "vacuum")
     with atomic_write(folder / "homes.json") as stream:
         stream.write((json.dumps(HOMES, indent=2) + "\n").encode())
     with atomic_write(folder / "README.md") as stream:
@@ -88,6 +108,45 @@ def _write_measurements(home: PartialMap, seen: PartialMap, tx: list[float], pat
     table = np.column_stack([np.tile(tx, (len(rx), 1)), rx, gain_db])
     header = "tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db"
     np.savetxt(path, table, delimiter=",", header=header, comments="", fmt=[*(["%.3f"] * 6), "%.1f"])
+
+
+def _write_vacuum(folder: Path) -> None:
+    """Write a home as ValetudoMap, and the powers of its access point as a recording of Valeronoi."""
+    state, seen, layers = np.full(HOME_CELLS, CellState.WALL, np.uint8), np.zeros(HOME_CELLS, dtype=bool), []
+    for name, rectangle in (*ROOMS.items(), *(("", door) for door in DOORS)):
+        x0, y0, x1, y1 = rectangle
+        state[y0:y1, x0:x1] = CellState.FREE
+        if name != "study":
+            seen[y0:y1, x0:x1] = True
+            layers.append(_layer("segment" if name else "floor", [(x0, y, x1 - x0) for y in range(y0, y1)], name))
+    walls = ndimage.binary_dilation(seen, iterations=2) & (state == CellState.WALL)
+    walls[54:56, 160:176] = False  # the closed door, which a vacuum robot does not draw
+    row, start, end = row_runs(walls)
+    layers.append(_layer("wall", np.column_stack([start, row, end - start])))
+    size_cm = {"x": PIXEL_CM * HOME_CELLS[1], "y": PIXEL_CM * HOME_CELLS[0]}
+    home = {"__class": "ValetudoMap", "metaData": {"version": 2}, "size": size_cm, "pixelSize": PIXEL_CM}
+    home |= {"layers": layers, "entities": []}
+    rows, columns = np.nonzero(ndimage.binary_erosion(seen, iterations=4))
+    lanes = (rows % 16 == 0) & (columns % 12 == 0)  # 0.8 m apart, a power every 0.6 m
+    x_cm, y_cm = ((index[lanes] + 0.5) * PIXEL_CM for index in (columns, rows))
+    rx = np.column_stack([x_cm, size_cm["y"] - y_cm, np.full(len(x_cm), 10.0)]) / 100.0
+    truth, brick = PartialMap(state[::-1].copy(), PIXEL_CM / 100.0), SceneSettings(material=Material.named("brick"))
+    wifi = TraceSettings(frequency_hz=2.44e9)
+    gain_db = trace_links(truth, ROUTER_M, rx, trace_settings=wifi, scene_settings=brick).gain_db
+    power_dbm = np.rint(gain_db + ROUTER_DBM + 3.0 * np.random.default_rng(0).standard_normal(len(rx)))
+    points = zip(x_cm.tolist(), y_cm.tolist(), power_dbm.tolist(), strict=True)
+    measured = [{"x": x, "y": y, "wifi": 0, "data": [round(power)]} for x, y, power in points]
+    wifis = [{"bssid": "02:00:00:00:00:01", "ssid": "home", "signal": measured[-1]["data"][0]}]
+    recording = {"version": 1, "map": home, "measurements": measured, "wifis": wifis}
+    folder.mkdir(exist_ok=True)
+    for name, content in (("home.json", home), ("home.vwm", recording)):
+        with atomic_write(folder / name) as stream:
+            stream.write((json.dumps(content, separators=(",", ":")) + "\n").encode())
+
+
+def _layer(kind: str, runs: ArrayLike, name: str = "") -> dict[str, Any]:
+    """Return a layer of a ValetudoMap, of rows of pixels: x, y and length."""
+    return {"type": kind, "metaData": {"name": name} if name else {}, "compressedPixels": np.ravel(runs).tolist()}
 
 
 def _scan() -> trimesh.Trimesh:

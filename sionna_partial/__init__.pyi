@@ -12,9 +12,9 @@ from sionna_partial.coverage.job import predict_map as predict_map
 from sionna_partial.coverage.network import network_map as network_map
 from sionna_partial.datasets.dataset import build_dataset as build_dataset
 from sionna_partial.datasets.shards import read_dataset as read_dataset
-from sionna_partial.differentiable.scene import DifferentiableScene as DifferentiableScene
+from sionna_partial.differentiable import DifferentiableScene as DifferentiableScene
 from sionna_partial.errors import SionnaPartialError as SionnaPartialError
-from sionna_partial.evaluation.evaluate import evaluate as evaluate
+from sionna_partial.evaluation import evaluate as evaluate
 from sionna_partial.exploration.explore import Exploration as Exploration
 from sionna_partial.exploration.explore import explore as explore
 from sionna_partial.exploration.explore import explore_trajectory as explore_trajectory

@@ -22,7 +22,7 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.display import later
+from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
@@ -219,7 +219,10 @@ class LinkModel:
 
         `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m], which have been checked.
         """
-        return self._predict_paths(ends_m, [self.simulation.blocks(*each_m, report) for each_m in ends_m])
+        share = 1.0 / max(1, len(ends_m))
+        parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
+        paths = [self.simulation.blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
+        return self._predict_paths(ends_m, paths)
 
     def _predict_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
@@ -249,13 +252,17 @@ class LinkModel:
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
         """Predict links from their features; the trace is the prediction of those that are complete.
 
-        Where the material of walls is unknown, this is the mixture over its candidates, with the residuals of traces.
-        Networks predict with the traced material.
+        Through walls it has the residuals of traces as well. Where the material of walls is unknown, it is the mixture
+        over its candidates. Networks predict with the traced material.
         """
-        if phi.path_power is None:
-            return self._predict_under([phi], complete, phi)[0]
-        parts = self._predict_under(self.wall_materials.under(phi), complete, phi)
-        return LinkPrediction.over_materials(parts, self.wall_materials.prior, RESIDUAL_DB)
+        features, prior = [phi], np.ones(1)
+        if phi.path_power is not None:
+            features = self.wall_materials.under(phi, self.partial.unnamed_walls)
+            prior = self.wall_materials.prior
+        parts = self._predict_under(features, complete, phi)
+        if not self.simulation.trace_settings.through_walls:
+            return parts[0]
+        return LinkPrediction.over_materials(parts, prior, RESIDUAL_DB)
 
     def _predict_under(
         self, features: Sequence[LinkFeatures], complete: Bools, traced: LinkFeatures

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from sionna_partial.datasets.shards import stage_name
-from sionna_partial.evaluation.evaluate import DEFINITIONS, Difference, Evaluation, Row
+from sionna_partial.evaluation import DEFINITIONS, Difference, Evaluation, Row
 from sionna_partial.files import atomic_files
 
 REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")

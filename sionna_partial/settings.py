@@ -172,6 +172,13 @@ WALL_MATERIALS = {
 """Materials that walls have, with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less
 below; coated glass is glass with the conductivity of its metal film."""
 
+
+def material_name(material: Material) -> str:
+    """Return the name of a material of walls."""
+    names = {known: name for name, known in WALL_MATERIALS.items()}
+    return names.get(material) or material.itu or "a custom material"
+
+
 DRYWALL = WALL_MATERIALS["drywall"]
 """Material of a trace where none is known."""
 

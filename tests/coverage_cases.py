@@ -7,7 +7,7 @@ from extruded import drawn
 
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.predictor import Predictor, warm_predictor
 
 PICTURE = """
 ????????????
@@ -45,10 +45,9 @@ def map_of(picture: str, resolution_m: float = 0.5, origin_m: tuple[float, float
     return drawn(picture, resolution_m, origin_m)
 
 
-@cache
 def shipped(name: str = "map") -> Predictor:
-    """Return a shipped predictor; reading it takes longer than most predictions."""
-    return Predictor.load(name)
+    """Return a shipped predictor, which is read once in a process."""
+    return warm_predictor(name)
 
 
 @cache

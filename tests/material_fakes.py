@@ -5,8 +5,7 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.calibration.material_fit import MaterialTarget, Point
-from sionna_partial.calibration.measured_building import LinkPaths
+from sionna_partial.calibration.material_fit import LinkPaths, MaterialTarget, Point
 from sionna_partial.tracing.power import reflection_loss_db
 
 FREQUENCY_HZ, THICKNESS_M = 28e9, 0.03

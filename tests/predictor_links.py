@@ -13,7 +13,7 @@ from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
-from sionna_partial.prediction.inputs import free_space_gain_db
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 

@@ -2,6 +2,7 @@
 
 import base64
 import io
+import itertools
 import json
 import os
 import re
@@ -147,6 +148,43 @@ class TestJobs:
         other.session.begin(short)
         assert other.settle() == window.settle() == "Ready."
         other.session.close()
+
+    @pytest.mark.parametrize(
+        ("act", "search"), [(Session.place, "place_transmitter"), (Session.find_views, "next_views")]
+    )
+    def test_searches_take_turns_with_other_windows(
+        self, window: Window, monkeypatch: pytest.MonkeyPatch, act: Callable[[Session], None], search: str
+    ) -> None:
+        other, ended, steps, function = Window(), threading.Event(), list[str](), getattr(app_session, search)
+
+        def counted(*given: Any, progress: Any, **named: Any) -> Any:
+            def report(fraction: float, message: str) -> None:
+                steps.append("search")
+                progress(fraction, message)
+
+            return function(*given, progress=report, **named)
+
+        def endless(report: Any) -> Iterator[Callable[[], None]]:
+            while not ended.is_set():
+                report(0.5, "working")
+                steps.append("other")
+            yield lambda: None
+
+        unseen = ROOM.copy()
+        unseen[:, 30:] = 2
+        window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
+        window.session.put([("", 1.0, 1.0)])
+        window.settle()
+        monkeypatch.setattr(app_session, search, counted)
+        other.session.begin(endless)
+        act(window.session)
+        assert window.settle() == "Ready."
+        ended.set()
+        assert other.settle() == "Ready."
+        other.session.close()
+        during = steps[steps.index("search") : len(steps) - steps[::-1].index("search")]
+        assert during.count("search") > 4
+        assert ("search", "search") not in {*itertools.pairwise(during)}
 
     def test_a_drag_keeps_the_model(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
         made: list[Any] = []
@@ -886,4 +924,35 @@ def test_a_plan_is_dropped_measured_and_corrected(url: str, tmp_path: Path) -> N
         tab.run(f"{_MODEL}('stroke').value = '', 0")
         tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
         tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3.0) < 0.1")
+        assert tab.faults() == []
+
+
+def level(tab: Tab, x_m: float, y_m: float) -> float:
+    """Return the mean received power at a position [dBm]."""
+    found = tab.run(
+        f"(({{data}}) => {{ const values = data.power_mean_dbm[0], [ny, nx] = values.shape"
+        f"; const at = (v, low, size, n) => Math.floor((v - low) / size * n)"
+        f"; return values[at({y_m}, data.y[0], data.dh[0], ny) * nx + at({x_m}, data.x[0], data.dw[0], nx)]"
+        f"}})({_MODEL}('values'))"
+    )
+    return float(found)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
+def test_one_is_placed_and_its_sector_turns(url: str, tmp_path: Path) -> None:
+    with chromium(tmp_path) as open_tab:
+        tab = open_tab(url, 1400, 950)
+        tab.wait(f"{_MODEL}('message').text.includes('Click on the map')")
+        press(tab, "Place it for me")
+        tab.wait(f"{_MODEL}('points').data.name[0] == 'tx1' && {_READY}")
+        type_into(tab, "x [m]", "1")
+        tab.wait(f"{_MODEL}('python').value.includes('(1.0,')")
+        type_into(tab, "y [m]", "1.5")
+        tab.wait(f"{_MODEL}('python').value.includes('(1.0, 1.5,')")
+        tab.run(f"{_MODEL}('pattern').value = 'tr38901', 0")
+        for azimuth_deg, stronger, weaker in ((10, (1.7, 1.6), (0.9, 2.5)), (90, (0.9, 2.5), (1.7, 1.6))):
+            tab.wait(f"{_MODEL}('python').value.includes('tr38901')")
+            type_into(tab, "Azimuth [\u00b0]", str(azimuth_deg))
+            tab.wait(f"{_MODEL}('python').value.includes('azimuth_deg={azimuth_deg}') && {_READY}")
+            assert level(tab, *stronger) > level(tab, *weaker) + 6.0
         assert tab.faults() == []

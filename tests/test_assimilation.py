@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import sionna_partial as sp
 from sionna_partial.cli import app
 from sionna_partial.errors import MeasurementError, PositionError
-from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation
+from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation, _positive
 
 HOUSE = drawn(
     """
@@ -291,6 +291,23 @@ def test_through_walls_nothing_far_from_the_measurements_becomes_certain():
         after = posterior.update(rx_m, prior(40, 0.0, std_db=std_db))
         assert after.gain_std_db.min() > 1.0
         assert after.gain_std_db[-1] >= np.hypot(std_db, 4.9)
+
+
+def test_through_walls_the_variance_is_of_process_offset_factor_and_fading_together():
+    """The predicted variance equals the Gaussian posterior of a new power, whose offset and factor are as uncertain."""
+    measured = sp.Measurements(UNSEEN, LEFT[:6], [-80.0, -84.0, -88.0, -81.0, -90.0, -79.0])
+    posterior = Assimilation.fit(HOUSE, UNSEEN, measured, prior(6, 0.0, std_db=0.0), through_walls=True)
+    (fit,), links, rx = posterior._fits, posterior._links, LEFT[6:]
+    measured_at = links.walks.points_m
+    free_db = [links.free_space_db(points_m) for points_m in (measured_at, rx)]
+    given, new = (np.stack([np.ones(len(each)), -95.0 - each]) for each in free_db)
+    across = fit.kind.trace_std_db**2 * links.correlation(rx, fit.kind) + given.T @ fit.kind.covariance @ new
+    among = fit.kind.trace_std_db**2 * _positive(links.correlation(measured_at, fit.kind))
+    among = among + given.T @ fit.kind.covariance @ given
+    explained = (across * np.linalg.solve(among + fit.noise_db**2 * np.eye(6), across)).sum(axis=0)
+    total = fit.kind.trace_std_db**2 + (new * (fit.kind.covariance @ new)).sum(axis=0) + fit.fading_db**2
+    found = posterior.update(rx, prior(len(rx), 0.0, std_db=0.0))
+    np.testing.assert_allclose(found.gain_std_db**2, total - explained)
 
 
 @functools.cache

@@ -29,8 +29,8 @@ def way(time_s: Any) -> tuple[Any, Any, Any]:
     return 1.0 + 0.5 * time_s, 2.0 + 0.1 * time_s, 0.02 * time_s
 
 
-@pytest.fixture(params=KINDS)
-def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+@pytest.fixture(params=KINDS, scope="module")
+def drive(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two maps, a costmap, transforms, poses, a goal, odometry, and powers with and without stamps."""
     name: str = request.param
     make = messages_of(name)
@@ -50,7 +50,7 @@ def drive(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
         rows.append(("/tf", time_s, make.transform(START_S + time_s, "odom", "base_link", *turned)))
         rows.append(("/rssi", time_s + 0.2, make.power(-50.0 - time_s)))
         rows.append(("/stamped", time_s + 0.4, make.stamped_power(START_S + time_s + 0.1, -60.0 - time_s)))
-    return write_bag(tmp_path / name, rows)
+    return write_bag(tmp_path_factory.mktemp("drive") / name, rows)
 
 
 class TestMaps:
@@ -74,15 +74,12 @@ class TestMaps:
             ({"time_s": "1"}, r"time_s = '1' is not allowed"),
             ({"topic": "/odom"}, r"has no OccupancyGrid topic '/odom': name one of its topics: /amcl_pose"),
             ({"topic": 3}, r"has no OccupancyGrid topic 3: name one of its topics"),
+            ({"up": "y"}, r"up is for scans alone, but path = '.*' is a rosbag: leave it out"),
         ],
     )
     def test_refused(self, drive: Path, given: Any, message: str) -> None:
         with pytest.raises(MapError, match=message):
-            map_from_bag(drive, **given)
-
-    def test_arguments_for_scans_alone(self, drive: Path) -> None:
-        with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is a rosbag: leave it out"):
-            load_map(drive, up="y")
+            (load_map if "up" in given else map_from_bag)(drive, **given)
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -219,20 +216,18 @@ class TestMessages:
             ({"data": [], "width": 0}, {}, "info has 1 x 0 cells: give a map with cells"),
             ({"tilt": 1.0}, {}, "info.origin.orientation = [1.0, 0.0, 0.0, 1.0] is not level: give a yaw alone"),
             ({"tilt": math.nan}, {}, "is not level"),
+            (None, {}, "resolution_m is missing: give the edge of a cell in metres, or an Occ"),
         ],
     )
-    def test_refused(self, change: dict[str, Any], given: dict[str, Any], message: str) -> None:
-        grid = Messages(2).grid(SIDE)
-        grid.info.origin.orientation.x = change.pop("tilt", 0.0)
-        grid.info.width = change.pop("width", 2)
-        for name, value in change.items():
-            object.__setattr__(grid, name, value)
+    def test_refused(self, change: dict[str, Any] | None, given: dict[str, Any], message: str) -> None:
+        grid = [[0]] if change is None else Messages(2).grid(SIDE)
+        for name, value in (change or {}).items():
+            where, name = {"tilt": (grid.info.origin.orientation, "x"), "width": (grid.info, name)}.get(
+                name, (grid, name)
+            )
+            object.__setattr__(where, name, value)
         with pytest.raises(MapError, match=re.escape(message)):
             map_from_occupancy(grid, **given)
-
-    def test_array_without_resolution(self) -> None:
-        with pytest.raises(MapError, match="resolution_m is missing: give the edge of a cell in metres, or an Occ"):
-            map_from_occupancy([[0]])
 
 
 class TestDamage:

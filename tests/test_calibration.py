@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.calibration import material_fit
-from sionna_partial.calibration.measured_building import custom_material
+from sionna_partial.calibration.calibration import custom_material
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map

@@ -416,7 +416,12 @@ class TestAccessor:
         assert 0.0 < above.mean() < 1.0
         assert area.fraction.sel(floor="observed").item() == pytest.approx(above.mean())
         assert area.area_m2.sel(floor="observed").item() == pytest.approx(floor.sum() * complete.spacing_m**2)
-        assert several.radio.area(-67.0).fraction.dims == ("floor", "tx")
+        each, together = (several.radio.area(-67.0, any_transmitter=of_all) for of_all in (False, True))
+        assert each.fraction.dims == ("floor", "tx")
+        means, mean = (found.fraction_mean.sel(floor="observed") for found in (each, together))
+        assert means.max() <= mean + 1e-9
+        assert mean <= means.sum() + 1e-9
+        assert complete.radio.area(-67.0, any_transmitter=True).identical(complete.radio.area(-67.0))
         assert (several.radio.area(-400.0).fraction_mean < 1.0).all()  # an outage is never above
 
     @pytest.mark.parametrize(

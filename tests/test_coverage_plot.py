@@ -1,8 +1,9 @@
 import io
+import re
 
 import numpy as np
 import pytest
-from coverage_cases import shipped
+from coverage_cases import shipped, small_coverage
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -13,12 +14,18 @@ from sionna_partial.constants import LinkState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage
+from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage, report_figure
 from sionna_partial.plots.style import STATE_COLOURS, figure_png, sheet_columns
 
 LOS, NLOS, OUTAGE = (
     np.array(to_rgb(STATE_COLOURS[state])) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)
 )
+
+
+@pytest.fixture(scope="module")
+def figure():
+    """One drawing of the coverage map, which tests read."""
+    return plot_coverage(small_coverage(), threshold_db=-80.0)
 
 
 def panels(figure):
@@ -60,8 +67,8 @@ def test_the_mixture_of_the_states_is_drawn_if_asked_for(coverage):
     np.testing.assert_allclose(at_receivers(panel, coverage), expected[coverage["valid"].to_numpy()])
 
 
-def test_the_likeliest_state_has_its_colour(coverage):
-    panel = panels(plot_coverage(coverage))[0]
+def test_the_likeliest_state_has_its_colour(coverage, figure):
+    panel = panels(figure)[0]
     assert panel.get_title() == "Likeliest link state"
     drawn = panel.images[0].to_rgba(at_receivers(panel, coverage))[..., :3]
     state = coverage["link_state"].to_numpy()[coverage["valid"].to_numpy()]
@@ -78,9 +85,14 @@ def test_other_panels_show_their_variable_with_fixed_scales(coverage):
         np.testing.assert_allclose(at_receivers(panel, coverage), expected)
 
 
-def test_the_probability_of_more_than_a_threshold(coverage):
+def test_gains_through_walls_have_a_scale_of_their_own(coverage):
+    (panel,) = panels(plot_coverage(coverage.assign_attrs(walls="through walls"), layers=["gain_mean_db"]))
+    assert panel.images[0].get_clim() == (-110, -30)
+
+
+def test_the_probability_of_more_than_a_threshold(coverage, figure):
     """By integration: the gain is the mixture of a normal distribution for LOS, one for NLOS, and the outage."""
-    panel = panels(plot_coverage(coverage, threshold_db=-80.0))[3]
+    panel = panels(figure)[3]
     assert panel.get_title() == "P(path gain > \N{MINUS SIGN}80 dB)"
     known = coverage.stack(rx=("y", "x")).isel(rx=coverage["valid"].to_numpy().ravel())
     draws = np.random.default_rng(0).normal(size=(20_000, 1))
@@ -91,8 +103,7 @@ def test_the_probability_of_more_than_a_threshold(coverage):
     np.testing.assert_allclose(at_receivers(panel, coverage), above, atol=0.02)
 
 
-def test_legend_and_colour_bars_name_what_is_drawn(coverage):
-    figure = plot_coverage(coverage)
+def test_legend_and_colour_bars_name_what_is_drawn(coverage, figure):
     labels = {axis.get_ylabel() for axis in figure.axes}
     assert {"dB", "probability"} <= labels
     assert legend(figure) == ["transmitter", "LOS", "NLOS", "outage", "wall", "not observed"]
@@ -108,9 +119,8 @@ def test_sheets_of_up_to_four_panels_have_no_hole():
             assert count % sheet_columns(count, aspect) == 0
 
 
-def test_walls_are_black_where_they_are_and_nowhere_else(coverage):
-    panel = panels(plot_coverage(coverage))[0]
-    walls = panel.images[-1]
+def test_walls_are_black_where_they_are_and_nowhere_else(coverage, figure):
+    walls = panels(figure)[0].images[-1]
     assert walls.get_extent() == pytest.approx((-1.0, 5.0, 2.0, 6.0))
     rgba = walls.get_array()
     x, y = np.meshgrid(np.linspace(-1, 5, 2 * rgba.shape[1] + 1)[1::2], np.linspace(2, 6, 2 * rgba.shape[0] + 1)[1::2])
@@ -119,11 +129,11 @@ def test_walls_are_black_where_they_are_and_nowhere_else(coverage):
     assert not rgba[..., :3].any()
 
 
-def test_the_unknown_area_is_hatched_and_a_known_map_is_not(coverage):
+def test_the_unknown_area_is_hatched_and_a_known_map_is_not(coverage, figure):
     def hatches(figure):
         return [item for item in panels(figure)[0].collections if item.get_hatch() or getattr(item, "hatches", None)]
 
-    (area,) = hatches(plot_coverage(coverage))
+    (area,) = hatches(figure)
     (outline,) = area.get_paths()
     x, y = np.meshgrid(coverage["x"], coverage["y"])
     points = np.column_stack([x.ravel(), y.ravel()])
@@ -133,8 +143,7 @@ def test_the_unknown_area_is_hatched_and_a_known_map_is_not(coverage):
     assert not hatches(plot_coverage(known))
 
 
-def test_the_transmitter_is_marked_in_each_panel_of_a_figure_unknown_to_pyplot(coverage):
-    figure = plot_coverage(coverage)
+def test_the_transmitter_is_marked_in_each_panel_of_a_figure_unknown_to_pyplot(figure):
     assert isinstance(figure, Figure)
     assert not pyplot.get_fignums()
     for panel in panels(figure):
@@ -147,9 +156,9 @@ def test_the_transmitter_is_marked_in_each_panel_of_a_figure_unknown_to_pyplot(c
         assert not image.text
 
 
-def test_several_transmitters_have_a_row_each(coverage, several):
-    figure = plot_coverage(several, layers=("link_state", "gain_mean_db", "state_mixture"))
-    rows = np.array(panels(figure)).reshape(2, 3)
+def test_several_transmitters_have_a_row_each(several, figure):
+    found = plot_coverage(several, layers=("link_state", "gain_mean_db", "state_mixture"))
+    rows = np.array(panels(found)).reshape(2, 3)
     assert [row[0].get_ylabel().split("\n")[0] for row in rows] == [*several["tx"].to_numpy()]
     assert [panel.get_title() for panel in rows[0]] == ["Likeliest link state", "Mean path gain", "Link state"]
     for row, tx in zip(rows, several["tx"], strict=True):
@@ -158,8 +167,20 @@ def test_several_transmitters_have_a_row_each(coverage, several):
         np.testing.assert_array_equal(at_receivers(row[1], one), expected)
         assert [star.get_xdata()[0] for star in row[1].lines] == [one["tx_x"]]
         assert row[1].images[0].get_clim() == (-150, -60)
-    assert figure.get_suptitle() == "Coverage for receivers that are indoors\n2 transmitters, 28 GHz, opaque walls"
-    assert legend(figure) == legend(plot_coverage(coverage))
+    assert found.get_suptitle() == "Coverage for receivers that are indoors\n2 transmitters, 28 GHz, opaque walls"
+    assert legend(found) == legend(figure)
+
+
+def test_the_report_has_names_any_transmitter_uncertainty_and_material(several):
+    figure = report_figure(several, [20.0, 30.0], -67.0, ("flat_2.png", "2026-11-25"))
+    (text,) = [text.get_text() for axis in figure.axes for text in axis.texts if "Uncertainty" in text.get_text()]
+    rows = text.split("\n\n")[0].splitlines()
+    assert [row.split(" ")[0] for row in rows] == ["Observed", *several["tx"].to_numpy(), "any"]
+    assert "20 dBm" in rows[1]
+    assert [row.count("%") for row in rows] == [0, 8, 8, 8]
+    assert re.search(r"Material of the walls: \w+", text)
+    assert "flat_2.png" in figure.get_suptitle()
+    assert len([axis for axis in figure.axes if axis.get_title()]) == 4
 
 
 def test_the_comparison_has_a_column_for_each_map(coverage):
@@ -191,7 +212,7 @@ def test_the_outside_is_blank_on_a_complete_map_alone(coverage):
         assert (blank[..., :3] == 255).all()
 
 
-@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1), (2, 3)])
+@pytest.mark.parametrize("shape", [(1, 1), (1, 40), (40, 1)])
 def test_maps_of_any_shape_are_drawn(shape):
     partial = PartialMap(np.full(shape, 2, dtype=np.uint8), 0.5)
     small = predict_map(partial, (0.1, 0.1), spacing_m=0.5, predictor=shipped())
@@ -200,16 +221,23 @@ def test_maps_of_any_shape_are_drawn(shape):
             assert max(image.size) < 8000
 
 
-def test_what_cannot_be_drawn_is_named(coverage):
-    with pytest.raises(SettingsError, match="coverage lacks p_los"):
-        plot_coverage(coverage.drop_vars("p_los"))
-    with pytest.raises(SettingsError, match="coverage lacks wall_parts"):
-        plot_comparison({"truth": coverage.drop_vars("wall_parts")})
-    with pytest.raises(SettingsError, match=r"coverages = \{\} is not allowed: give at least one coverage map"):
-        plot_comparison({})
-    with pytest.raises(SettingsError, match="layers = 'gain' is not allowed: choose one of link_state, state_mixture"):
-        plot_coverage(coverage, layers=("p_los", "gain"))
-    with pytest.raises(SettingsError, match="layers = 'p_los' is not allowed: give some of link_state"):
-        plot_coverage(coverage, layers="p_los")
-    with pytest.raises(SettingsError, match=r"threshold_db = -151 is not allowed: give a number in \[-150, 0\]"):
-        plot_coverage(coverage, threshold_db=-151)
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda data: plot_coverage(data.drop_vars("p_los")), "coverage lacks p_los"),
+        (lambda data: plot_comparison({"truth": data.drop_vars("wall_parts")}), "coverage lacks wall_parts"),
+        (lambda _: plot_comparison({}), r"coverages = \{\} is not allowed: give at least one coverage map"),
+        (
+            lambda data: plot_coverage(data, layers=("p_los", "gain")),
+            "layers = 'gain' is not allowed: choose one of link",
+        ),
+        (lambda data: plot_coverage(data, layers="p_los"), "layers = 'p_los' is not allowed: give some of link_state"),
+        (
+            lambda data: plot_coverage(data, threshold_db=-151),
+            r"threshold_db = -151 is not allowed: give a number in \[-",
+        ),
+    ],
+)
+def test_what_cannot_be_drawn_is_named(coverage, draw, message):
+    with pytest.raises(SettingsError, match=message):
+        draw(coverage)

@@ -29,7 +29,7 @@ def coverages():
 
 @pytest.mark.usefixtures("command_line")
 def test_the_demo_writes_every_file_and_prints_the_table_and_their_names(tmp_path, monkeypatch):
-    monkeypatch.setattr(demo, "predict_map", partial(predict_map, spacing_m=0.4))
+    monkeypatch.setattr(demo, "predict_map", partial(predict_map, spacing_m=0.8))
     out = tmp_path / "out"
     result = CliRunner().invoke(cli.app, ["demo", "--out", str(out)])
     assert result.exit_code == 0, result.output

@@ -12,7 +12,7 @@ from scipy import stats
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
-from sionna_partial.differentiable.scene import STEEPEST, LinkDistribution, SmoothLengths, moved_lengths_m, moved_paths
+from sionna_partial.differentiable import STEEPEST, LinkDistribution, SmoothLengths, moved_lengths_m, moved_paths
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.predictor import LinkPrediction

@@ -9,7 +9,7 @@ from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation.evaluate import (
+from sionna_partial.evaluation import (
     ALWAYS_OUTAGE,
     WITH_INDOOR,
     WITHOUT_INDOOR,

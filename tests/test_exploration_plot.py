@@ -2,6 +2,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
@@ -30,6 +31,20 @@ def exploration(home: PartialMap) -> Exploration:
     return explore_trajectory(home, range(0, 61, 10), 2)
 
 
+@pytest.fixture(scope="module")
+def last(exploration: Exploration) -> Axes:
+    """Panel of one drawing of the last step."""
+    return panels(plot_exploration(exploration.at((60,))))[0]
+
+
+@pytest.fixture(scope="module")
+def way(exploration: Exploration, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One animation."""
+    path = tmp_path_factory.mktemp("way") / "way.gif"
+    animate_exploration(exploration, path)
+    return path
+
+
 def panels(figure: Figure) -> list:
     return [axis for axis in figure.axes if axis.images]
 
@@ -52,17 +67,16 @@ class TestPlotExploration:
         assert len(np.unique(picture[hidden])) == len(np.unique(picture[unknown & ~hidden])) == 1
         assert 0 < picture[hidden][0, 0] < picture[unknown & ~hidden][0, 0] < 1
 
-    def test_the_way_ends_at_the_robot(self, exploration):
-        panel = panels(plot_exploration(exploration.at((60,))))[0]
-        way = next(line for line in panel.lines if len(line.get_xdata()) == 61)
+    def test_the_way_ends_at_the_robot(self, exploration, last):
+        way = next(line for line in last.lines if len(line.get_xdata()) == 61)
         assert np.array_equal(np.stack(way.get_data(), axis=1), exploration.poses[:, :2])
-        robot = panel.lines[-1]
+        robot = last.lines[-1]
         assert (robot.get_xdata()[0], robot.get_ydata()[0]) == tuple(exploration.poses[-1, :2])
         tip = robot.get_marker().vertices[0]
         assert np.degrees(np.arctan2(tip[1], tip[0])) % 360 == pytest.approx(exploration.poses[-1, 2])
 
-    def test_the_view_stays_in_the_room(self, home, exploration):
-        (view,) = panels(plot_exploration(exploration.at((60,))))[0].patches
+    def test_the_view_stays_in_the_room(self, home, exploration, last):
+        (view,) = last.patches
         corners = view.get_xy()
         assert tuple(corners[0]) == tuple(exploration.poses[-1, :2])
         assert (home.state_at(corners) != CellState.UNKNOWN).all()
@@ -93,9 +107,8 @@ class TestPlotExploration:
 
 
 class TestAnimateExploration:
-    def test_frames(self, exploration, tmp_path):
-        animate_exploration(exploration, tmp_path / "way.gif")
-        with Image.open(tmp_path / "way.gif") as animation:
+    def test_frames(self, exploration, way):
+        with Image.open(way) as animation:
             assert animation.n_frames == len(exploration.steps)
             assert animation.info["loop"] == 0
             fractions = []
@@ -105,11 +118,10 @@ class TestAnimateExploration:
                 fractions.append((pixels == 255).all(axis=2).mean())
             assert animation.info["duration"] > 1000
         assert fractions[0] < fractions[1] < fractions[-1]
-        assert (tmp_path / "way.gif").stat().st_size < 200_000
+        assert way.stat().st_size < 200_000
 
-    def test_its_colours_are_those_that_are_drawn(self, exploration, tmp_path):
-        animate_exploration(exploration, tmp_path / "way.gif")
-        with Image.open(tmp_path / "way.gif") as animation:
+    def test_its_colours_are_those_that_are_drawn(self, way):
+        with Image.open(way) as animation:
             animation.seek(animation.n_frames - 1)
             found = {colour for _, colour in animation.convert("RGB").getcolors(1 << 20)}
         assert {tuple(round(255 * value) for value in to_rgb(colour)) for colour in (BLUE, RED)} <= found

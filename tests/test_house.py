@@ -44,12 +44,12 @@ ROOMS = {
     "scene": ("outlines", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
-        *("plan.room", "plan.beams", "plan.reflections", "plan.edges"),
+        *("plan.room", "plan.clipping", "plan.beams", "plan.reflections", "plan.edges"),
         *("mesh.sequences", "mesh.reflections", "stock", "finder"),
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "features", "inputs"),
+        *("unobserved", "features"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
@@ -57,13 +57,13 @@ ROOMS = {
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
     "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),
-    "differentiable": ("scene",),
-    "calibration": ("measured_building", "material_fit", "calibration"),
+    "differentiable": ("differentiable",),
+    "calibration": ("material_fit", "calibration"),
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
     "live": ("coverage", "topics"),
     "datasets": ("shards", "home_links", "dataset"),
-    "evaluation": ("evaluate",),
+    "evaluation": ("evaluation",),
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
@@ -73,7 +73,7 @@ ROOMS = {
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "networks", "results", "command"}
+FILES = {"foundations", "coverage", "networks", "differentiable", "evaluation", "results", "command"}
 """Rooms whose modules are given by their full names."""
 
 MODULES = tuple(
@@ -92,7 +92,7 @@ HEAVY = IN_FUNCTIONS | {
 
 HOMES = {
     **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
-    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable.", "training.")),
+    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable", "training.")),
     "matplotlib": ("plots.",),
     "bokeh": ("plots.", "app."),
 }

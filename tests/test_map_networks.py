@@ -11,9 +11,9 @@ from predictor_links import FREQUENCY_HZ, NLOS, QUIET, features, make_seen_links
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M
-from sionna_partial.prediction.inputs import LINK_INPUTS, free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     CONTEXT_SHAPES,
+    LINK_INPUTS,
     LINK_NETWORK,
     LINK_OUTPUTS,
     MAP_FEATURES,
@@ -26,7 +26,7 @@ from sionna_partial.prediction.map_networks import (
     read_maps,
     scaled_inputs,
 )
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras
 from sionna_partial.prediction.unobserved import CELLS_M, WINDOW_CELLS, WINDOWS
 
 pytestmark = QUIET

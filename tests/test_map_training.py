@@ -16,13 +16,13 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkFeatures
-from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     evaluate_context_networks,
     fit_context_networks,
     receiver_offsets_m,
     scaled_inputs,
 )
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.unobserved import WINDOW_CELLS
 from sionna_partial.settings import PredictorSettings
 

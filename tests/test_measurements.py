@@ -162,41 +162,46 @@ class TestWhatIsMissing:
         with pytest.raises(MeasurementError, match=r"tx_x, tx_y and tx_z have shapes \(3,\), \(2,\), \(3,\): give one"):
             measurements_of({**FLAT, "tx_y": TX[:2, 1]})
 
-    def test_file(self, tmp_path: Path) -> None:
-        with pytest.raises(MeasurementError, match=r"gone\.csv' cannot be read \(No such file.*\): check the path"):
-            measurements_of(tmp_path / "gone.csv")
 
-    @pytest.mark.parametrize("text", ["", "tx_x,tx_y\n1,2\n"])
-    def test_columns_of_a_file(self, tmp_path: Path, text: str) -> None:
-        with pytest.raises(MeasurementError, match=r"is missing .*with the columns tx_x, tx_y, tx_z, rx_x"):
-            measurements_of(csv_file(tmp_path, text))
+DOTS = "is not a number: write decimal points."
+OWN = {"rx_x": "east", "rx_y": "north", "gain_db": "level"}
+REFUSED_CSV = [
+    (None, None, "measured.csv' cannot be read (No such file or directory): check the path"),
+    (b"PK\x03\x04\xff\xfe", None, "measured.csv' cannot be read ("),
+    *((text, None, "with the columns tx_x, tx_y, tx_z, rx_x") for text in ("", "tx_x,tx_y\n1,2\n")),
+    (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", None, "' has 2 columns of gain_db (gain_db, gain_db): keep one"),
+    (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", None, "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be cut"),
+    (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", None, ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
+    ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", None, "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
+    (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', None, f"line 2: tx_x = '1,5' {DOTS}"),
+    (f"{HEADER}\n{'1' * 200_000},2\n", None, ", line 2 cannot be read (field larger than field limit"),
+    *(
+        (
+            f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n{row}\n",
+            None,
+            f"line 4: gain_db = {cell} is not a number: correct the line",
+        )
+        for row, cell in (("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''"))
+    ),
+    ("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n", None, "2 columns of rx_x (rx_x, x): keep one"),
+    ("x,y,rssi\n1,2,-52\n", ["rssi"], "columns = ['rssi'] is no mapping: name the headers of a file, as columns"),
+    ("x,y,rssi\n", None, "has a header and no rows"),
+    ("x,y,rssi,gain_db\n1,2,-52,-60\n", None, "has 2 columns of gain_db (a gain and a power)"),
+    ("east,north,level\n1,2,-52\n", None, "(its other headers are east, north, level): name the headers"),
+    ("x,y,level\n1,2,-52\n", None, "as columns={'gain_db': 'HEADER'} of load_measurements or --column gain_db=H"),
+    ("east,north,level\n3.0,2.0,-52\n", OWN | {"rx_z": "up"}, "has no column 'up'"),
+    ("east,north,level\n3.0,2.0,-52\n", {"rssi": "level"}, "give a header for some of tx_x"),
+]
+"""Content of a file, names of its columns, and words of the message."""
 
-    @pytest.mark.parametrize(
-        ("text", "message"),
-        [
-            (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", "' has 2 columns of gain_db (gain_db, gain_db): keep"),
-            (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be"),
-            (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
-            ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
-            (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', "line 2: tx_x = '1,5' is not a number: write decimal points."),
-            (f"{HEADER}\n{'1' * 200_000},2\n", ", line 2 cannot be read (field larger than field limit"),
-        ],
-    )
-    def test_csv_that_would_be_misread(self, tmp_path: Path, text: str, message: str) -> None:
-        with pytest.raises(MeasurementError, match=re.escape(message)):
-            measurements_of(csv_file(tmp_path, text))
 
-    @pytest.mark.parametrize(("line", "shown"), [("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''")])
-    def test_cell_that_is_no_number(self, tmp_path: Path, line: str, shown: str) -> None:
-        path = csv_file(tmp_path, f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n{line}\n")
-        message = re.escape(f"'{path}', line 4: gain_db = {shown} is not a number: correct the line, or leave it out.")
-        with pytest.raises(MeasurementError, match=message):
-            measurements_of(path)
-
-    def test_binary_file(self, tmp_path: Path) -> None:
-        (tmp_path / "map.npz").write_bytes(b"PK\x03\x04\xff\xfe")
-        with pytest.raises(MeasurementError, match=r"map\.npz' cannot be read"):
-            measurements_of(tmp_path / "map.npz")
+@pytest.mark.parametrize(("content", "columns", "message"), REFUSED_CSV, ids=lambda value: repr(value)[:40])
+def test_csv_that_would_be_misread(tmp_path: Path, content: str | bytes | None, columns: Any, message: str) -> None:
+    path = tmp_path / "measured.csv"
+    if content is not None:
+        path.write_bytes(content if isinstance(content, bytes) else content.encode())
+    with pytest.raises(MeasurementError, match=re.escape(message)):
+        sp.load_measurements(path, columns=columns)
 
 
 @pytest.mark.parametrize(
@@ -227,17 +232,7 @@ class TestSurveys:
     def test_columns_of_ones_own(self, tmp_path: Path) -> None:
         path = tmp_path / "survey.csv"
         path.write_text("east,north,level,x\n3.0,2.0,-52,0\n")
-        own = {"rx_x": "east", "rx_y": "north", "gain_db": "level"}
-        assert sp.load_measurements(path, columns=own).rx.tolist() == [[3.0, 2.0, 1.5]]
-        with pytest.raises(MeasurementError, match="has no column 'up'"):
-            sp.load_measurements(path, columns=own | {"rx_z": "up"})
-        with pytest.raises(MeasurementError, match="give a header for some of tx_x"):
-            sp.load_measurements(path, columns={"rssi": "level"})
-
-    def test_two_columns_of_one_name(self, tmp_path: Path) -> None:
-        (tmp_path / "survey.csv").write_text("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n")
-        with pytest.raises(MeasurementError, match=r"2 columns of rx_x \(rx_x, x\): keep one"):
-            sp.load_measurements(tmp_path / "survey.csv")
+        assert sp.load_measurements(path, columns=OWN).rx.tolist() == [[3.0, 2.0, 1.5]]
 
     @pytest.mark.parametrize(
         ("header", "columns", "gain_db"),
@@ -255,28 +250,6 @@ class TestSurveys:
         measured = sp.load_measurements(path, columns=columns, tx_power_dbm=20.0)
         assert measured.gain_db.tolist() == [gain_db]
         assert ("tx_power_dbm = 20 is not subtracted" in caplog.text) == (gain_db == -52.0)
-
-    @pytest.mark.parametrize(
-        ("text", "columns", "message"),
-        [
-            (
-                "x,y,rssi\n1,2,-52\n",
-                ["rssi"],
-                "columns = ['rssi'] is no mapping: name the headers of a file, as columns",
-            ),
-            ("x,y,rssi\n", None, "has a header and no rows"),
-            ("x,y,rssi,gain_db\n1,2,-52,-60\n", None, "has 2 columns of gain_db (a gain and a power)"),
-            ("east,north,level\n1,2,-52\n", None, "(its other headers are east, north, level): name the headers"),
-            (
-                "x,y,level\n1,2,-52\n",
-                None,
-                "as columns={'gain_db': 'HEADER'} of load_measurements or --column gain_db=H",
-            ),
-        ],
-    )
-    def test_files_that_cannot_be_used(self, tmp_path, text, columns, message):
-        with pytest.raises(MeasurementError, match=re.escape(message)):
-            sp.load_measurements(csv_file(tmp_path, text), columns=columns)
 
     def test_unused_columns_and_positions_are_named(self, tmp_path, caplog):
         path = csv_file(tmp_path, "tx_x,tx_y,rx_x,rx_y,gain_db,ssid\n1,2,3,2,-52,1\n")

@@ -6,7 +6,7 @@ import pytest
 from predictor_links import LOS, NLOS, OUTAGE, make_links, p_kept, true_gain
 
 from sionna_partial.constants import LinkState
-from sionna_partial.evaluation.evaluate import (
+from sionna_partial.evaluation import (
     CONFIDENCE_BINS,
     DEFINITIONS,
     PIT_BINS,

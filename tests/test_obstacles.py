@@ -53,7 +53,7 @@ class TestMap:
                 {"obstacle_heights_m": (0.75,)},
                 "obstacle has values 0 to 2, and obstacle_heights_m has 1 entries",
             ),
-            ({"obstacle_heights_m": tuple(0.1 + 0.001 * k for k in range(300))}, "has 300 heights: give at most 255"),
+            ({"obstacle_heights_m": tuple(0.1 + 0.001 * k for k in range(300))}, "has 300 entries: give at most 255"),
         ],
     )
     def test_what_is_refused(self, changes: dict[str, object], message: str) -> None:

@@ -23,8 +23,8 @@ from predictor_links import (
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.paper_networks import (
+    GAIN_INPUTS,
     GAIN_NETWORKS,
     OUTPUT_WIDTHS,
     assemble,

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 import typer
 from rosbag_files import write_drive
-from vacuum_files import valetudo_map, write_json, write_recording
 
 from sionna_partial.cli.app import app
 from sionna_partial.resources import scenes_folder
@@ -42,7 +41,7 @@ def anchors(page: Path) -> set[str]:
 
 
 def write_scans(folder: Path) -> None:
-    """Write the rosbag, the point cloud, the drawing and the files of a vacuum robot that the blocks read."""
+    """Write the rosbag, the point cloud and the drawings that the blocks read."""
     write_drive(folder / "drive.bag")
     rng = np.random.default_rng(0)
     cloud = rng.uniform((0, 0, 0), (5, 3, 2.5), (60_000, 3))
@@ -57,8 +56,6 @@ def write_scans(folder: Path) -> None:
     corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
     plan.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL-FULL"})
     plan.saveas(folder / "plan.dxf")
-    write_json(folder / "home.json", valetudo_map())
-    write_recording(folder / "home.vwm")
     from ifc_building import Building  # needs an extra
 
     building = Building(0.0, 3.0)

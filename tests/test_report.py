@@ -7,7 +7,7 @@ from link_tables import fitted_baselines, make_table
 from predictor_links import QUIET, quick_predictor
 
 from sionna_partial.errors import OutputError
-from sionna_partial.evaluation.evaluate import DEFINITIONS, WITH_INDOOR, evaluate
+from sionna_partial.evaluation import DEFINITIONS, WITH_INDOOR, evaluate
 from sionna_partial.reports import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
 
 pytestmark = QUIET

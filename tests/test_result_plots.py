@@ -5,13 +5,14 @@ import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_table
 from matplotlib.collections import PatchCollection
+from matplotlib.figure import Figure
 from placement_cases import placed
 from predictor_links import QUIET, quick_predictor
 
 import sionna_partial as sp
 from sionna_partial.calibration.material_fit import Posterior
 from sionna_partial.errors import SettingsError
-from sionna_partial.evaluation.evaluate import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
+from sionna_partial.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.plots.result_plots import (
     ANGLES_DEG,
@@ -23,33 +24,38 @@ from sionna_partial.plots.result_plots import (
 from sionna_partial.plots.style import RED, figure_png
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def placement() -> TransmitterPlacement:
     return placed()
 
 
+@pytest.fixture(scope="module")
+def figure(placement: TransmitterPlacement) -> Figure:
+    """One drawing of the placement."""
+    return plot_placement(placement)
+
+
 class TestPlotPlacement:
-    def test_shows_the_refinement_and_the_best(self, placement: TransmitterPlacement) -> None:
-        lines = plot_placement(placement).axes[0].lines
+    def test_shows_the_refinement_and_the_best(self, placement: TransmitterPlacement, figure: Figure) -> None:
+        lines = figure.axes[0].lines
         (red,) = (np.column_stack(line.get_data()) for line in lines if line.get_color() == RED)
         np.testing.assert_array_equal(red, placement.trajectory_m[:, :2])
         star = next(line for line in lines if line.get_marker() == "*")
         np.testing.assert_array_equal(np.ravel(star.get_data()), placement.position_m[:2])
 
-    def test_shows_the_starts(self, placement: TransmitterPlacement) -> None:
-        points = [np.asarray(each.get_offsets()) for each in plot_placement(placement).axes[0].collections]
+    def test_shows_the_starts(self, placement: TransmitterPlacement, figure: Figure) -> None:
+        points = [np.asarray(each.get_offsets()) for each in figure.axes[0].collections]
         assert any(
             len(each) == len(placement.starts_m) and (each == placement.starts_m[:, :2]).all() for each in points
         )
 
-    def test_shows_what_is_covered(self, placement: TransmitterPlacement) -> None:
-        axis = plot_placement(placement).axes[0]
+    def test_shows_what_is_covered(self, placement: TransmitterPlacement, figure: Figure) -> None:
+        axis = figure.axes[0]
         (squares,) = (each for each in axis.collections if isinstance(each, PatchCollection))
         np.testing.assert_array_equal(squares.get_array(), placement.values)
         assert len(np.unique(squares.get_alpha())) == len(np.unique(placement.weight))
 
-    def test_says_where_and_how_good(self, placement: TransmitterPlacement) -> None:
-        figure = plot_placement(placement)
+    def test_says_where_and_how_good(self, placement: TransmitterPlacement, figure: Figure) -> None:
         x, y, z = placement.position_m
         title = f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, predicted coverage {placement.score:.1%}"
         assert figure.axes[0].get_title() == title
@@ -60,15 +66,15 @@ class TestPlotPlacement:
         assert "worst tenth at" in figure.axes[0].get_title()
         assert figure.axes[1].get_ylabel() == "mean path gain [dB]"
 
-    def test_all_of_it_is_in_the_picture(self, placement: TransmitterPlacement) -> None:
-        axis = plot_placement(placement).axes[0]
+    def test_all_of_it_is_in_the_picture(self, placement: TransmitterPlacement, figure: Figure) -> None:
+        axis = figure.axes[0]
         (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
         for x, y, _ in (*placement.starts_m, *placement.trajectory_m):
             assert x0 < x < x1
             assert y0 < y < y1
 
-    def test_equal_placements_are_equal_pictures(self, placement: TransmitterPlacement) -> None:
-        assert figure_png(plot_placement(placement)) == figure_png(plot_placement(placement))
+    def test_equal_placements_are_equal_pictures(self, placement: TransmitterPlacement, figure: Figure) -> None:
+        assert figure_png(figure) == figure_png(plot_placement(placement))
 
     def test_something_else(self) -> None:
         message = "placement = 'dict' is not allowed: give what place_transmitter returned"
@@ -151,9 +157,15 @@ def evaluation():
     return evaluate(predictor, make_table(homes=3, stages=(0, 50, 100)), baselines=fitted_baselines())
 
 
+@pytest.fixture(scope="module")
+def stages(evaluation):
+    """One drawing of the evaluation."""
+    return plot_stages(evaluation)
+
+
 class TestPlotStages:
-    def test_lines_show_the_figures_of_test_homes(self, evaluation):
-        axes = plot_stages(evaluation).axes
+    def test_lines_show_the_figures_of_test_homes(self, evaluation, stages):
+        axes = stages.axes
         for axis, name in zip(axes, ("accuracy", "rmse_db", "rmse_linked_db"), strict=True):
             lines = {line.get_label(): line for line in axis.get_lines()}
             for answer in ("predictor", "distance only", "partial trace", "TR 38.901 open office"):
@@ -161,13 +173,13 @@ class TestPlotStages:
                 expected = [[row.stage, getattr(row.metrics, name)] for row in rows]
                 np.testing.assert_array_equal(lines[answer].get_xydata(), expected)
 
-    def test_of_training_homes_only_the_predictor(self, evaluation):
-        labels = [line.get_label() for line in plot_stages(evaluation).axes[0].get_lines()]
+    def test_of_training_homes_only_the_predictor(self, evaluation, stages):
+        labels = [line.get_label() for line in stages.axes[0].get_lines()]
         assert [label for label in labels if "training" in label] == ["predictor, training homes"]
         assert len(labels) == len({row.model for row in evaluation.select(receivers="indoor")}) + 1
 
-    def test_every_line_has_a_colour_of_its_own(self, evaluation):
-        lines = plot_stages(evaluation).axes[0].get_lines()
+    def test_every_line_has_a_colour_of_its_own(self, stages):
+        lines = stages.axes[0].get_lines()
         assert len({line.get_color() for line in lines if "training" not in line.get_label()}) == len(lines) - 1
 
     def test_nothing_to_draw(self, evaluation):

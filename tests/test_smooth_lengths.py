@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.interpolate import RegularGridInterpolator
 
 from sionna_partial.constants import CellState
-from sionna_partial.differentiable.scene import SmoothLengths
+from sionna_partial.differentiable import SmoothLengths
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 

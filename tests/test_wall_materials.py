@@ -1,4 +1,6 @@
-"""Walls of an unknown material: candidates on one trace, their prior, and what measured powers say of them."""
+"""Walls of an unknown material: candidates on one trace, their prior, and their posterior given powers."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -97,10 +99,29 @@ class TestPrediction:
         joined = LinkPrediction.concatenate([some, some])
         assert joined.by_material[0][1].gain_mean_db.shape == (8,)
 
-    def test_a_named_material_is_certain(self):
+    def test_a_named_material_has_the_residuals_of_traces(self):
         found = model_of("brick").predict(TX, RX)
-        assert np.all(found.gain_std_db == 0.0)
-        assert len(found.by_material[0]) == 1
+        assert np.allclose(found.gain_std_db, RESIDUAL_DB)
+        (part,), _ = found.by_material
+        assert np.all(part.gain_std_db == 0.0)
+        assert np.all(model_of("brick", replace(WIFI, refraction=False)).predict(TX, RX).gain_std_db == 0.0)
+
+    def test_known_walls_keep_their_material(self):
+        """The wall at x = 2.5 m is of concrete, and all others unknown: only they lose more under a candidate."""
+        near = RX[RX[:, 0] < 4.7]
+        concrete = [(2.3, -1.0), (2.7, -1.0), (2.7, 9.0), (2.3, 9.0)]
+        settings = replace(EVERY_PATH, max_depth=0)
+        model = model_of(None, settings, FLAT.with_wall_material("concrete", concrete))
+        parts, _ = model.predict(TX, near).by_material
+        named = model_of("concrete", settings).predict(TX, near)
+        assert len(parts) == 16
+        assert all(np.allclose(part.gain_mean_db, named.gain_mean_db) for part in parts)
+        far = RX[RX[:, 0] > 5.2]
+        traced_db = model.features(TX, far).gain_db
+        lost_db = traced_db - np.array([part.gain_mean_db for part in model.predict(TX, far).by_material[0]])
+        walls = (far[:, 0] > 5.0).astype(int) + (far[:, 0] > 7.4)
+        expected_db = model.wall_materials.crossing_db[:, None] * walls
+        assert np.allclose(lost_db[:, traced_db > -120.0], expected_db[:, traced_db > -120.0], atol=0.5)
 
     @pytest.mark.parametrize(
         ("partial", "settings"),
@@ -113,6 +134,20 @@ class TestPrediction:
     )
     def test_known_materials(self, partial, settings):
         assert not sp.Simulation(partial, settings).material_unknown
+
+    @pytest.mark.parametrize("material", [None, "brick"])
+    def test_differentiable_links_have_the_same_distribution(self, material):
+        import tensorflow as tf
+
+        model = model_of(material, EVERY_PATH)
+        links = sp.DifferentiableScene(model).links(TX, RX[:20])
+        tx_m, expected = tf.Variable(links.base.tx_m), model.predict(TX, RX[:20])
+        with tf.GradientTape() as tape:
+            found = links(tx_m=tx_m)
+            mean_db = tf.reduce_mean(found.gain_mean_db)
+        np.testing.assert_allclose(found.gain_mean_db, expected.gain_mean_db, atol=0.05)
+        np.testing.assert_allclose(found.gain_std_db, expected.gain_std_db, atol=0.05)
+        assert np.isfinite(tape.gradient(mean_db, tx_m)).all()
 
     def test_28_ghz_through_walls(self):
         simulation = sp.Simulation(FLAT, sp.TraceSettings(28e9, refraction=True))

@@ -1,7 +1,8 @@
 """The newest answer of a window: coverage of its transmitters, their network, and what the page shows of them."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from datetime import date
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ class Answer:
     is_final: bool
     network: xr.Dataset | None = None
     truth: xr.Dataset | None = None
+    made: date = field(default_factory=date.today)
 
     def layers_of(self, name: str, threshold_dbm: float, *, truth: bool = False) -> xr.Dataset:
         """Return the variables (y, x) of `predict_map` and `radio` of a transmitter, or of the strongest for "".

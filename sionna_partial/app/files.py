@@ -105,11 +105,19 @@ def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
 
 
 def coverage_file(
-    kind: str, coverage: xr.Dataset, network: xr.Dataset | None, eirp_dbm: Floats, threshold_dbm: float
+    kind: str,
+    coverage: xr.Dataset,
+    network: xr.Dataset | None,
+    eirp_dbm: Floats,
+    threshold_dbm: float,
+    heading: Sequence[str] = (),
 ) -> bytes:
-    """Return a file of one of `FILES` of a coverage; a ROS map is a zip, of several transmitters of their network."""
+    """Return a file of one of `FILES` of a coverage; a ROS map is a zip, of several transmitters of their network.
+
+    `heading` is for the report.
+    """
     if kind == "pdf":
-        return report_pdf(coverage, eirp_dbm, threshold_dbm)
+        return report_pdf(coverage, eirp_dbm, threshold_dbm, heading)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         path = Path(folder) / f"coverage.{kind}"
         if kind == "yaml" and network is not None:

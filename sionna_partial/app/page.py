@@ -13,13 +13,14 @@ import numpy as np
 from sionna_partial.app.answer import Answer
 from sionna_partial.app.drawing import LENGTH, STROKES
 from sionna_partial.app.files import FILES
-from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour, material_name
+from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
 from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
+from sionna_partial.settings import material_name
 
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
 _AIM = 0.06
@@ -126,7 +127,6 @@ class Page:
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
             lambda value: self.session.measure(self._line_m, float(value)),
-            "value_throttled",
         )
         self.dark = self._on(
             Slider(title="Walls up to shade", name="dark", start=0, end=254, step=1, value=127),
@@ -385,7 +385,7 @@ class Page:
         partial, session = self.session.partial, self.session
         self.picture.show_map(partial, session.plan)
         self._line_m = []
-        self.length.update(value=None, value_throttled=None)
+        self.length.value = None
         self.stroke.value = "" if self.stroke.value == LENGTH else self.stroke.value
         self.more.visible = self.truth.visible = session.home is not None
         self.example.value = session.title if session.home is not None else ""
@@ -529,8 +529,8 @@ def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
 
 def _legend(partial: PartialMap) -> str:
     """Return the colours of walls whose material is known."""
-    used = [] if partial.wall_material is None else np.unique(partial.wall_material[partial.wall_material > 0])
-    materials = [partial.wall_materials[number - 1] for number in used]
+    used = np.unique(0 if partial.wall_material is None else partial.wall_material)
+    materials = [partial.wall_materials[number - 1] for number in used if number]
     return "".join(
         f'<br><span style="color:{material_colour(each)}">\u25a0</span> {html.escape(material_name(each))}'
         for each in materials
@@ -539,10 +539,15 @@ def _legend(partial: PartialMap) -> str:
 
 def _summary(answer: Answer, threshold_dbm: float) -> str:
     """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
-    area = answer.coverage.radio.area(threshold_dbm, probability=LIKELY, eirp_dbm=answer.eirp_dbm)["fraction"]
+    given: dict[str, Any] = {"probability": LIKELY, "eirp_dbm": answer.eirp_dbm}
+    area = answer.coverage.radio.area(threshold_dbm, **given)["fraction"]
+    rows = [*zip(answer.coverage["tx"].to_numpy(), *area.to_numpy()[:2], strict=True)]
+    if len(rows) > 1:
+        together = answer.coverage.radio.area(threshold_dbm, any_transmitter=True, **given)["fraction"]
+        rows.insert(0, ("any transmitter", *together.to_numpy()[:2]))
     fractions = (
         f"<b>{html.escape(str(name))}</b> {float(seen):.0%} of the observed floor, {float(every):.0%} of all"
-        for name, seen, every in zip(answer.coverage["tx"].to_numpy(), *area.to_numpy(), strict=True)
+        for name, seen, every in rows
     )
     text = f"Above {threshold_dbm:g} dBm with probability {LIKELY:g}: {'; '.join(fractions)}."
     found = answer.agreement()

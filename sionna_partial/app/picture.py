@@ -16,7 +16,7 @@ from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import extent_m, outside
 from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes, radio_layers, server_codes
-from sionna_partial.settings import WALL_MATERIALS, Material
+from sionna_partial.settings import WALL_MATERIALS, Material, material_name
 
 LIKELY = 0.9
 """Probability with which an area counts as covered."""
@@ -80,7 +80,8 @@ class Picture:
         from bokeh.plotting import figure
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
-        self.values = ColumnDataSource({name: [] for name in ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)})
+        of_values = ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)
+        self.values = ColumnDataSource({name: [] for name in of_values}, name="values")
         self.shades = ColumnDataSource({name: [] for name in ("cells", "x", "y", "dw", "dh")})
         self.outline = ColumnDataSource({"xs": [], "ys": []})
         self.stroke, self._live = (
@@ -213,7 +214,7 @@ class Picture:
         lines: list[Any] = []
         if outline:
             height = {"power_mean_dbm": threshold_dbm, "p_above": LIKELY}[outline]
-            field = contour_generator(one["x"], one["y"], np.ma.masked_invalid(columns[outline][0]))
+            field: Any = contour_generator(one["x"], one["y"], np.ma.masked_invalid(columns[outline][0]))
             lines = field.lines(height)
         self.outline.data = {"xs": [line[:, 0] for line in lines], "ys": [line[:, 1] for line in lines]}
         self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
@@ -264,12 +265,6 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
     row, column = np.indices(cells.shape)
     stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
     return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
-
-
-def material_name(material: Material) -> str:
-    """Return the name of a material of walls."""
-    known = {each: name for name, each in WALL_MATERIALS.items()}
-    return known.get(material) or material.itu or "another material"
 
 
 def material_colour(material: Material) -> str:

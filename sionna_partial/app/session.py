@@ -191,7 +191,7 @@ class Session:
             elif partial is not None:
                 yield functools.partial(self.open_map, partial, title, warnings)
             elif project is not None:
-                placed = {name: _placed(partial, each) for name, each in project.transmitters.items()}
+                placed = {name: _placed(project.partial, each) for name, each in project.transmitters.items()}
                 yield functools.partial(self._open_project, replace(project, transmitters=placed), warnings)
 
         self.begin(work)
@@ -493,8 +493,8 @@ class Session:
                 self.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
-            report(0.2, "comparing poses")
-            views = next_views(self._model("map", partial, settings), tx_m, threshold_db=threshold_db)
+            model = self._model("map", partial, settings)
+            views = next_views(model, tx_m, threshold_db=threshold_db, progress=report)
             yield functools.partial(take, views)
 
         self.begin(work)
@@ -608,7 +608,8 @@ class Session:
                 "there is no coverage yet: put a transmitter on the map, and wait for the fine picture."
             )
         threshold_dbm = answer.settings.threshold_dbm
-        return coverage_file(kind, answer.coverage, answer.network, answer.eirp_dbm, threshold_dbm)
+        heading = self.title, f"{answer.made:%Y-%m-%d}"
+        return coverage_file(kind, answer.coverage, answer.network, answer.eirp_dbm, threshold_dbm, heading)
 
     def python(self) -> str:
         """Return the lines that compute the same coverage."""

@@ -472,6 +472,7 @@ class CoverageAccessor:
         probability: float = 0.9,
         eirp_dbm: ArrayLike = 20.0,
         rx_gain_db: float = 0.0,
+        any_transmitter: bool = False,
     ) -> xr.Dataset:
         """Return how much of the floor receives more than a power: "95 % of it above -67 dBm with probability 0.9".
 
@@ -481,6 +482,8 @@ class CoverageAccessor:
             Received power, as `power` computes it [dBm].
         probability : float
             Required of each receiver, in [0, 1].
+        any_transmitter : bool
+            Count receivers of several transmitters once, by the largest probability.
 
         Returns
         -------
@@ -502,12 +505,14 @@ class CoverageAccessor:
         require_number("probability", probability, 0.0, 1.0)
         above = self._probability_of(threshold_dbm - self._offset_db(eirp_dbm, rx_gain_db))
         valid, indoor = self._coverage["valid"].to_numpy() == 1, self._coverage["p_indoor"].to_numpy()
+        dims = ("floor", *self._coverage["p_los"].dims[:-2])
+        if any_transmitter and len(dims) > 1:
+            above, valid, indoor, dims = above.max(axis=0), valid.any(axis=0), indoor.max(axis=0), dims[:1]
         free = np.broadcast_to(self._coverage["cell_state"].to_numpy() == CellState.FREE, above.shape)
         rooms = self._rooms()
         of_rooms = [valid & free & room for room in rooms.values()]
         weights = np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0), *of_rooms])
         total = weights.sum(axis=(-2, -1))
-        dims = ("floor", *self._coverage["p_los"].dims[:-2])
         with np.errstate(invalid="ignore"):
             shares = [
                 (weights * np.nan_to_num(each)).sum(axis=(-2, -1)) / total for each in (above >= probability, above)

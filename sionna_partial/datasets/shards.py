@@ -25,10 +25,9 @@ from sionna_partial.checks import shown
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
-from sionna_partial.maps.environment import material_records
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, layers_of
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, link_numbers, link_states
-from sionna_partial.prediction.inputs import FEATURES, columns_of, features_of_columns
+from sionna_partial.prediction.map_networks import FEATURES, columns_of, features_of_columns
 from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
@@ -59,7 +58,7 @@ COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "obse
 _NAMES = (
     *COLUMNS[:2],
     *(f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"),
-    *(name for feature in FEATURES for name in feature.columns),
+    *(name for columns in FEATURES.values() for name in columns),
     "map_index",
     *COLUMNS[2:],
 )
@@ -321,11 +320,8 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
 def _packed(partial: PartialMap) -> dict[str, object]:
     """Return a floor plan as JSON has it, its cells deflated."""
     material: dict[str, object] = {} if partial.material is None else {"material": asdict(partial.material)}
-    if partial.wall_material is not None:
-        material["wall_material"] = _deflated(partial.wall_material)
-        material["wall_materials"] = material_records(partial.wall_materials)
-    if partial.obstacle is not None:
-        material |= {"obstacle": _deflated(partial.obstacle), "obstacle_heights_m": [*partial.obstacle_heights_m]}
+    for name, (cells, counted, values) in partial.layers().items():
+        material |= {name: _deflated(cells), counted: values}
     return {
         "shape": list(partial.shape),
         "cells": _deflated(partial.state),
@@ -353,12 +349,8 @@ def _unpacked(entry: Any) -> PartialMap:
     rest = {name: entry[name] for name in ("resolution_m", "wall_height_m", "interior_cells")}
     if "material" in entry:
         rest["material"] = Material(**entry["material"])
-    if "wall_material" in entry:
-        rest["wall_material"] = inflated(entry["wall_material"])
-        rest["wall_materials"] = tuple(Material(**record) for record in entry["wall_materials"])
-    if "obstacle" in entry:
-        rest |= {"obstacle": inflated(entry["obstacle"]), "obstacle_heights_m": tuple(entry["obstacle_heights_m"])}
-    return PartialMap(inflated(entry["cells"]), origin_m=tuple(entry["origin_m"]), **rest)
+    layers = layers_of(entry, inflated, list)
+    return PartialMap(inflated(entry["cells"]), origin_m=tuple(entry["origin_m"]), **rest, **layers)
 
 
 def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:

@@ -19,7 +19,9 @@ from scipy.special import entr
 
 from sionna_partial.arrays import Floats, largest_part, read_only
 from sionna_partial.checks import (
+    Progress,
     float_array,
+    no_progress,
     require_choice,
     require_number,
     require_whole,
@@ -29,7 +31,7 @@ from sionna_partial.checks import (
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
 from sionna_partial.coverage.job import POSITIONS, transmitter_positions
-from sionna_partial.display import Pictured, Shown
+from sionna_partial.display import Pictured, Shown, part_of, reporting
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
@@ -211,6 +213,7 @@ def next_views(
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
+    progress: Progress | bool | None = None,
 ) -> NextViews:
     """Rank poses from which a robot would lower the uncertainty of a coverage map most per metre driven.
 
@@ -239,7 +242,7 @@ def next_views(
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional
         Sensor of the robot.
-    predictor, scene_settings, trace_settings
+    predictor, scene_settings, trace_settings, progress
         As for `predict_map`.
 
     Returns
@@ -275,21 +278,29 @@ def next_views(
     cell = _start_cell(partial, start)
     measured = None if measurements is None else measurements_of(measurements)
     of = None if goal == "state" else threshold_db
-    if goal != "area" and tx is None and measured is not None and not measured.tx_known.any():
-        tx_m, uncertainty = _located(model, measured, of)
-    else:
-        tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measured)
-        uncertainty = _uncertainty(model, tx_m, measured, of)
-    none = np.zeros(partial.shape, dtype=bool)
-    radius, pockets = ROBOT_RADII_M[0] / partial.resolution_m, unknown_pockets(partial.state, partial.resolution_m)
-    state = np.where(pockets, CellState.WALL, partial.state).astype(np.uint8)
-    frontiers = find_frontiers(state, cell, partial.resolution_m, radius, none, none)
-    frontiers = wide_frontiers(frontiers, partial.resolution_m)
-    gains = _gains(partial, frontiers, tx_m, uncertainty, sensor)
+    with reporting(progress) as report:
+        predicting = part_of(report, 0.0, 0.7)
+        if goal != "area" and tx is None and measured is not None and not measured.tx_known.any():
+            tx_m, uncertainty = _located(model, measured, of, predicting)
+        else:
+            tx_m = np.zeros((0, 3)) if goal == "area" else _transmitters(partial, tx, measured)
+            uncertainty = _uncertainty(model, tx_m, measured, of, predicting)
+        frontiers = _frontiers(partial, cell)
+        gains = _gains(partial, frontiers, tx_m, uncertainty, sensor, part_of(report, 0.7, 1.0))
+        report(1.0, "done")
     views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
     views.sort(key=lambda view: -view.gain_per_m)
     start_m = cell_centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal, sensor)
+
+
+def _frontiers(partial: PartialMap, cell: tuple[int, int]) -> list[Frontier]:
+    """Return wide frontiers that a robot at a cell reaches; pockets are no goal."""
+    none = np.zeros(partial.shape, dtype=bool)
+    radius, pockets = ROBOT_RADII_M[0] / partial.resolution_m, unknown_pockets(partial.state, partial.resolution_m)
+    state = np.where(pockets, CellState.WALL, partial.state).astype(np.uint8)
+    frontiers = find_frontiers(state, cell, partial.resolution_m, radius, none, none)
+    return wide_frontiers(frontiers, partial.resolution_m)
 
 
 def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:
@@ -310,7 +321,12 @@ def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | N
 
 
 def _gains(
-    partial: PartialMap, frontiers: list[Frontier], tx_m: Floats, uncertainty: xr.DataArray, sensor: SensorSettings
+    partial: PartialMap,
+    frontiers: list[Frontier],
+    tx_m: Floats,
+    uncertainty: xr.DataArray,
+    sensor: SensorSettings,
+    report: Progress = no_progress,
 ) -> tuple[list[float], list[float]]:
     """Return the gain at each frontier, and the heading with the largest unknown area in view [degree].
 
@@ -327,7 +343,8 @@ def _gains(
         counts = (unobserved > GRAZE) & (bits.ravel() > 0.0)
         links.append((starts[counts], rx[counts], bits.ravel()[counts] / unobserved[counts] * each_m2))
     gains, headings_deg = [], []
-    for frontier in frontiers:
+    for number, frontier in enumerate(frontiers):
+        report(number / len(frontiers), f"comparing poses, {number + 1} of {len(frontiers)}")
         in_view = unknown_in_view(partial.state, frontier.route[-1], _HEADINGS_DEG, partial.resolution_m, sensor)
         best = int(np.argmax([len(cells) for cells in in_view]))
         headings_deg.append(float(_HEADINGS_DEG[best]))
@@ -390,7 +407,11 @@ def _possible_m(partial: PartialMap) -> Floats:
 
 
 def _uncertainty(
-    model: LinkModel, tx_m: Floats, measured: Measurements | None, threshold_db: float | None
+    model: LinkModel,
+    tx_m: Floats,
+    measured: Measurements | None,
+    threshold_db: float | None,
+    report: Progress = no_progress,
 ) -> xr.DataArray:
     """Predict the uncertainty of links of given transmitters on (tx, y, x) [bit]."""
     spacing_m = _spacing_m(model.partial)
@@ -399,17 +420,19 @@ def _uncertainty(
         return _described(none, spacing_m)
     near = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
     used = measured if near or len(tx_m) == 1 else None
-    coverage = model.coverage(tx_m, spacing_m=spacing_m, measurements=used, progress=False)
+    coverage = model.coverage(tx_m, spacing_m=spacing_m, measurements=used, progress=report)
     return _described(_entropy(coverage, threshold_db).drop_vars(("tx", ANTENNA, *TX_COORDINATES)), spacing_m)
 
 
-def _located(model: LinkModel, measured: Measurements, threshold_db: float | None) -> tuple[Floats, xr.DataArray]:
+def _located(
+    model: LinkModel, measured: Measurements, threshold_db: float | None, report: Progress
+) -> tuple[Floats, xr.DataArray]:
     """Return some positions (T, 3) [m] where the transmitter may be, and the contribution of each to the uncertainty.
 
     That is the uncertainty of the coverage averaged over all positions, weighted by the posterior of each.
     """
     spacing_m = _spacing_m(model.partial)
-    coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=False)
+    coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=report)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
     posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
     tx_m, weights, _ = posterior.draw(POSITIONS)

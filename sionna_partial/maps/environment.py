@@ -167,7 +167,7 @@ class SceneMesh(Shown):
         (x0, y0, x1, y1), heights_m = bounds_m, self._heights_m
         return [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), heights_m)]
 
-    def sheet(self, _image: str) -> dict[str, object]:
+    def sheet(self) -> dict[str, object]:
         """Return its keys in the YAML of an exported scene, which has the triangles."""
         return {"mesh": {"height_range": [*self._heights_m], "materials": material_records(self.materials)}}
 
@@ -319,18 +319,13 @@ class FloorPlan:
         """Return the world position [m] of the origin of a scene, x and y, or x, y and z."""
         return [*bounds_m[:2]] if max(map(abs, bounds_m)) > FAR_M else [0.0, 0.0]
 
-    def sheet(self, image: str) -> dict[str, object]:
-        """Return its keys in a map's YAML, where `image` has the materials of the cells."""
-        if self.wall_material is None:
-            return {}
-        return {"wall_material": {"image": image, "materials": material_records(self.wall_materials)}}
+    def sheet(self) -> dict[str, object]:
+        """Return its keys in a map's YAML, besides the layers of the map."""
+        return {}
 
     def arrays(self) -> dict[str, Any]:
-        """Return its arrays in a map's `.npz`."""
-        if self.wall_material is None:
-            return {}
-        records = json.dumps(material_records(self.wall_materials))
-        return {"wall_material": self.wall_material, "wall_materials": records}
+        """Return its arrays in a map's `.npz`, besides the layers of the map."""
+        return {}
 
 
 def _whole_offset_m(low_m: float, high_m: float) -> float:

@@ -8,7 +8,9 @@ import os
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
+from functools import partial as bind
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -39,7 +41,14 @@ from sionna_partial.files import (
 )
 from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.import_report import ImportSource
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, grid_array, require_map, warn_of_odd_states
+from sionna_partial.maps.partial_map import (
+    MAX_CELLS,
+    PartialMap,
+    grid_array,
+    layers_of,
+    require_map,
+    warn_of_odd_states,
+)
 from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
@@ -225,10 +234,8 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
             content["interior_cells"] = partial.interior_cells
         if partial.material is not None:
             content["material"] = json.dumps(asdict(partial.material))
-        if partial.obstacle is not None:
-            content["obstacle"], content["obstacle_heights_m"] = partial.obstacle, partial.obstacle_heights_m
-        if partial.room is not None:
-            content["room"], content["room_names"] = partial.room, json.dumps(partial.room_names)
+        for name, (cells, counted, values) in partial.layers().items():
+            content[name], content[counted] = cells, values if name == "obstacle" else json.dumps(values)
         with atomic_write(target) as stream:
             np.savez_compressed(stream, **content, **partial.environment.arrays())
     else:
@@ -391,10 +398,12 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
         raise MapError(f"{name} has shape {array.shape} and {other} {like.shape}: give arrays of one shape.")
 
 
-def _read_cloud(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.mesh.points import map_from_points
+def _later(reader: str) -> Callable[..., PartialMap]:
+    """Return a reader of this room, such as "ifc:map_from_ifc", whose module is imported when a file is read."""
+    return lambda source, **options: resolve_name(f"sionna_partial.maps.{reader}")(source, **options)
 
-    return map_from_points(source, **options)
+
+_read_cloud = _later("mesh.points:map_from_points")
 
 
 def _read_mesh(source: Path, **options: Any) -> PartialMap:
@@ -422,36 +431,6 @@ def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
     return reading.attached(notes, mesh_map(read_mitsuba_scene(source, notes), reading))
 
 
-def _read_drawing(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.drawings import map_from_drawing
-
-    return map_from_drawing(source, **options)
-
-
-def _read_ifc(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.ifc import map_from_ifc
-
-    return map_from_ifc(source, **options)
-
-
-def _read_bag(source: Path) -> PartialMap:
-    from sionna_partial.maps.bags import map_from_bag
-
-    return map_from_bag(source)
-
-
-def _read_vacuum(source: Path) -> PartialMap:
-    from sionna_partial.maps.vacuum import read_vacuum_map
-
-    return read_vacuum_map(source)
-
-
-def _read_picture(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.drawings import read_picture
-
-    return read_picture(source, **options)
-
-
 def _read_npz(source: Path) -> PartialMap:
     with decoding(source, "was not written by save_map", MapError, "save it again."):
         content = io.BytesIO(read_bytes(source, "path", MapError, MAX_MESH_BYTES))
@@ -466,11 +445,7 @@ def _read_npz(source: Path) -> PartialMap:
             origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
-            walls = content.get("wall_material")
-            of_walls = json.loads(str(content["wall_materials"])) if walls is not None else []
-            obstacle = content.get("obstacle")
-            heights_m = tuple(content["obstacle_heights_m"].tolist()) if obstacle is not None else ()
-            room, names = content.get("room"), tuple(json.loads(str(content.get("room_names", "[]"))))
+            layers = layers_of(content, np.asarray, lambda each: each.tolist() if each.ndim else json.loads(str(each)))
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -478,13 +453,7 @@ def _read_npz(source: Path) -> PartialMap:
                 materials = tuple(None if record is None else Material(**record) for record in records)
                 low, high = content["mesh_height_range_m"].tolist()
                 mesh = SceneMesh(vertices_m, triangles, content["mesh_material"], materials, (low, high))
-            wall_materials = tuple(Material(**record) for record in of_walls)
-    layers = walls, wall_materials, obstacle, heights_m, room, names
-    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, *layers)
-
-
-def _read_exported(source: Path) -> PartialMap:
-    return read_ros_map(source, confined=True)
+    return PartialMap(state, resolution_m, origin_m, height_m, interior, mesh, material, **layers)
 
 
 class _Reader(NamedTuple):
@@ -505,10 +474,12 @@ _OPTIONS_OF = {
 """Files that options are for, other than scans."""
 
 _OF_SCANS = ("height_band_m", "observed", "resolution_m", "up", "unit_m")
-_BAG = _Reader("a rosbag", _read_bag)
+_BAG = _Reader("a rosbag", _later("bags:map_from_bag"))
 _MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
 _CALIBRATED = _Reader("the map of a calibration", _read_npz)
-_EXPORTED = _Reader("an exported map (remove its map.yaml to read the meshes of its scene alone)", _read_exported)
+_EXPORTED = _Reader(
+    "an exported map (remove its map.yaml to read the meshes of its scene alone)", bind(read_ros_map, confined=True)
+)
 
 _READERS = {
     **dict.fromkeys((".yaml", ".yml"), _Reader("none", read_ros_map, ("strict",))),
@@ -518,13 +489,18 @@ _READERS = {
     ".ply": _Reader("a mesh or a point cloud", _read_ply, _OF_SCANS),
     **dict.fromkeys(
         DRAWING_SUFFIXES,
-        _Reader("a drawing", _read_drawing, ("resolution_m", "layer_materials", "wall_layers", "unit_m")),
+        _Reader(
+            "a drawing",
+            _later("drawings:map_from_drawing"),
+            ("resolution_m", "layer_materials", "wall_layers", "unit_m"),
+        ),
     ),
     **dict.fromkeys(
-        IFC_SUFFIXES, _Reader("a building model", _read_ifc, ("resolution_m", "layer_materials", "storey"))
+        IFC_SUFFIXES,
+        _Reader("a building model", _later("ifc:map_from_ifc"), ("resolution_m", "layer_materials", "storey")),
     ),
-    **dict.fromkeys(VACUUM_SUFFIXES, _Reader("the map of a vacuum robot", _read_vacuum)),
-    **dict.fromkeys(PICTURE_SUFFIXES, _Reader("a picture", _read_picture, ("resolution_m",))),
+    **dict.fromkeys(VACUUM_SUFFIXES, _Reader("the map of a vacuum robot", _later("vacuum:read_vacuum_map"))),
+    **dict.fromkeys(PICTURE_SUFFIXES, _Reader("a picture", _later("drawings:read_picture"), ("resolution_m",))),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
 """Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""

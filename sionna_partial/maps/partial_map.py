@@ -3,8 +3,8 @@
 import itertools
 import math
 import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -38,6 +38,9 @@ FREE_STANDING_M = 2.5
 
 ODD_CELLS = 1000
 """Number of cells from which a map has free and wall cells."""
+
+OUTLINE_M = 0.3
+"""Largest distance of an outline of a wall from the cells of this wall [m]."""
 
 ROOM_M, BODY_M = 0.6, 0.3
 """Radius of the largest disc in an unknown region from which it may be a room, and of what gets into one [m]."""
@@ -143,14 +146,11 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         if not isinstance(self.material, Material | None):
             kind = type(self.material).__name__
             raise MapError(f"material is of type {kind}: give a Material, or None for that of SceneSettings.")
-        object.__setattr__(self, "wall_materials", _checked_materials(self.wall_materials))
-        object.__setattr__(self, "wall_material", self._layer("wall_material", "wall_materials"))
-        object.__setattr__(self, "obstacle_heights_m", _checked_heights(self.obstacle_heights_m))
-        object.__setattr__(self, "obstacle", self._layer("obstacle", "obstacle_heights_m"))
-        object.__setattr__(self, "room_names", _checked_names(self.room_names))
-        object.__setattr__(self, "room", self._layer("room", "room_names", CellState.FREE))
+        for name, (counted, of, checked) in _LAYERS.items():
+            object.__setattr__(self, counted, checked(_values(counted, getattr(self, counted))))
+            object.__setattr__(self, name, self._layer(name, counted, of))
 
-    def _layer(self, name: str, counted: str, of: CellState = CellState.WALL) -> NDArray[np.uint8] | None:
+    def _layer(self, name: str, counted: str, of: CellState) -> NDArray[np.uint8] | None:
         """Return the numbers of the cells of a state as a new read-only array, None where all are 0."""
         values = getattr(self, name)
         if values is None:
@@ -172,6 +172,15 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
             return NotImplemented
         return equal_fields(self, other)
 
+    def layers(self) -> dict[str, tuple[States, str, list[Any]]]:
+        """Return the cells of each layer, the field with the values that they count, and these as plain data."""
+        found = {}
+        for name, (counted, _, _) in _LAYERS.items():
+            if (cells := getattr(self, name)) is not None:
+                values = [asdict(each) if isinstance(each, Material) else each for each in getattr(self, counted)]
+                found[name] = cells, counted, values
+        return found
+
     def window(self, row: int, column: int, shape: tuple[int, int], beyond: CellState) -> "PartialMap":
         """Return the map of `shape` cells from a row and a column on; those outside the grid are all `beyond`."""
         ny, nx = self.shape
@@ -184,8 +193,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
             window[inside] = cells[own]
             return window
 
-        names = "wall_material", "obstacle", "room"
-        layers: dict[str, Any] = {name: cut(cells, 0) for name in names if (cells := getattr(self, name)) is not None}
+        layers: dict[str, Any] = {name: cut(cells, 0) for name, (cells, *_) in self.layers().items()}
         x, y = self.origin_m
         origin_m = x + column * self.resolution_m, y + row * self.resolution_m
         return replace(self, state=cut(self.state, beyond), origin_m=origin_m, **layers)
@@ -218,7 +226,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         material = Material.named(material) if isinstance(material, str) else material
         materials = self.wall_materials if material in self.wall_materials else (*self.wall_materials, material)
         cells = np.zeros(self.shape, np.uint8) if self.wall_material is None else self.wall_material.copy()
-        materials = _checked_materials(materials)
+        materials = _checked_materials(_values("wall_materials", materials))
         cells[self.cells_within(where)] = materials.index(material) + 1
         return replace(self, wall_material=cells, wall_materials=materials)
 
@@ -329,6 +337,28 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def wall_noise(self) -> float:
         """Range noise of the walls, from their thickness where they are rough: 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
+
+    @property
+    def unnamed_walls(self) -> float:
+        """Fraction of the wall cells whose material the map does not name."""
+        walls = self.state == CellState.WALL
+        if self.wall_material is None or self.material is not None or not walls.any():
+            return float(self.material is None)
+        return float((self.wall_material[walls] == 0).mean())
+
+    @cached_property
+    def _near_named_walls(self) -> Bools:
+        """Whether the nearest wall of each cell is within `OUTLINE_M` and has a material that the map names."""
+        if self.wall_material is None:
+            return np.zeros(self.shape, dtype=bool)
+        away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
+        return (self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)
+
+    def at_named_walls(self, points_m: NDArray[np.floating]) -> Bools:
+        """Return whether points (..., 3) [m] on outlines of walls, or NaN, are on walls whose material is named."""
+        cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
+        column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)
+        return self._near_named_walls[row, column]
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:
@@ -635,33 +665,51 @@ def free_standing(state: States, resolution_m: float) -> Bools:
     return np.asarray((stands[pieces] & (state == CellState.WALL))[1:-1, 1:-1])
 
 
-def _checked_heights(values: object) -> tuple[float, ...]:
-    """Return heights of obstacles as a tuple, or raise a MapError."""
-    heights = tuple(values) if isinstance(values, tuple | list) else (values,)
-    if len(heights) > MAX_WALL_MATERIALS:
-        raise MapError(f"obstacle_heights_m has {len(heights)} heights: give at most {MAX_WALL_MATERIALS}.")
+def _values(name: str, given: object) -> tuple[Any, ...]:
+    """Return the values that the cells of a layer count as a tuple, or raise a MapError."""
+    values = tuple(given) if isinstance(given, tuple | list) else (given,)
+    if len(values) > MAX_WALL_MATERIALS:
+        raise MapError(f"{name} has {len(values)} entries: give at most {MAX_WALL_MATERIALS}.")
+    return values
+
+
+def _checked_heights(heights: tuple[Any, ...]) -> tuple[float, ...]:
+    """Return heights of obstacles as numbers, or raise a MapError."""
     return tuple(_number("obstacle_heights_m", each, 0.01, 100.0) for each in heights)
 
 
-def _checked_materials(values: object) -> tuple[Material, ...]:
-    """Return materials of walls as a tuple, or raise a MapError."""
-    materials = tuple(values) if isinstance(values, tuple | list) else (values,)
+def _checked_materials(materials: tuple[Any, ...]) -> tuple[Material, ...]:
+    """Return materials of walls, or raise a MapError."""
     other = next((type(each).__name__ for each in materials if not isinstance(each, Material)), None)
     if other is not None:
         raise MapError(f"wall_materials holds a {other}: give a tuple of Material, such as Material.named returns.")
-    if len(materials) > MAX_WALL_MATERIALS:
-        raise MapError(f"wall_materials has {len(materials)} materials: give at most {MAX_WALL_MATERIALS}.")
     return materials
 
 
-def _checked_names(values: object) -> tuple[str, ...]:
-    """Return names of rooms as a tuple, or raise a MapError."""
-    names = tuple(values) if isinstance(values, tuple | list) else (values,)
+def _checked_names(names: tuple[Any, ...]) -> tuple[str, ...]:
+    """Return names of rooms, or raise a MapError."""
     if len({*names}) < len(names) or not all(isinstance(name, str) and name and name.isprintable() for name in names):
-        raise MapError(f"room_names = {shown(values)} is not allowed: give different texts of printable characters.")
-    if len(names) > MAX_WALL_MATERIALS:
-        raise MapError(f"room_names has {len(names)} names: give at most {MAX_WALL_MATERIALS}.")
+        raise MapError(f"room_names = {shown(names)} is not allowed: give different texts of printable characters.")
     return names
+
+
+_LAYERS: dict[str, tuple[str, CellState, Callable[[tuple[Any, ...]], tuple[Any, ...]]]] = {
+    "wall_material": ("wall_materials", CellState.WALL, _checked_materials),
+    "obstacle": ("obstacle_heights_m", CellState.WALL, _checked_heights),
+    "room": ("room_names", CellState.FREE, _checked_names),
+}
+"""Layers of a map: the field with the values that its cells count, the cells that it is for, and the check of these
+values."""
+
+
+def layers_of(found: Mapping[str, Any], cells: Callable[[Any], Any], values: Callable[[Any], Any]) -> dict[str, Any]:
+    """Return the fields of the layers of a file, whose cells and plain values (`layers`) two functions decode."""
+    layers = {name: cells(found[name]) for name in _LAYERS if name in found}
+    counted = {_LAYERS[name][0]: values(found[_LAYERS[name][0]]) for name in layers}
+    return layers | {
+        name: tuple(Material(**each) if isinstance(each, dict) else each for each in plain)
+        for name, plain in counted.items()
+    }
 
 
 def _number(name: str, value: object, low: float, high: float) -> float:

@@ -211,17 +211,12 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
         sheet["interior_cells"] = int(partial.interior_cells)
     if partial.material is not None:
         sheet["material"] = asdict(partial.material)
-    image = f"{path.stem}_wall_material.pgm"
-    sheet |= partial.environment.sheet(image)
-    images = {} if partial.wall_material is None else {path.with_name(image): partial.wall_material}
-    if partial.obstacle is not None:
-        image = f"{path.stem}_obstacle.pgm"
-        sheet["obstacle"] = {"image": image, "heights": [*partial.obstacle_heights_m]}
-        images[path.with_name(image)] = partial.obstacle
-    if partial.room is not None:
-        image = f"{path.stem}_room.pgm"
-        sheet["room"] = {"image": image, "names": [*partial.room_names]}
-        images[path.with_name(image)] = partial.room
+    sheet |= partial.environment.sheet()
+    images = {}
+    for name, (cells, _, values) in partial.layers().items():
+        image = f"{path.stem}_{name}.pgm"
+        sheet[name] = {"image": image, _LAYERS[name][0]: values}
+        images[path.with_name(image)] = cells
     shades = np.empty(len(CellState), dtype=np.uint8)
     shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
     sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -25,7 +26,6 @@ from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.wall_evidence import (
     FADINGS_DB,
-    LIKELY_STD_DB,
     OTHERS_WEIGHT,
     OWN_WEIGHT,
     STDS_DB,
@@ -33,8 +33,9 @@ from sionna_partial.measurements.wall_evidence import (
     log_std_prior,
     mean_square,
 )
-from sionna_partial.prediction.inputs import free_space_gain_db
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.wall_materials import LIKELY_STD_DB
 from sionna_partial.settings import FREQUENCIES_HZ
 
 CELL_M = 0.3
@@ -84,19 +85,35 @@ class Kind(NamedTuple):
     """True if predictions that are certain without measurements stay certain; for a real radio no trace is."""
 
     def learnt(self, others: Sequence[tuple[Floats, Floats]]) -> Kind:
-        """Return the prior of a transmitter given others of the same building, whose means scatter.
+        """Update the prior by other transmitters of the building, whose differences are inferred as well.
 
         `others` are the precisions (2, 2), and their products with the means, without a prior.
         """
-        within = np.minimum(BETWEEN_TRANSMITTERS, self.covariance)
-        unsure = self.covariance - within
-        precision, shift = np.zeros((2, 2)), np.zeros(2)
-        for each_precision, each_shift in others:
-            scattered = np.linalg.inv(np.eye(2) + each_precision @ within)
-            precision, shift = precision + scattered @ each_precision, shift + scattered @ each_shift
+        if not others:
+            return self
+        found = [self._learnt(others, np.minimum(np.diag(stds) ** 2, self.covariance)) for stds in BETWEEN_STDS]
+        log_p, means, covariances = (np.array(each) for each in zip(*found, strict=True))
+        apart = np.log(np.array(BETWEEN_STDS) / LIKELY_BETWEEN) / BETWEEN_SPREAD
+        log_p -= 0.5 * (apart**2).sum(axis=1)
+        weights = np.exp(log_p - logsumexp(log_p))
+        mean = weights @ means
+        scatter = np.einsum("w,wa,wb->ab", weights, means - mean, means - mean)
+        covariance = np.tensordot(weights, covariances, 1) + scatter
+        return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=covariance)
+
+    def _learnt(self, others: Sequence[tuple[Floats, Floats]], within: Floats) -> tuple[float, Floats, Floats]:
+        """Return the log-evidence of a covariance (2, 2) between transmitters, and the prior's mean and covariance."""
+        precision, shift, log_p = np.zeros((2, 2)), np.zeros(2), 0.0
+        for own_precision, own_shift in others:
+            scattered = np.linalg.inv(np.eye(2) + own_precision @ within)
+            precision, shift = precision + scattered @ own_precision, shift + scattered @ own_shift
+            log_p += 0.5 * float(own_shift @ within @ scattered @ own_shift + np.linalg.slogdet(scattered)[1])
+        unsure, mean = self.covariance - within, np.array(self.mean)
         left = np.linalg.solve(np.eye(2) + unsure @ precision, unsure)
-        mean = self.mean + left @ (shift - precision @ self.mean)
-        return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=left + within)
+        change = shift - precision @ mean
+        log_p += 0.5 * float(change @ left @ change - np.linalg.slogdet(np.eye(2) + unsure @ precision)[1])
+        log_p += float(mean @ shift - 0.5 * mean @ precision @ mean)
+        return log_p, mean + left @ change, left + within
 
 
 KINDS = (
@@ -117,8 +134,11 @@ UNKNOWN_FACTOR_STD = 0.3
 LEAST_WEIGHT = 0.01
 """Probability of a candidate below which it is left out of predictions."""
 
-BETWEEN_TRANSMITTERS = np.diag([6.0, 0.3]) ** 2
-"""Covariance (2, 2) of offset [dB] and factor between the transmitters of a building."""
+BETWEEN_STDS = tuple(itertools.product((1.5, 3.0, 6.0, 9.0), (0.1, 0.2, 0.3)))
+"""Standard deviations of offset [dB] and factor between the transmitters of a building that are tried."""
+
+LIKELY_BETWEEN, BETWEEN_SPREAD = (3.0, 0.2), 0.5
+"""The most probable ones before any measurement, and the standard deviation of their logarithms."""
 
 MOST_POINTS = 500
 """Number of measured positions from which on neighbours are averaged."""
@@ -279,7 +299,8 @@ class _Hypothesis(NamedTuple):
 class _Fit(NamedTuple):
     """The process under one material: weights (P,) and matrix (P, P) with which it predicts.
 
-    `fading_db` is the part of the noise that other receivers have as well.
+    `fading_db` is the part of the noise that other receivers have as well. Offset and factor have the posterior
+    covariance `common` (2, 2); `coupling` (2, P) gives their covariance with the process.
     """
 
     kind: Kind
@@ -289,12 +310,23 @@ class _Fit(NamedTuple):
     factor: float
     weights: Floats
     precision: Floats
+    common: Floats
+    coupling: Floats
 
     @classmethod
     def of(cls, best: _Hypothesis, received: Bools, fading_db: float = 0.0) -> _Fit:
         weights, precision = _posterior(best.covariance, best.residual, received, best.noise)
-        offset_db, factor = best.kind.mean + best.kind.covariance @ best.design @ weights
-        return cls(best.kind, best.noise_db, fading_db, float(offset_db), float(factor), weights, precision)
+        design = best.kind.covariance @ best.design
+        offset_db, factor = (best.kind.mean + design @ weights).tolist()
+        coupling = design @ precision
+        common = best.kind.covariance - coupling @ design.T
+        return cls(best.kind, best.noise_db, fading_db, offset_db, factor, weights, precision, common, coupling)
+
+    def common_variance(self, across: Floats, scale_db: Floats, below_db: Floats) -> Floats:
+        """Return the variance (N,) that uncertain offset and factor add to the process at other receivers [dB²]."""
+        design = np.stack([np.ones(len(below_db)), below_db])
+        shared = self.common @ design - 2.0 * scale_db * (self.coupling @ across)
+        return (design * shared).sum(axis=0)
 
 
 def _hypotheses(
@@ -596,9 +628,8 @@ class Assimilation(Shown):
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
-        materials = prior.by_material[0] if len(self._fits) > 1 else (prior,)
         updated, across = [], None
-        for fit, links in zip(self._fits, materials, strict=True):
+        for fit, links in zip(self._fits, prior.by_material[0], strict=True):
             if fit is not None:
                 across = self._links.correlation(rx_m, fit.kind) if across is None else across
                 updated.append(self._updated(fit, across, rx_m, links))
@@ -606,7 +637,8 @@ class Assimilation(Shown):
 
     def _updated(self, fit: _Fit, across: Floats, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
         """Update links under one material, whose residuals have the correlations (P, N) `across` with the measured."""
-        kind, prior = fit.kind, self._shadowed(rx_m, prior, fit.factor)
+        kind, below_db = fit.kind, prior.gain_mean_db - self._links.free_space_db(rx_m)
+        prior = self._shadowed(rx_m, prior, fit.factor)
         explained = np.clip(np.einsum("pn,pn->n", across, fit.precision @ across), 0.0, 1.0 - 1e-3)
         informed = explained > _LEAST_EXPLAINED
         explained = np.where(informed, explained, 1.0)
@@ -623,7 +655,9 @@ class Assimilation(Shown):
         has_path = np.arange(3)[:, None] != LinkState.OUTAGE
         pull = np.where(informed & has_path, variance / total, 0.0)
         means_db = np.clip(means_db + pull * (gain_db - means_db), GAIN_FLOOR_DB, 0.0)
-        left = np.where(has_path, variance * (1.0 - pull) + fit.fading_db**2, 0.0)
+        common = 0.0 if kind.exact else fit.common_variance(across, scale_db, below_db)
+        left = np.maximum(variance * (1.0 - pull) + common, 0.0) + fit.fading_db**2
+        left = np.where(has_path, left, 0.0)
         stds_db = np.sqrt(np.maximum(np.minimum(stds_db**2, left) if kind.exact else left, 0.0))
         updated = LinkPrediction.of_parts(weights / weights.sum(axis=0), means_db, stds_db)
         return prior.where(informed, updated) if kind.exact else updated

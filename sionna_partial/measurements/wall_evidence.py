@@ -11,16 +11,16 @@ from typing import NamedTuple
 import numpy as np
 
 from sionna_partial.arrays import Floats
+from sionna_partial.prediction.wall_materials import LIKELY_FADING_DB, LIKELY_STD_DB
 
-STDS_DB, LIKELY_STD_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 5.0, 0.4
-"""Standard deviations of the process that are tried [dB], the most probable one before any measurement, and the
-standard deviation of its logarithm."""
+STDS_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 0.4
+"""Standard deviations of the process that are tried [dB], and the standard deviation of their logarithm."""
 
 FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
 """Standard deviations of what differs from receiver to receiver that are tried [dB]."""
 
-LIKELY_FADING_DB, FADING_SPREAD = 3.0, 0.5
-"""The most probable one before any measurement, and the standard deviation of its logarithm [dB]."""
+FADING_SPREAD = 0.5
+"""Standard deviation of their logarithm before any measurement."""
 
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
 """Exponents of the evidence of a transmitter, and of other transmitters of the building: errors of a trace are
@@ -50,19 +50,21 @@ class Residuals(NamedTuple):
         root = np.sqrt(self.size)
         values, vectors = np.linalg.eigh(self.correlation * root[:, None] * root)
         values = np.maximum(values, 1e-6)
-        found = np.empty((len(self.residual_db), len(STDS_DB), len(noises_db)))
-        for k, covariance in enumerate(self.covariance):
-            for s, process_db in enumerate(STDS_DB):
-                scale_db = np.hypot(self.std_db[k], process_db)
-                rows = np.stack([self.residual_db[k], np.ones(len(root)), self.below_db[k]]) * (root / scale_db)
-                rows = rows @ vectors
-                spectrum = values + (noises_db**2 * (scale_db**-2.0).sum() / max(len(root), 1))[:, None]
-                gram = np.einsum("np,ap,bp->nab", 1.0 / spectrum, rows, rows, optimize=True)
-                common = np.linalg.inv(covariance) + gram[:, 1:, 1:]
-                shift = gram[:, 1:, 0]
-                square = gram[:, 0, 0] - np.einsum("na,nab,nb->n", shift, np.linalg.inv(common), shift)
-                volume = np.log(spectrum).sum(axis=1) + np.linalg.slogdet(covariance @ common)[1]
-                found[k, s] = -0.5 * (square + volume) - np.log(scale_db).sum()
+        rows_db = np.stack([self.residual_db, np.ones_like(self.below_db), self.below_db], axis=1) * root
+        found = np.empty((len(rows_db), len(STDS_DB), len(noises_db)))
+        for s, process_db in enumerate(STDS_DB):
+            scale_db = np.hypot(self.std_db, process_db)
+            rows = (rows_db / scale_db[:, None]) @ vectors
+            relative = noises_db**2 * (scale_db**-2.0).sum(axis=1)[:, None] / max(len(root), 1)
+            spectrum = values + relative[..., None]
+            products = rows[:, :, None] * rows[:, None]
+            gram = (1.0 / spectrum) @ products.reshape(len(rows), 9, -1).swapaxes(1, 2)
+            gram = gram.reshape(*spectrum.shape[:2], 3, 3)
+            common = np.linalg.inv(self.covariance)[:, None] + gram[..., 1:, 1:]
+            shift = gram[..., 1:, 0]
+            square = gram[..., 0, 0] - (shift * np.linalg.solve(common, shift[..., None])[..., 0]).sum(axis=-1)
+            volume = np.log(spectrum).sum(axis=-1) + np.linalg.slogdet(self.covariance[:, None] @ common)[1]
+            found[:, s] = -0.5 * (square + volume) - np.log(scale_db).sum(axis=1)[:, None]
         return found
 
 

@@ -11,9 +11,9 @@ import numpy as np
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, read_only
-from sionna_partial.checks import Progress
+from sionna_partial.checks import Progress, no_progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.display import Pictured, reporting
+from sionna_partial.display import Pictured, part_of, reporting
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
@@ -370,10 +370,10 @@ def place_transmitter(
     with reporting(progress) as report:
         report(0.0, "comparing positions")
         starts_m = search.starts(some, _per_area(some, *STARTS))
-        start_scores = search.scores(starts_m, some)
+        start_scores = search.scores(starts_m, some, part_of(report, 0.0, 0.4))
         routes = _refined(search, some, starts_m, start_scores, report)
-        report(0.9, "evaluating the best positions")
-        values = [search.values(trajectory_m[-1:], area)[0] for trajectory_m, _ in routes]
+        ends_m = np.array([trajectory_m[-1] for trajectory_m, _ in routes])
+        values = search.values(ends_m, area, part_of(report, 0.9, 1.0))
         report(1.0, "done")
     scores = [placement_score(each, area.weight, settings) for each in values]
     best = int(np.argmax(scores))
@@ -437,28 +437,30 @@ class Search:
             chosen.append(int(np.argmax(left)))
         return positions_m[chosen]
 
-    def links(self, positions_m: Floats, area: PlacementArea) -> tuple[LinkPrediction, Bools]:
+    def links(
+        self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress
+    ) -> tuple[LinkPrediction, Bools]:
         """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
         frequency_hz = self.model.simulation.trace_settings.frequency_hz
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]
-        _, found, _ = self.model.predict_each(ends_m)
+        _, found, _ = self.model.predict_each(ends_m, report)
         columns = {}
         for column in fields(LinkPrediction):
             columns[column.name] = np.full(far.shape, OUTAGE[column.name])
             columns[column.name][far] = getattr(found, column.name)
         return LinkPrediction(**columns), far
 
-    def values(self, positions_m: Floats, area: PlacementArea) -> Floats:
+    def values(self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress) -> Floats:
         """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
-        links, far = self.links(positions_m, area)
+        links, far = self.links(positions_m, area, report)
         return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
 
-    def scores(self, positions_m: Floats, area: PlacementArea) -> Floats:
+    def scores(self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress) -> Floats:
         """Return the scores (P,) of positions (P, 3) [m]; P may be 0."""
         if not len(positions_m):
             return np.zeros(0)
-        values = self.values(positions_m, area)
+        values = self.values(positions_m, area, report)
         return np.array([placement_score(each, area.weight, self.settings) for each in values])
 
 
@@ -493,12 +495,12 @@ def _refined(
     best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
     routes = [([starts_m[index]], [start_scores[index]]) for index in best]
     for number, step_m in enumerate(STEPS_M):
-        report(0.4 + 0.5 * number / len(STEPS_M), f"refining, step {number + 1} of {len(STEPS_M)}")
+        part = part_of(report, *(0.4 + 0.5 * np.array([number, number + 1]) / len(STEPS_M)))
         neighbours_m = np.array([route_m[-1] for route_m, _ in routes])[:, None] + step_m * _DIRECTIONS
         neighbours_m[..., :2] = np.round(neighbours_m[..., :2], 3)
         stands = area.stands(neighbours_m)
         scores = np.full(stands.shape, -math.inf)
-        scores[stands] = search.scores(neighbours_m[stands], area)
+        scores[stands] = search.scores(neighbours_m[stands], area, part)
         for (route_m, route_scores), around_m, around_scores in zip(routes, neighbours_m, scores, strict=True):
             if around_scores.max() > route_scores[-1]:
                 route_m.append(around_m[around_scores.argmax()])

@@ -2,6 +2,7 @@
 
 import io
 import itertools
+import json
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
@@ -33,17 +34,21 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.coverage.network import require_network
 from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, server_colours, shade, sheet_columns
+from sionna_partial.settings import Material, material_name
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
 """Panels of `plot_coverage`."""
 
-_NARROW_IN, _WIDE_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0, 11.0, 0.75, 0.35, 170, 3000
+_NARROW_IN, _WIDE_IN, _HIGHEST_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0, 11.0, 16.0, 0.75, 0.35, 170, 3000
 _ROW_NAME, _LOW_ASPECT, _OUTAGE_NOTE = 16, 0.2, "an outage counts as a path gain of \N{MINUS SIGN}150 dB"
 _NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
+_GAINS_DB, _GAINS_THROUGH_WALLS_DB = (GAIN_FLOOR_DB, -60.0), (-110.0, -30.0)
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
-_A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -21.0, -10.0), 0.9
+_A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
+_REPORT_LINE_IN, _REPORT_WIDTH, _WIDE_ASPECT = 0.14, 114, 1.7
+_NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
 @dataclass(frozen=True)
@@ -66,8 +71,9 @@ def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) 
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
-def coverage_layers(threshold_db: float) -> dict[str, Layer]:
-    """Return every layer that a panel can show, by name."""
+def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> dict[str, Layer]:
+    """Return every layer that a panel can show, by name; gains of a coverage through walls are less spread."""
+    through_walls = coverage is not None and coverage.attrs.get("walls") == "through walls"
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
     layers = {
@@ -78,7 +84,7 @@ def coverage_layers(threshold_db: float) -> dict[str, Layer]:
         "gain_mean_db": Layer(
             "Mean path gain",
             _variable("gain_mean_db"),
-            Normalize(-150.0, -60.0),
+            Normalize(*(_GAINS_THROUGH_WALLS_DB if through_walls else _GAINS_DB)),
             "viridis",
             "dB",
         ),
@@ -86,7 +92,7 @@ def coverage_layers(threshold_db: float) -> dict[str, Layer]:
             "Std. dev. of the path gain", _variable("gain_std_db"), Normalize(0.0, 40.0), "magma_r", "dB"
         ),
         "p_above": Layer(
-            f"P(path gain > {threshold_db:g} dB)".replace("-", "\N{MINUS SIGN}"),
+            f"P(path gain > {round(threshold_db, 1):g} dB)".replace("-", "\N{MINUS SIGN}"),
             lambda data: probability_above(data, threshold_db),
             *probability,
         ),
@@ -138,7 +144,7 @@ def plot_coverage(
     >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
     maps = transmitters_of(coverage)
-    chosen = _choose(layers, threshold_db)
+    chosen = _choose(layers, threshold_db, coverage)
     figure = _plot_rows(maps, chosen) if len(maps) > 1 else _plot_sheet(next(iter(maps.values())), chosen)
     figure.suptitle(headline("Coverage", maps).replace(": ", "\n", 1))
     _add_legend(figure, [*maps.values()], chosen)
@@ -184,7 +190,7 @@ def plot_comparison(
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     coverages = {title: require_coverage(coverage) for title, coverage in coverages.items()}
     first, *others = coverages.values()
-    chosen = _choose(layers, -100.0)
+    chosen = _choose(layers, -100.0, first)
     figure, axes = _panels(len(chosen), len(coverages), first.sizes["x"] / first.sizes["y"], keys_in=1.6)
     for row, layer in zip(axes, chosen, strict=True):
         for axis, coverage in zip(row, coverages.values(), strict=True):
@@ -198,9 +204,9 @@ def plot_comparison(
     return figure
 
 
-def _choose(layers: Sequence[str], threshold_db: float) -> list[Layer]:
+def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) -> list[Layer]:
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
-    known = coverage_layers(threshold_db)
+    known = coverage_layers(threshold_db, coverage)
     named = isinstance(layers, Sequence) and not isinstance(layers, str) and len(layers) > 0
     require(named, "layers", layers, f"give some of {', '.join(known)}.")
     for name in layers:
@@ -230,7 +236,8 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
     """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
-    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), 12.0)
+    highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
+    height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
     figure = Figure(figsize=(page, rows * (height + 0.35) + 1.6), dpi=_DPI, layout="compressed")
     axes = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
     for axis in axes.flat:
@@ -393,39 +400,72 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
     legend_below(figure, handles, columns=4 if located else None, title=note)
 
 
-def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float) -> bytes:
-    """Return a page (PDF) on the coverage of named transmitters: maps, covered area by received power, uncertainty.
-
-    Equal maps give equal bytes.
-    """
-    maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
-    figure = Figure(figsize=_A4_IN, layout="constrained")
-    parts: Any = figure.subfigures(2, 1, height_ratios=(1.0, 1.05))
-    pictures, words = parts
-    axes = pictures.subplots(1, 2, sharey=True)
-    power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
-    strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
-    above = [
-        probability_above(one, float(np.clip(threshold_dbm - each, GAIN_FLOOR_DB, 0.0)))
-        for one, each in zip(maps.values(), powers_dbm, strict=True)
-    ]
-    level = Layer("", lambda _: _taken(power, strongest), Normalize(-130.0, -30.0), "viridis", "dBm")
-    probability = Layer("", lambda _: _taken(np.stack(above), strongest), Normalize(0.0, 1.0), "cividis", "probability")
-    titles = "Mean received power", f"P(received power > {threshold_dbm:g} dBm)"
-    for axis, layer, title in zip(axes, (level, probability), titles, strict=True):
-        _draw(axis, next(iter(maps.values())), layer)
-        axis.plot(coverage[TX_COORDINATES[0]], coverage[TX_COORDINATES[1]], zorder=4, **_STAR)
-        axis.set_title(title, fontsize="medium")
-        axis.label_outer()
-        pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, location="bottom", label=layer.label)
-    figure.suptitle(headline("Radio coverage", maps))
-    axis = words.subplots()
-    axis.set_axis_off()
-    text = _report_text(coverage, maps, powers_dbm, threshold_dbm)
-    axis.text(0.02, 1.0, text, va="top", family="monospace", fontsize=8, parse_math=False, transform=axis.transAxes)
-    stream = io.BytesIO()
+def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()) -> bytes:
+    """Return `report_figure` as a PDF; equal maps give equal bytes."""
+    figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading), io.BytesIO()
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
+
+
+def report_figure(
+    coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
+) -> Figure:
+    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty.
+
+    `heading` is the name of the map and the date.
+    """
+    maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
+    notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
+    text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
+    text_in = _REPORT_LINE_IN * (text.count("\n") + 2)
+    figure = Figure(figsize=_A4_IN, layout="constrained")
+    parts: Any = figure.subfigures(2, 1, height_ratios=(_A4_IN[1] - text_in, text_in))
+    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm)
+    title = " \N{MIDDLE DOT} ".join(["Radio coverage", *heading])
+    figure.suptitle(f"{title}\n{headline('Prediction', maps)}", fontsize="medium", parse_math=False)
+    axis = parts[1].subplots()
+    axis.set_axis_off()
+    axis.text(0.02, 1.0, text, va="top", family="monospace", fontsize=7.5, parse_math=False, transform=axis.transAxes)
+    return figure
+
+
+def _draw_report(
+    pictures: Any, coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
+) -> None:
+    """Draw received power, its probability and uncertainty, and the strongest transmitter; on wide maps two of them."""
+    power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
+    strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
+    thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
+    above = np.max(
+        [probability_above(*pair) for pair in zip(maps.values(), thresholds_db.tolist(), strict=True)], axis=0
+    )
+    nearest = distance_transform_edt(np.isnan(above), return_distances=False, return_indices=True)
+    covered = above[tuple(nearest)]
+    spread = _taken(coverage["gain_std_db"].to_numpy(), strongest)
+    level, probability = Normalize(threshold_dbm - 30.0, threshold_dbm + 40.0), Normalize(0.0, 1.0)
+    servers = Normalize(-0.5, len(maps) - 0.5), ListedColormap(server_colours(len(maps)))
+    panels = [
+        Layer("Mean received power", lambda _: _taken(power, strongest), level, "viridis", "dBm"),
+        Layer(f"P(received power > {threshold_dbm:g} dBm)", lambda _: above, probability, "cividis", "probability"),
+        Layer("Standard deviation of the received power", lambda _: spread, Normalize(0.0, 30.0), "magma", "dB"),
+        Layer("Strongest transmitter", lambda _: strongest.astype(float), *servers),
+    ]
+    is_wide = coverage.sizes["x"] > _WIDE_ASPECT * coverage.sizes["y"]
+    count = 2 if is_wide else 3 + (len(maps) > 1)
+    axes = pictures.subplots(2, 1 if is_wide else 2).ravel()
+    x_m, y_m = (coverage[name].to_numpy() for name in TX_COORDINATES[:2])
+    for axis, layer in zip(axes[:count], panels, strict=False):
+        _draw(axis, next(iter(maps.values())), layer)
+        axis.contour(coverage["x"], coverage["y"], covered, levels=[_LIKELY], colors="black", linewidths=1.0)
+        axis.plot(x_m, y_m, zorder=4, **_STAR)
+        for place in zip(maps, zip(x_m, y_m, strict=True), strict=True):
+            axis.annotate(*place, (7, 0), textcoords="offset points", va="center", zorder=5, **_NAME)
+        axis.set_title(layer.title, fontsize="medium")
+        bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, location="bottom", label=layer.label)
+        if not layer.label:
+            bar.set_ticks(range(len(maps)), labels=[name[:_ROW_NAME] for name in maps])
+    for axis in axes[count:]:
+        axis.set_axis_off()
 
 
 def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
@@ -433,21 +473,34 @@ def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
     return np.take_along_axis(values, index[None], axis=0)[0]
 
 
-def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float) -> str:
-    """Return settings, covered area by received power, and the accuracy of the numbers."""
-    lines, attributes = [], coverage.attrs
-    for (name, one), eirp_dbm in zip(maps.items(), powers_dbm, strict=True):
+def _report_table(
+    coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
+) -> str:
+    """Return the covered area by received power, a row for each transmitter, and one for any of several."""
+    rows = [f"Observed floor / all floor above, with P = {_LIKELY:g}"]
+    for (name, one), power_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]
-        lines.append(f"{name}: ({x:.2f}, {y:.2f}, {z:.2f}) m, EIRP {eirp_dbm:g} dBm")
-    lines.append(f"Receivers: {attributes['rx_height_m']:g} m high, {attributes['spacing_m']:g} m apart")
-    lines.append(f"Map: {attributes['map_observed_fraction']:.0%} observed. Predictor: {attributes['predictor']}")
-    lines += ["", f"Share of the floor above a received power with probability {_LIKELY:g}, by transmitter"]
-    lines.append("  above [dBm]   " + "".join(f"{name[:16]:>18}" for name in maps))
+        rows.append(f"{name[:_ROW_NAME]} at ({x:.2f}, {y:.2f}, {z:.2f}) m, {power_dbm:g} dBm")
+    rows += ["any transmitter"] if len(maps) > 1 else []
+    rows = [row.ljust(max(map(len, rows))) for row in rows]
     for level_dbm in threshold_dbm + _REPORTED_DB:
-        share = coverage.radio.area(level_dbm, probability=_LIKELY, eirp_dbm=powers_dbm)["fraction"]
-        both = (f"{float(seen):>7.0%} /{float(every):>5.0%}" for seen, every in zip(*share.to_numpy(), strict=True))
-        lines.append(f"  {level_dbm:>7g}       " + "".join(each.rjust(18) for each in both))
-    lines.append("  (observed floor / all floor, unobserved floor weighted by the probability that it is indoors)")
+        given: Any = {"probability": _LIKELY, "eirp_dbm": powers_dbm}
+        area = coverage.radio.area(level_dbm, **given)["fraction"].to_numpy().T
+        together = coverage.radio.area(level_dbm, any_transmitter=True, **given)["fraction"].to_numpy()
+        cells = [f"{seen:.0%} /{every:>4.0%}" for seen, every, *_ in (*area, together)]
+        rows = [row + cell.rjust(13) for row, cell in zip(rows, [f"{level_dbm:g} dBm", *cells], strict=False)]
+    return "\n".join(rows)
+
+
+def _report_notes(coverage: xr.Dataset) -> list[str]:
+    """Return paragraphs on the receivers, the map, the uncertainty and the material of the walls."""
+    attributes = coverage.attrs
+    notes = [
+        f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. "
+        f"{attributes['map_observed_fraction']:.0%} of the map is observed. Predictor: {attributes['predictor']}. "
+        f"Lines enclose the area above the threshold with a probability of {_LIKELY:g}. Unobserved floor counts with "
+        "the probability that it is indoors."
+    ]
     std_db = coverage["gain_std_db"].to_numpy()
     observed = np.broadcast_to(coverage["observed"].to_numpy() == 1, std_db.shape) & np.isfinite(std_db)
     spreads = [
@@ -455,17 +508,24 @@ def _report_text(coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_db
         for what, where in (("observed", observed), ("unobserved", ~observed & np.isfinite(std_db)))
         if where.any() and not (attributes["map_complete"] and what == "unobserved")
     ]
-    lines += ["", "Uncertainty: the mean standard deviation of the path gain is", f"{', '.join(spreads)}."]
-    if "wall_material" in attributes:
-        lines.append(f"Material of the walls: {attributes['wall_material']}. Its uncertainty, and of what maps lack,")
-        lines.append("as furniture, is in that deviation.")
-    elif attributes["map_complete"]:
-        lines.append("The map is complete: the numbers are a ray trace of it. Errors of walls' positions, of their")
-        lines.append("material and of furniture that the map does not show are not in that deviation.")
+    uncertainty = f"Uncertainty: the mean standard deviation of the path gain is {', '.join(spreads)}. "
+    if attributes["map_complete"]:
+        uncertainty += (
+            "The map is complete, and rays were traced in it: errors of the map, and furniture that it lacks, "
+        )
+        uncertainty += f"are {'' if 'wall_material' in attributes else 'not '}in that deviation."
     else:
-        lines.append("Rays were traced in the observed part; the rest is a distribution learned from other buildings.")
-        lines.append("An area counts where that distribution exceeds the power with the probability above.")
-    return "\n".join(lines)
+        uncertainty += (
+            "Rays were traced in the observed part; the rest is a distribution learned from other buildings. "
+        )
+        uncertainty += "An area counts where that distribution exceeds the power with the probability above."
+    if "wall_material" in attributes:
+        walls = f"not known; probabilities: {attributes['wall_material']}. That is part of the deviation"
+    else:
+        material = Material(**json.loads(attributes["scene_settings"])["material"])
+        walls = f"{material_name(material)}, except walls whose material the map has"
+        walls += "; no path passes through walls" if attributes.get("walls") == "opaque walls" else ""
+    return [*notes, uncertainty, f"Material of the walls: {walls}."]
 
 
 def plot_network(network: xr.Dataset) -> Figure:

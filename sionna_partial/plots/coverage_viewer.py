@@ -106,8 +106,8 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
     from bokeh.models.widgets.inputs import Select
     from bokeh.models.widgets.sliders import Slider
 
-    layers = {name: layer for name, layer in coverage_layers(THRESHOLD_DB).items() if name in _LAYERS}
     words, one = {"link_state": STATES}, next(iter(maps.values()))
+    layers = {name: layer for name, layer in coverage_layers(THRESHOLD_DB, one).items() if name in _LAYERS}
     if len(maps) > 1:
         layers["best_server"] = _best_server(maps)
         words["best_server"] = [*maps]

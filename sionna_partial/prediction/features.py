@@ -376,7 +376,7 @@ class LinkFeatures(Shown):
     frequency_hz : float, optional
         Carrier frequency of the trace [Hz], from `link_features`. None is the frequency of the predictor.
     path_power : (N, C + 1, R + 1) float64 array, optional
-        Power of the paths of each link by crossed walls and by reflections, where the material of walls is unknown.
+        Power of the paths of each link by crossed walls and by reflections, of those walls whose material is unknown.
 
     Raises
     ------
@@ -437,8 +437,11 @@ class LinkFeatures(Shown):
         path_power = None if self.path_power is None else self.path_power[index]
         return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz, path_power=path_power)
 
-    def with_extra_losses(self, crossing_db: float, reflection_db: float) -> "LinkFeatures":
-        """Return the features where walls lose more than in the trace: at each crossing and reflection [dB]."""
+    def with_extra_losses(self, crossing_db: float, reflection_db: float, fraction: float = 1.0) -> "LinkFeatures":
+        """Return the features where walls lose more than in the trace: at each crossing and reflection [dB].
+
+        `fraction` of the walls of the map have an unknown material.
+        """
         assert self.path_power is not None
         walls, reflections = (np.arange(count) for count in self.path_power.shape[1:])
         extra_db = crossing_db * walls[:, None] + reflection_db * reflections
@@ -450,7 +453,7 @@ class LinkFeatures(Shown):
             context = replace(
                 context,
                 straight_gain_db=np.maximum(straight_db, GAIN_FLOOR_DB),
-                wall_loss_db=context.wall_loss_db + crossing_db,
+                wall_loss_db=context.wall_loss_db + fraction * crossing_db,
             )
         return replace(self, gain_db=gain_db, link_state=states, context=context)
 
@@ -587,13 +590,15 @@ def features_of_paths(
 
     `blocks` are all paths between them, from `Simulation.blocks`, `settings` those of the trace, and `windows` those of
     `map_windows` around the transmitter. Without windows there is no context, which the paper's predictor does not
-    need. Where the material of walls is unknown, the features have the power of the paths by their interactions.
+    need. Where the material of walls is unknown, the features have the power of the paths by their interactions with
+    these walls.
     """
     limits = (settings[0].max_walls, settings[0].max_depth) if material_unknown else ()
     sums = LinkSums(1, len(rx_m), *limits)
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
+    some_named = material_unknown and partial.wall_material is not None
     for paths in blocks:
-        sums.add(paths)
+        sums.add(paths, ~partial.at_named_walls(paths.vertices_m) if some_named else True)
         if windows is not None:
             indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()

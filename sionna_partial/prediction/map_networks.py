@@ -1,4 +1,4 @@
-"""The networks that read maps and paths, as Keras 3 models: two map networks and a link network, and their training.
+"""The networks that read maps and paths, as Keras 3 models: their inputs, two map networks, a link network, training.
 
 The map networks read the windows around the transmitter, near and far, and write `MAP_FEATURES` numbers into each of
 their cells: U-Nets (Ronneberger, Fischer and Brox 2015), a smaller one for the far window. What they make of an empty
@@ -13,6 +13,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,9 +23,15 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.features import LinkContext, LinkFeatures, context_of, excess_noise
-from sionna_partial.prediction.inputs import LINK_INPUTS, feature_values, free_space_gain_db, link_inputs
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras, layer, tf
+from sionna_partial.prediction.features import (
+    ATTENUATION_LENGTHS_M,
+    LinkContext,
+    LinkFeatures,
+    context_of,
+    excess_noise,
+    shifted_gain_db,
+)
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
 from sionna_partial.prediction.unobserved import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
 from sionna_partial.settings import NetworkKind, PredictorSettings
 
@@ -75,6 +82,71 @@ _REPORT_STEPS = 50
 
 _log = logging.getLogger(__name__)
 
+_LOG_NEAREST_M = 0.1
+_SCALE_M, _SCALE_DB, _EXCESS_DB = 3.0, 100.0, 30.0
+
+FEATURES: dict[str, tuple[str, ...]] = {
+    "link_state": ("partial_link_state",),
+    "gain_db": ("partial_gain_db",),
+    **{name: (name,) for name in ("unobserved_distance_m", "distance_m")},
+    "indirect_gain_db": tuple(f"indirect_gain_reach_{length_m:g}_m_db" for length_m in ATTENUATION_LENGTHS_M),
+    **{name: (name,) for name in ("strongest_unobserved_m", "straight_gain_db", "straight_walls", "wall_loss_db")},
+    **dict.fromkeys(("tx_seen", "rx_seen", "possible", "walled_m"), ()),
+}
+"""Features of links, by their names in `LinkFeatures` or `LinkContext`, that networks, the mean loss of walls and
+multi-wall models read, and their columns in the order that data sets have them. Those without columns follow from the
+map and the positions."""
+
+Values = Mapping[str, Any]
+"""Features by name; `free_db`, the gain of free space, and `near_m`, the distance but at least 10 cm."""
+
+Make = Callable[[Values, ModuleType], Any]
+
+
+def _is_state(state: LinkState) -> Make:
+    return lambda of, ops: 1.0 * (of["link_state"] == state)
+
+
+def _flag(name: str, column: int | None = None) -> Make:
+    return lambda of, ops: 1.0 * (of[name] if column is None else of[name][:, column])
+
+
+def _log_length(length_m: Callable[[Values], Any]) -> Make:
+    return lambda of, ops: ops.log(1.0 + length_m(of) / _SCALE_M)
+
+
+def _gain(gain_db: Callable[[Values], Any]) -> Make:
+    return lambda of, ops: (gain_db(of) - GAIN_FLOOR_DB) / _SCALE_DB
+
+
+def _excess(gain_db: Callable[[Values], Any]) -> Make:
+    return lambda of, ops: ops.clip((gain_db(of) - of["free_db"]) / _EXCESS_DB, -2.0, 0.5)
+
+
+_INDIRECT: dict[str, Callable[[Values], Any]] = {
+    f"indirect_{length_m:g}": lambda of, column=column: of["indirect_gain_db"][:, column]  # type: ignore[misc]
+    for column, length_m in enumerate(ATTENUATION_LENGTHS_M)
+}
+
+LINK_INPUTS: dict[str, Make] = {
+    **{state.name.lower(): _is_state(state) for state in LinkState},
+    "tx_seen": _flag("tx_seen"),
+    "rx_seen": _flag("rx_seen"),
+    **{f"{state.name.lower()}_possible": _flag("possible", state) for state in LinkState},
+    "walled": lambda of, ops: ops.minimum(of["walled_m"], 1.0),
+    "log_distance": lambda of, ops: ops.log(of["near_m"]),
+    "unobserved_fraction": lambda of, ops: of["unobserved_distance_m"] / of["near_m"],
+    "distance": _log_length(lambda of: of["distance_m"]),
+    "unobserved": _log_length(lambda of: of["unobserved_distance_m"]),
+    "observed": _log_length(lambda of: of["distance_m"] - of["unobserved_distance_m"]),
+    "strongest_unobserved": _log_length(lambda of: of["strongest_unobserved_m"]),
+    "gain": _gain(lambda of: of["gain_db"]),
+    "free_gain": _gain(lambda of: of["free_db"]),
+    **{name: _gain(gain_db) for name, gain_db in _INDIRECT.items()},
+    "gain_above_free": _excess(lambda of: of["gain_db"]),
+    **{f"{name}_above_free": _excess(gain_db) for name, gain_db in _INDIRECT.items()},
+}
+"""The inputs of the link network in their order, without units: how each is made of features."""
 
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
 _LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
@@ -88,6 +160,37 @@ CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
     },
 )
 """Inputs and outputs of the networks that a predictor may have in addition to the paper's: none, "paths", or "map"."""
+
+
+def feature_values(phi: LinkFeatures) -> dict[str, Any]:
+    """Return all features of links, which have a context, by name."""
+    return {name: getattr(phi if hasattr(phi, name) else phi.context, name) for name in FEATURES}
+
+
+def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleType = np) -> Any:
+    """Return the inputs (N, len(LINK_INPUTS)) of the link network of a frequency.
+
+    `values` are from `feature_values`, or tensors in their place; `ops` is NumPy, or keras.ops for tensors. Free space
+    is stronger by `shift_db` at that frequency than at the frequency of the links.
+    """
+    gains_db = {name: shifted_gain_db(values[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
+    free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops)
+    near_m = ops.maximum(values["distance_m"], _LOG_NEAREST_M)
+    of = {**values, **gains_db, "free_db": free_db, "near_m": near_m}
+    return ops.stack([make(of, ops) for make in LINK_INPUTS.values()], axis=1)
+
+
+def columns_of(phi: LinkFeatures) -> dict[str, Floats]:
+    """Return the columns (N,) that data sets have of links, which have a context."""
+    values = feature_values(phi)
+    stored = ((columns, np.atleast_2d(values[name].T)) for name, columns in FEATURES.items() if columns)
+    return {name: column for columns, rows in stored for name, column in zip(columns, rows, strict=True)}
+
+
+def features_of_columns(columns: Mapping[str, Floats]) -> dict[str, Any]:
+    """Return the features by name that such columns hold."""
+    stored = {name: [columns[column] for column in own] for name, own in FEATURES.items() if own}
+    return {name: np.column_stack(values) if len(values) > 1 else values[0] for name, values in stored.items()}
 
 
 def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:

@@ -22,23 +22,23 @@ from scipy.optimize import minimize
 from scipy.special import log_softmax
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.prediction.features import LinkFeatures, shifted_gain_db
-from sionna_partial.prediction.inputs import (
-    GAIN_INPUTS,
-    INDOOR_INPUTS,
-    NEAREST_M,
-    STATE_INPUTS,
-    free_space_gain_db,
-    gain_at_1m_db,
-)
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
     import keras
+
+NEAREST_M = 0.01
+"""Distance below which the gain of free space rises no more [m]."""
+
+STATE_INPUTS = ("distance_m", "unobserved_distance_m")
+GAIN_INPUTS = (*STATE_INPUTS, "gain_db")
+INDOOR_INPUTS = ("unobserved_distance_m",)
+"""Unscaled inputs of the paper's networks; the link state of the partial trace selects the network."""
 
 STD_RANGE_DB = (0.3, 40.0)
 """Range of the standard deviation that a gain network can give [dB]."""
@@ -53,6 +53,16 @@ _INDOORS = 20.0
 _log = logging.getLogger(__name__)
 
 Ranges = Mapping[str, tuple[float, float]]
+
+
+def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
+    """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
+    return gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
+
+
+def gain_at_1m_db(frequency_hz: float) -> float:
+    """Return the same at 1 m [dB]."""
+    return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 
 @dataclass(frozen=True)

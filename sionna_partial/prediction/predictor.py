@@ -29,7 +29,6 @@ from sionna_partial.prediction.features import (
     link_states,
     require_each,
 )
-from sionna_partial.prediction.inputs import free_space_gain_db
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MapReader,
@@ -44,6 +43,7 @@ from sionna_partial.prediction.paper_networks import (
     evaluate_paper,
     fit_indoor_networks,
     fit_networks,
+    free_space_gain_db,
     import_keras,
     network_ranges,
     parts,
@@ -148,20 +148,15 @@ class LinkPrediction(Shown):
         return self._materials or ((self,), np.ones(1))
 
     @classmethod
-    def over_materials(
-        cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float = 0.0
-    ) -> LinkPrediction:
+    def over_materials(cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float) -> LinkPrediction:
         """Return the mixture over candidates for the material of walls, which is remembered.
 
         `residual_db` is the standard deviation of gains about the trace with the true material [dB].
         """
-        mixed = cls.mixture(parts, weights)
-        if residual_db:
-            probabilities, means_db, stds_db = mixed.by_state
-            stds_db[1:] = np.hypot(stds_db[1:], residual_db)
-            mixed = cls.of_parts(probabilities, means_db, stds_db)
-        if len(parts) > 1:
-            object.__setattr__(mixed, "_materials", (tuple(parts), weights))
+        probabilities, means_db, stds_db = cls.mixture(parts, weights).by_state
+        stds_db[1:] = np.hypot(stds_db[1:], residual_db)
+        mixed = cls.of_parts(probabilities, means_db, stds_db)
+        object.__setattr__(mixed, "_materials", (tuple(parts), weights))
         return mixed
 
     def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
@@ -731,7 +726,7 @@ def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
 
 
 def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
-    path, name = predictor_path(name_or_path), None if name_or_path is None else str(name_or_path)
+    path, name = predictor_path(name_or_path), SHIPPED[0] if name_or_path is None else str(name_or_path)
     try:
         files = [each.stat() for each in (path, path.with_suffix(".json"))]
     except (OSError, ValueError):
@@ -740,7 +735,7 @@ def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
 
 
 @lru_cache(maxsize=4)
-def _read_once(name: str | None, *identity: object) -> Predictor:
+def _read_once(name: str, *identity: object) -> Predictor:
     return Predictor.load(name)
 
 

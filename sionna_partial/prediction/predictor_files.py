@@ -18,9 +18,8 @@ import numpy as np
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes, temporary_folder, unzipped
-from sionna_partial.prediction.inputs import GAIN_INPUTS
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
-from sionna_partial.prediction.paper_networks import OUTPUT_WIDTHS, import_keras, own_input
+from sionna_partial.prediction.paper_networks import GAIN_INPUTS, OUTPUT_WIDTHS, import_keras, own_input
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 if TYPE_CHECKING:

@@ -36,8 +36,12 @@ CROSSINGS, LARGEST_DB, REFLECTIONS_DB = 8, (21.0, 40.0), (0.0, 3.0)
 BELOW = 1.3
 """Ratio of the smallest mean loss of the common materials to the smallest loss that is compared."""
 
-RESIDUAL_DB = 6.0
-"""Standard deviation of measured powers about a trace with the best material and offset: what maps lack [dB]."""
+LIKELY_STD_DB, LIKELY_FADING_DB = 5.0, 3.0
+"""Most probable standard deviations of measured powers about a trace with the best material and offset [dB]: of a
+spatial process, for furniture, doors and people that maps lack, and of fading (`benchmarks/reality.py`)."""
+
+RESIDUAL_DB = math.hypot(LIKELY_STD_DB, LIKELY_FADING_DB)
+"""Standard deviation of gains about a trace before any measurement [dB]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +82,10 @@ class WallMaterials:
         names = tuple([*COMMON][at] for at in np.tile(np.abs(apart).argmin(axis=1), len(REFLECTIONS_DB)))
         return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
 
-    def under(self, phi: LinkFeatures) -> list[LinkFeatures]:
-        """Return the features of links under each candidate."""
+    def under(self, phi: LinkFeatures, fraction: float = 1.0) -> list[LinkFeatures]:
+        """Return the features of links under each candidate, for that `fraction` of the walls of the map."""
         pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
-        return [phi.with_extra_losses(*pair) for pair in pairs]
+        return [phi.with_extra_losses(*pair, fraction) for pair in pairs]
 
     def attributes(self, weights: Floats) -> dict[str, str | float]:
         """Return the attributes of a coverage map: the materials as a text, and the mean loss of a wall [dB]."""

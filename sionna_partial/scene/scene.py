@@ -155,7 +155,9 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
 
 
 def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
-    """Return whether neither the settings nor the map name a material of walls."""
+    """Return whether neither the settings nor the map name the material of some walls; meshes name all or none."""
+    if partial.mesh is None:
+        return settings.material is None and partial.unnamed_walls > 0.0
     named = partial.environment.known_materials(_NO_MATERIAL) != {_NO_MATERIAL}
     return settings.material is None and partial.material is None and not named
 

@@ -455,11 +455,11 @@ class LinkSums:
         power: Floats = self.path_power.sum(axis=(1, 2))
         return power
 
-    def add(self, paths: SolvedPaths) -> None:
-        """Add some of the paths."""
+    def add(self, paths: SolvedPaths, counted: Bools | bool = True) -> None:
+        """Add some of the paths; walls and reflections count where `counted` (P, D) is True."""
         link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
         counts = (
-            np.minimum(np.count_nonzero(paths.interactions == kind, axis=1), most - 1)
+            np.minimum(np.count_nonzero((paths.interactions == kind) & counted, axis=1), most - 1)
             for kind, most in zip((REFRACTION, REFLECTION), self.path_power.shape[1:], strict=True)
         )
         np.add.at(self.path_power, (link, *counts), paths.power)

@@ -247,7 +247,7 @@ class DiffractionCandidates(_EdgeCandidates):
             return
         plan, room, edges = self._geometry.plan, self._building.room, self._edges
         receivers, walls = bin_points(room.rx_m[:, :2]), np.array([self._walls_a_side])
-        tree_and_pairs = trace_beams(plan, bin_points(edges.position_m), room.tx_m[None, :2], walls)
+        tree_and_pairs = trace_beams(self._building, bin_points(edges.position_m), room.tx_m[None, :2], walls)
         arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
         reached = np.flatnonzero(np.diff(arrivals.start))
         groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
@@ -256,7 +256,7 @@ class DiffractionCandidates(_EdgeCandidates):
             group = groups[number]
             fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
             onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-            tree, pairs = trace_beams(plan, receivers, edges.position_m[group], onward)
+            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward)
             task = _EdgeTask(tree, pairs, group, edges, arrivals, self._building, self._reflections)
             pair, joined, bound, unlisted = _list_joined(task, _NEGLIGIBLE * found, trail_of(plan))
             write = partial(self._written, task, pair, joined)

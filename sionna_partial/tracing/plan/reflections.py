@@ -7,7 +7,7 @@ between opaque walls have an upper bound for any polarisation, paths through wal
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,16 +19,7 @@ from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.beams import (
-    BeamTree,
-    CrossingBeams,
-    Task,
-    first_beams,
-    first_pairs,
-    follow_beams,
-    needed_of,
-    trace_beams,
-)
+from sionna_partial.tracing.plan.beams import Beams, BeamTree, Task, follow, needed_of, trace_beams
 from sionna_partial.tracing.plan.room import (
     FACES,
     Building,
@@ -68,8 +59,8 @@ _VARIANTS = 6
 _LISTED_AT_ONCE = 200_000
 """Number of pairs of a sequence of opaque walls and a receiver that are listed together, which limits the memory."""
 
-_BEAMS_AT_ONCE, _PAIRS_AT_ONCE = 256, 5_000
-"""Number of beams and number of pairs that one thread works on at a time."""
+_PAIRS_AT_ONCE = 5_000
+"""Number of pairs that one thread works on at a time."""
 
 
 @njit(cache=True)
@@ -157,7 +148,7 @@ class SpecularCandidates:
     def listed(self, found: Floats, *, pairs_at_once: int = _LISTED_AT_ONCE) -> Iterator[Listed]:
         """List the candidates; none is negligible."""
         room, plan, depth = self._building.room, self._building.plan, self._building.limits.depth
-        tree, pairs = trace_beams(plan, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
+        tree, pairs = trace_beams(self._building, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
         for start in range(0, len(pairs), pairs_at_once):
             some = pairs[start : start + pairs_at_once]
             pair, variant, bound = _list_variants(tree, some, self._building, trail_of(plan))
@@ -346,38 +337,21 @@ class CrossingCandidates:
         The paths of few reflections decide how strong paths of more have to be.
         """
         room, limits, count = self.building.room, self.building.limits, len(found)
-        receivers, beams = bin_points(room.rx_m[:, :2]), first_beams(room)
-        tree, first = BeamTree(beams.parent, beams.piece, beams.window[:, :2].copy()), 0
-        straight = np.stack([np.zeros(count, np.int32), np.arange(count, dtype=np.int32)], axis=1)
-        listed = [self._paths(tree, straight, np.ones(count), np.zeros(count))]
+        receivers, reflections = bin_points(room.rx_m[:, :2]), np.array([limits.reflections])
+        beams = Beams.first(room.tx_m[None, :2], reflections, room.gains.largest)
+        tree, straight = BeamTree.of(beams), np.arange(count, dtype=np.int32)
+        pair = np.stack([np.zeros_like(straight), straight], axis=1)
+        listed = [self._paths(tree, pair, np.ones(count), np.zeros(count))]
         total = found + listed[0].sums(count)
         transmitted = float(self.building.materials.most_transmitted.max(initial=0.0))
-        for order in range(limits.reflections + 1):
+        for _ in range(limits.reflections + 1):
             weakest = limits.min_power(total)
             needed = needed_of(weakest, room, self.building.materials.wavelength_m)
-            task = Task(order, receivers, self.building, needed, transmitted)
-            reflected, pair, through = self._followed(beams, task)
-            new = first_pairs(np.unique(beams.sequence, return_inverse=True)[1], pair, count)
-            pair = pair[new] + np.array([first, 0], np.int32)
-            listed.append(self._paths(tree, pair, through[new], weakest))
+            beams, pair, through = follow(tree, beams, Task(receivers, self.building, needed, transmitted))
+            listed.append(self._paths(tree, pair, through, weakest))
             total += listed[-1].sums(count)
-            first, beams = len(tree.parent), reflected._replace(parent=reflected.parent + np.int32(first))
-            parent, piece = np.append(tree.parent, beams.parent), np.append(tree.piece, beams.piece)
-            tree = BeamTree(parent, piece, np.concatenate([tree.source_m, beams.window[:, :2]]))
+            tree = tree.extended(beams)
         return tree, _Paths(*(np.concatenate(column) for column in zip(*listed, strict=True)))
-
-    def _followed(self, beams: CrossingBeams, task: Task) -> tuple[CrossingBeams, NDArray[np.int32], Floats]:
-        """Follow beams: return the beams that walls reflect, pairs (K, 2), and bounds of the power after walls (K,)."""
-
-        def followed(first: int) -> tuple[Any, ...]:
-            stop = min(first + _BEAMS_AT_ONCE, len(beams.parent))
-            return follow_beams(beams, first, stop, task)  # type: ignore[no-any-return]
-
-        nothing = (tuple(column[:0] for column in beams), np.zeros((0, 2), np.int32), np.zeros(0))
-        parts = [nothing, *in_order(followed, range(0, len(beams.parent), _BEAMS_AT_ONCE))]
-        children, pair, through = zip(*parts, strict=True)
-        reflected = CrossingBeams(*(np.concatenate(column) for column in zip(*children, strict=True)))
-        return reflected, np.concatenate(pair), np.concatenate(through)
 
     def _paths(self, tree: BeamTree, pair: NDArray[np.int32], through: Floats, needed: Floats) -> _Paths:
         """Find the paths of pairs (beam, receiver) of which walls leave no more than `through` (K,)."""

@@ -70,8 +70,9 @@ class Room(NamedTuple):
         """Take it from a scene, whose faces have these materials."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
-        materials = material_of_face[: 2 * len(geometry.segments) : 2], of_flats
-        return cls(float(geometry.height_m), *flats, tx_m, rx_m, *materials, geometry.top_m, gains)
+        # Contiguous: numba compiles for each layout.
+        of_walls = material_of_face[: 2 * len(geometry.segments) : 2].copy()
+        return cls(float(geometry.height_m), *flats, tx_m, rx_m, of_walls, of_flats, geometry.top_m, gains)
 
 
 class Building(NamedTuple):

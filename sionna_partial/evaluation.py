@@ -19,7 +19,7 @@ from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.inputs import free_space_gain_db
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings

@@ -39,19 +39,22 @@ from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of, link_features
-from sionna_partial.prediction.inputs import GAIN_INPUTS, feature_values, free_space_gain_db, link_inputs
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
     distribution,
+    feature_values,
+    link_inputs,
     read_links,
     read_maps,
     reads_maps,
 )
 from sionna_partial.prediction.paper_networks import (
+    GAIN_INPUTS,
     GAIN_NETWORKS,
     STATE_NETWORKS,
     distribution_by_paper,
+    free_space_gain_db,
     import_keras,
     parts,
     tf,
@@ -66,10 +69,12 @@ from sionna_partial.prediction.unobserved import (
     map_windows,
     segment_between,
 )
+from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.process import njit
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
-from sionna_partial.tracing.path_set import PARAMETERS, PathSet
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathSet
 from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
@@ -263,8 +268,8 @@ class DifferentiableScene:
         Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls on complete maps, and on
         others with a predictor that was trained on such paths.
     scene_settings : SceneSettings, optional
-        Where the material of walls is unknown, they are of drywall here: the distribution is not averaged over
-        materials. Give the material that the measurements show, as the attribute `wall_material` of a coverage map.
+        Where the material of walls is unknown, complete links are averaged over its candidates before any measurement,
+        as by `LinkModel`, unless a call gives constants of materials.
 
     Raises
     ------
@@ -409,7 +414,10 @@ class DifferentiableLinks:
         power, vertices_m = moved_paths(self._paths, given)
         gain_db = _gain_db(self._sum(power, self._paths.path_rx))
         states = tf.cast([self._phi.link_state == state for state in LinkState], tf.float64)
-        trace = states, tf.stack([gain_db] * len(LinkState)), tf.zeros_like(states)
+        mean_db, std_db = gain_db, tf.zeros_like(gain_db)
+        if self._scene.simulation.trace_settings.through_walls:
+            mean_db, std_db = self._over_materials(power, given)
+        trace = states, tf.stack([mean_db] * len(LinkState)), tf.stack([std_db] * len(LinkState))
         complete = context_of(self._phi).complete
         if complete.all():
             return LinkDistribution.of_parts(*trace, ops=ops)
@@ -446,6 +454,21 @@ class DifferentiableLinks:
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
         """Sum (N,) over the paths to each receiver."""
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
+
+    def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
+        """Return mean and standard deviation (N,) of the traced gain over unknown materials and residuals [dB]."""
+        extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
+        if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
+            materials = WallMaterials.at(float(self.base.frequency_hz))
+            counted = ~self._scene.partial.at_named_walls(paths.vertices_m)
+            walls, reflections = (
+                np.count_nonzero((paths.interactions == kind) & counted, axis=1) for kind in (REFRACTION, REFLECTION)
+            )
+            extra_db = np.outer(materials.crossing_db, walls) + np.outer(materials.reflection_db, reflections)
+            prior = materials.prior
+        gains_db = tf.stack([_gain_db(self._sum(power * kept, paths.path_rx)) for kept in 10.0 ** (-extra_db / 10.0)])
+        mean_db = tf.tensordot(prior, gains_db, 1)
+        return mean_db, tf.sqrt(tf.tensordot(prior, (gains_db - mean_db) ** 2, 1) + RESIDUAL_DB**2)
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the gain, and what derives from the transmitter position alone, None being where it was."""

@@ -1,1 +1,0 @@
-"""The prediction as TensorFlow functions of transmitter and walls."""

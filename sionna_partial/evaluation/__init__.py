@@ -1,1 +1,0 @@
-"""Figures of merit, baselines and the evaluation of predictors."""

@@ -1,0 +1,305 @@
+"""Walls clipped to a beam: the part of each wall that is in it, its windows, and the points in a part of it.
+
+Coordinates inside a beam are explained in `beams.py`.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sionna_partial.arrays import Floats, span_in_strip
+from sionna_partial.process import njit
+from sionna_partial.scene.outlines import grow
+
+TOLERANCE_M = 1e-4
+"""Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
+checks the candidates computes in single precision."""
+
+_STRIP_CELLS = 6.0
+"""Depth of the strips in which a narrow beam is searched for walls [cells of the index]."""
+
+_FAR_M = 1e6
+"""Length at which beams that hit nothing are cut off [m]. It is fixed, so that no receiver depends on the others."""
+
+THINNEST = 1e-12
+"""Part of a beam's width below which nothing lies between two edges."""
+
+
+class Clipped(NamedTuple):
+    """Arrays that one beam after the other is worked out in; `visit` ends with the number of the present beam.
+
+    Of the walls clipped to a beam, `found` (C, 4) are the parts (t0, 1 / r0, t1, 1 / r1), `wall` (C,) the pieces, and
+    `order` sorts them by t0. `active` are the walls at a t, and `edge` the sorted ends.
+    """
+
+    found: Floats
+    wall: NDArray[np.int32]
+    order: NDArray[np.int32]
+    active: NDArray[np.int32]
+    edge: Floats
+    visit: NDArray[np.int64]
+
+
+@njit(cache=True)
+def scratch_of(plan):  # type: ignore[no-untyped-def]
+    """Make scratch for the walls in one beam."""
+    size = len(plan.pieces_m)
+    wall, order, active = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
+    return Clipped(np.empty((size, 4)), wall, order, active, np.empty(2 * size + 2), np.zeros(size + 1, np.int64))
+
+
+@njit(cache=True)
+def _clip(beam, wall, reflected):  # type: ignore[no-untyped-def]
+    """Return the part of a wall inside a beam and beyond its window, as (t0, w0, t1, w1) with w = 1 / r and t0 < t1.
+
+    t0 >= t1 if there is none.
+    """
+    ax, ay = beam[2] - beam[0], beam[3] - beam[1]
+    bx, by = beam[4] - beam[0], beam[5] - beam[1]
+    area = ax * by - ay * bx
+    px, py = wall[0, 0] - beam[0], wall[0, 1] - beam[1]
+    qx, qy = wall[1, 0] - beam[0], wall[1, 1] - beam[1]
+    alpha0, beta0 = (px * by - py * bx) / area, (ax * py - ay * px) / area
+    alpha1, beta1 = (qx * by - qy * bx) / area, (ax * qy - ay * qx) / area
+    nearest = 1.0 + 1e-9 if reflected else 1e-9
+    low, high = 0.0, 1.0
+    for start, stop in ((alpha0, alpha1), (beta0, beta1), (alpha0 + beta0 - nearest, alpha1 + beta1 - nearest)):
+        if start < 0.0 and stop < 0.0:
+            return 1.0, 0.0, 0.0, 0.0
+        if start < 0.0:
+            low = max(low, start / (start - stop))
+        elif stop < 0.0:
+            high = min(high, start / (start - stop))
+    if low >= high:
+        return 1.0, 0.0, 0.0, 0.0
+    r0 = alpha0 + beta0 + low * (alpha1 + beta1 - alpha0 - beta0)
+    r1 = alpha0 + beta0 + high * (alpha1 + beta1 - alpha0 - beta0)
+    t0 = (beta0 + low * (beta1 - beta0)) / r0
+    t1 = (beta0 + high * (beta1 - beta0)) / r1
+    if t0 < t1:
+        return t0, 1.0 / r0, t1, 1.0 / r1
+    return t1, 1.0 / r1, t0, 1.0 / r0
+
+
+@njit(cache=True)
+def clip_nearest(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
+    """Clip the walls in a beam, from its window outwards, until they hide everything beyond them; return their number.
+
+    Cells of the index are visited in strips across the beam. Other cells lie beyond all strips, so that walls that fill
+    the whole view within the strips hide them.
+    """
+    x0, y0, edge, columns, rows = plan.cells.grid
+    x1, y1 = x0 + columns * edge, y0 + rows * edge
+    sx, sy = beam[0], beam[1]
+    ax, ay, bx, by = beam[2] - sx, beam[3] - sy, beam[4] - sx, beam[5] - sy
+    length, width = 0.5 * (np.hypot(ax, ay) + np.hypot(bx, by)), np.hypot(ax - bx, ay - by)
+    corner = np.empty((4, 2))
+    near, count = 1.0 if own >= 0 else 0.0, np.int64(0)
+    while True:
+        far = near + max(_STRIP_CELLS * edge, near * width) / length
+        for k, (r, dx, dy) in enumerate(((near, ax, ay), (near, bx, by), (far, bx, by), (far, ax, ay))):
+            corner[k, 0], corner[k, 1] = sx + r * dx, sy + r * dy
+        if _leaves(corner, x0 - edge, x1 + edge, 0, ax, bx) or _leaves(corner, y0 - edge, y1 + edge, 1, ay, by):
+            return count
+        count = clip_cells(plan, beam, own, corner, count, scratch)
+        if _is_filled(plan.low, scratch, count, far):
+            return count
+        near = far
+
+
+@njit(cache=True)
+def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-def]
+    """Return whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
+    return (min(corner[0, axis], corner[1, axis]) > high and min(first, second) >= 0.0) or (
+        max(corner[0, axis], corner[1, axis]) < low and max(first, second) <= 0.0
+    )
+
+
+@njit(cache=True)
+def clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-untyped-def]
+    """Clip the walls in the cells of a strip that were not clipped before; return the number of all clipped walls."""
+    visit = scratch.visit[-1]
+    first, last = rows_in(corner, plan.cells)
+    for row in range(first, last):
+        begin, end = entries_in(corner, plan.cells, row)
+        for entry in range(begin, end):
+            wall = plan.cells.piece[entry]
+            if scratch.visit[wall] == visit:
+                continue
+            scratch.visit[wall] = visit
+            if own >= 0 and plan.line[wall] == plan.line[own]:
+                continue
+            t0, w0, t1, w1 = _clip(beam, plan.pieces_m[wall], own >= 0)
+            if t1 - t0 > 1e-12:
+                scratch.found[count, 0], scratch.found[count, 1] = t0, w0
+                scratch.found[count, 2], scratch.found[count, 3] = t1, w1
+                scratch.wall[count] = wall
+                k = count
+                while k > 0 and scratch.found[scratch.order[k - 1], 0] > t0:
+                    scratch.order[k] = scratch.order[k - 1]
+                    k -= 1
+                scratch.order[k] = count
+                count += 1
+    return count
+
+
+@njit(cache=True)
+def rows_in(corner, bins):  # type: ignore[no-untyped-def]
+    """Return the first row of square bins that a quadrilateral reaches, and the row after the last."""
+    y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
+    low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
+    high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
+    return max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)
+
+
+@njit(cache=True)
+def entries_in(corner, bins, row):  # type: ignore[no-untyped-def]
+    """Return the first entry of the bins of a row that a convex quadrilateral reaches, and the entry after the last."""
+    x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
+    left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
+    if left > right:
+        return 0, 0
+    start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+    stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+    return (bins.start[row * columns + start], bins.start[row * columns + stop + 1]) if start <= stop else (0, 0)
+
+
+@njit(cache=True)
+def _is_filled(low, scratch, count, far):  # type: ignore[no-untyped-def]
+    """Return whether walls no farther than `far` that are not low fill the whole view."""
+    reach = 1e-12
+    for k in range(count):
+        i = scratch.order[k]
+        if low[scratch.wall[i]]:
+            continue
+        if scratch.found[i, 0] > reach:
+            return False
+        if min(scratch.found[i, 1], scratch.found[i, 3]) * far >= 1.0:
+            reach = max(reach, scratch.found[i, 2] + 1e-12)
+            if reach >= 1.0:
+                return True
+    return False
+
+
+@njit(cache=True)
+def _sort(values, count):  # type: ignore[no-untyped-def]
+    """Sort the first `count` values in place (Shell 1959); `np.sort` takes a second to compile."""
+    gap = 1
+    while 3 * gap + 1 < count:
+        gap = 3 * gap + 1
+    while gap > 0:
+        for i in range(gap, count):
+            value, k = values[i], i
+            while k >= gap and values[k - gap] > value:
+                values[k] = values[k - gap]
+                k -= gap
+            values[k] = value
+        gap //= 3
+
+
+@njit(cache=True)
+def sort_edges(found, edge, count):  # type: ignore[no-untyped-def]
+    """Write the sorted ends of the clipped walls, and of the beam."""
+    edge[0], edge[1] = 0.0, 1.0
+    for i in range(count):
+        edge[2 * i + 2], edge[2 * i + 3] = min(max(found[i, 0], 0.0), 1.0), min(max(found[i, 2], 0.0), 1.0)
+    _sort(edge, 2 * count + 2)
+
+
+@njit(cache=True)
+def move_to(t, found, order, active, count, begun, number):  # type: ignore[no-untyped-def]
+    """Update the walls that are active at a larger t; return the numbers of walls begun and active."""
+    while begun < count and found[order[begun], 0] <= t:
+        active[number] = order[begun]
+        begun, number = begun + 1, number + 1
+    kept = 0
+    for k in range(number):
+        if found[active[k], 2] >= t:
+            active[kept] = active[k]
+            kept += 1
+    return begun, kept
+
+
+@njit(cache=True)
+def reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
+    """Write the beam reflected in a piece (t0, 1 / r0, t1, 1 / r1) of its view; return False if it is too thin."""
+    sx, sy = beam[0], beam[1]
+    for k in range(2):  # the ends change places
+        t, w = piece[2 - 2 * k], piece[3 - 2 * k]
+        child[2 + 2 * k] = sx + ((1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)) / w
+        child[3 + 2 * k] = sy + ((1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)) / w
+    dx, dy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
+    away = (dx * (sy - wall[0, 1]) - dy * (sx - wall[0, 0])) / (dx * dx + dy * dy)
+    child[0], child[1] = sx + 2.0 * away * dy, sy - 2.0 * away * dx
+    if np.hypot(child[2] - child[4], child[3] - child[5]) < 1e-9 or abs(away) * np.hypot(dx, dy) < 1e-9:
+        return False
+    ax, ay, bx, by = child[2] - child[0], child[3] - child[1], child[4] - child[0], child[5] - child[1]
+    return ax * by - ay * bx > 1e-15  # the source is in front of the window, and not on it
+
+
+@njit(cache=True)
+def cone_of(beam, reflected, grid, rows):  # type: ignore[no-untyped-def]
+    """Return the corners (4, 2) of a beam from its window, or its source if it is a root, to beyond a grid."""
+    x0, y0, x1, y1 = grid[0], grid[1], grid[0] + grid[3] * grid[2], grid[1] + rows * grid[2]
+    far = np.hypot(max(abs(beam[0] - x0), abs(beam[0] - x1)), max(abs(beam[1] - y0), abs(beam[1] - y1)))
+    corner = np.empty((4, 2))
+    near = 1.0 if reflected else 0.0
+    for e in range(2):
+        dx, dy = beam[2 + 2 * e] - beam[0], beam[3 + 2 * e] - beam[1]
+        scale = max(1.0, 2.0 * far / max(np.hypot(dx, dy), 1e-9))
+        corner[e, 0], corner[e, 1] = beam[0] + near * dx, beam[1] + near * dy
+        corner[3 - e, 0], corner[3 - e, 1] = beam[0] + scale * dx, beam[1] + scale * dy
+    return corner
+
+
+@njit(cache=True)
+def corners_of(beam, reflected, piece):  # type: ignore[no-untyped-def]
+    """Return the corners (4, 2) of a beam between its window and one piece of its view, cut off where it is far."""
+    sx, sy = beam[0], beam[1]
+    corner = np.empty((4, 2))
+    for k in range(2):
+        t, w = piece[2 * k], piece[2 * k + 1]
+        dx = (1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)
+        dy = (1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)
+        far = _FAR_M / np.hypot(dx, dy)
+        r_far = 1.0 / w if w * far > 1.0 else far
+        r_near = 1.0 if reflected else 0.0
+        corner[k, 0], corner[k, 1] = sx + r_near * dx, sy + r_near * dy
+        corner[3 - k, 0], corner[3 - k, 1] = sx + r_far * dx, sy + r_far * dy
+    return corner
+
+
+@njit(cache=True)
+def _inward_edges(corner):  # type: ignore[no-untyped-def]
+    """Return unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
+    normal, offset = np.empty((4, 2)), np.empty(4)
+    for k in range(4):
+        normal[k, 0], normal[k, 1], offset[k] = 0.0, 0.0, -1.0
+        dx, dy = corner[(k + 1) % 4, 0] - corner[k, 0], corner[(k + 1) % 4, 1] - corner[k, 1]
+        length = np.hypot(dx, dy)
+        if length > 0.0:
+            normal[k, 0], normal[k, 1] = dy / length, -dx / length
+            offset[k] = normal[k, 0] * corner[k, 0] + normal[k, 1] * corner[k, 1]
+    return normal, offset
+
+
+@njit(cache=True)
+def add_points(corner, number, receivers, pair, through, used):  # type: ignore[no-untyped-def]
+    """Pair a beam with the receivers in a part of it with some corners."""
+    points, (normal, offset) = receivers.points_m, _inward_edges(corner)
+    first, last = rows_in(corner, receivers)
+    for row in range(first, last):
+        begin, end = entries_in(corner, receivers, row)
+        for i in range(begin, end):
+            inside = True
+            for k in range(4):
+                side = normal[k, 0] * points[i, 0] + normal[k, 1] * points[i, 1] - offset[k]
+                if side < -TOLERANCE_M:
+                    inside = False
+                    break
+            if inside:
+                pair, through = grow(pair, used + 1), grow(through, used + 1)
+                pair[used, 0], pair[used, 1], through[used] = number, receivers.order[i], 1.0
+                used += 1
+    return pair, through, used
