@@ -1,12 +1,13 @@
-"""Nearly complete maps: homes driven to the end by a lidar of 12 m, where small pockets alone stay unknown.
+"""Nearly complete maps: buildings driven to the end by a lidar, where small pockets alone stay unknown.
 
-Of links whose ends are both seen and that have no line of sight on the map: the error of the trace, of the networks
-alone (the baseline) and of the default predictor, which takes the trace with its measured errors there; with exact
-ranges, and with noise of 3 cm and a drift of 0.2 %. Truth is the trace of the complete building. FOLDER holds complete
-maps, one folder with a map.yaml for each; without it, procedural homes are taken. Run it with
+Of links whose ends are both seen and that have no line of sight on the map: the errors of the trace between the mapped
+walls, of its mean over geometries, of the networks alone and of the default predictor, which takes the mean with its
+measured errors there. Homes have a lidar of 12 m and a drift of 0.2 %, halls and warehouses of at most `MOST_CELLS` one
+of 20 m and, as SLAM closes loops, a drift of 0.02 %. Truth is the trace of the complete building. FOLDER holds complete
+maps, one folder with a map.yaml for each, in place of procedural homes. Run it with
 
-    python benchmarks/nearly_complete.py --homes 8
-    python benchmarks/nearly_complete.py --maps ../shared/gibson --homes 4
+    python benchmarks/nearly_complete.py --homes 8 --halls 8 --warehouses 8
+    python benchmarks/nearly_complete.py --maps ../shared/gibson --homes 4 --halls 0 --warehouses 0
 """
 
 import argparse
@@ -23,9 +24,10 @@ from sionna_partial.evaluation import measure
 from sionna_partial.maps.partial_map import cell_centres_m
 from sionna_partial.prediction.predictor import LinkPrediction
 
-FIRST_SEED = 73_000
-ERRORS = {"exact": {}, "noise": {"range_noise_m": 0.03, "drift_m_per_m": 0.002}}
-TRANSMITTERS, RECEIVERS = 2, 250
+FIRST_SEED = {"home": 73_000, "hall": 73_100, "warehouse": 73_200}
+RANGE_NOISES_CM = (0, 1, 2, 3)
+MOST_CELLS = 250_000
+TRANSMITTERS, RECEIVERS = 2, 160
 HEIGHT_M = 1.5
 
 
@@ -44,38 +46,47 @@ class Links(NamedTuple):
 
 
 def main() -> None:
-    """Print one row of the table for each home, and for all of them."""
+    """Print one row of the table for each building, and for all of a kind."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--maps", type=Path, metavar="FOLDER")
     parser.add_argument("--homes", type=int, default=8)
+    parser.add_argument("--halls", type=int, default=4)
+    parser.add_argument("--warehouses", type=int, default=4)
     arguments = parser.parse_args()
-    models = ("trace", "networks", "predictor")
+    models = ("mapped walls", "mean", "networks", "predictor")
     print(
-        "| home | ranges | nearly complete | links | "
+        "| building | noise [cm] | nearly complete | links | "
         + " | ".join(f"{name}: RMSE, mean std, rms std [dB], in 90 %" for name in models)
         + " |"
     )
     print("|---" * (4 + len(models)) + "|")
-    found: dict[str, list[Links]] = {name: [] for name in ERRORS}
-    for name, home in homes(arguments.maps, arguments.homes):
-        for errors, sensor in ERRORS.items():
-            lidar = sp.SensorSettings(field_of_view_deg=360.0, range_m=12.0, **sensor)
-            partial = sp.explore(home, (0.999,), 0, sensor=lidar)[0]
-            links = links_of(home, partial)
-            print(row(name, errors, "yes" if partial.is_nearly_complete else "no", links), flush=True)
-            found[errors] += [links] if partial.is_nearly_complete else []
-    for errors, parts in found.items():
-        if parts:
-            print(row("**all that are nearly complete**", errors, str(len(parts)), Links.joined(parts)))
+    counts = {"home": arguments.homes, "hall": arguments.halls, "warehouse": arguments.warehouses}
+    for kind, count in counts.items():
+        found: dict[int, list[Links]] = {noise_cm: [] for noise_cm in RANGE_NOISES_CM}
+        range_m, drift = (12.0, 0.002) if kind == "home" else (20.0, 0.0002)
+        for name, building in buildings(kind, count, arguments.maps):
+            for noise_cm in RANGE_NOISES_CM:
+                errors = {"range_noise_m": noise_cm / 100.0, "drift_m_per_m": drift} if noise_cm else {}
+                lidar = sp.SensorSettings(field_of_view_deg=360.0, range_m=range_m, **errors)
+                partial = sp.explore(building, (0.999,), 0, sensor=lidar)[0]
+                links = links_of(building, partial)
+                print(row(name, noise_cm, "yes" if partial.is_nearly_complete else "no", links), flush=True)
+                found[noise_cm] += [links] if partial.is_nearly_complete else []
+        for noise_cm, parts in found.items():
+            if parts:
+                print(row(f"**{kind}: all nearly complete**", noise_cm, str(len(parts)), Links.joined(parts)))
 
 
-def homes(folder: Path | None, count: int) -> Iterator[tuple[str, sp.PartialMap]]:
+def buildings(kind: str, count: int, folder: Path | None) -> Iterator[tuple[str, sp.PartialMap]]:
     """Names and complete maps."""
-    if folder is None:
-        yield from ((f"seed {seed}", sp.make_home(seed)) for seed in range(FIRST_SEED, FIRST_SEED + count))
-    else:
+    if folder is not None and kind == "home":
         for path in sorted(folder.glob("*/map.yaml"))[:count]:
             yield path.parent.name, closed_home(sp.load_map(path), path.parent.name)
+        return
+    for seed in range(FIRST_SEED[kind], FIRST_SEED[kind] + count):
+        building = sp.make_home(seed, None if kind == "home" else kind)
+        if building.state.size <= MOST_CELLS:
+            yield f"{kind} {seed}", building
 
 
 def links_of(home: sp.PartialMap, partial: sp.PartialMap) -> Links:
@@ -87,11 +98,16 @@ def links_of(home: sp.PartialMap, partial: sp.PartialMap) -> Links:
         points_m = cell_centres_m(home, both[rng.choice(len(both), RECEIVERS)])
         tx_m, *rx_m = np.column_stack([points_m, height_m])
         rx_m = np.array(rx_m)[np.linalg.norm(rx_m - tx_m, axis=1) > 0.2]
-        truth, traced = (sp.trace_links(each, tx_m, rx_m) for each in (home, partial))
+        single = sp.SceneSettings(geometries=1)
+        truth, traced, mapped = (
+            sp.trace_links(scene, tx_m, rx_m, scene_settings=settings)
+            for scene, settings in ((home, None), (partial, None), (partial, single))
+        )
         phi = sp.link_features(partial, traced)
         alone = replace(phi, context=replace(phi.context, nearly_complete=np.zeros(len(phi), dtype=bool)))
         models = {
-            "trace": LinkPrediction.of_trace(phi),
+            "mapped walls": LinkPrediction.of_trace(sp.link_features(partial, mapped, windows=False)),
+            "mean": LinkPrediction.of_trace(phi),
             "networks": predictor.predict(alone),
             "predictor": predictor.predict(phi),
         }
@@ -107,9 +123,9 @@ def free_on(partial: sp.PartialMap, home: sp.PartialMap) -> np.ndarray:
     return np.reshape(partial.state_at(cell_centres_m(home, cells)) == sp.CellState.FREE, home.shape)
 
 
-def row(name: str, errors: str, complete: str, links: Links) -> str:
+def row(name: str, noise_cm: int, complete: str, links: Links) -> str:
     """Return one row of the table."""
-    columns = [name, errors, complete, str(len(links.gain_db))]
+    columns = [name, str(noise_cm), complete, str(len(links.gain_db))]
     for prediction in links.models.values():
         found, std_db = measure(prediction, links.link_state, links.gain_db), prediction.gain_std_db
         columns.append(

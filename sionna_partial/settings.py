@@ -204,6 +204,12 @@ class SceneSettings(Checked):
     outline : {"lines", "cells"}
         Position of the walls: few straight lines fitted to the wall cells, or the staircase through the centres of
         the wall cells as they are, for which `bridge_gap_m` does not count.
+    geometries : int or None
+        Number of plausible geometries, 1 to 16, over which powers are averaged: the mapped outlines, and outlines whose
+        vertices are moved at random by 3 cm. They count for links without line of sight on the mapped outlines. None is
+        3 on nearly complete maps with range noise (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1
+        elsewhere. Gradients, channels, meshes, links with a folder and those with a
+        `TraceSettings.power_tolerance_db` always have the mapped outlines.
 
     Raises
     ------
@@ -222,6 +228,7 @@ class SceneSettings(Checked):
     floor_extent: Literal["observed", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
+    geometries: Annotated[int, Within(1, 16)] | None = None
 
     @property
     def traced_material(self) -> Material:

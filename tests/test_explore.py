@@ -19,7 +19,7 @@ from sionna_partial.exploration.explore import Exploration, explore, explore_tra
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LEAST_NOISE
+from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.settings import Fusion, SensorSettings
 from sionna_partial.worlds.homes import make_home
 from sionna_partial.worlds.robot import FORWARD_M, TURN_DEG

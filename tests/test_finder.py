@@ -184,3 +184,45 @@ def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
     assert {word for word in words[0] if "D" in word} == {"D"}
     assert {word for word in words[1] if "D" in word} == {"D", "DR", "RD", "RDR"}
     assert {word for word in words[2] if "D" in word} == {"D", "DR", "RD", "RDR", "DRR", "RRD"}
+
+
+def test_powers_are_averaged_over_geometries(tmp_path: Path) -> None:
+    """A link in sight is as mapped, another has the mean power of the mapped walls and of drawn ones."""
+    plan = _plan()
+    one, three, again = (sp.Simulation(plan, None, sp.SceneSettings(geometries=count)) for count in (1, 3, 3))
+    mapped, mean = one.links(TX, RX), three.links(TX, RX)
+    hidden = mapped.link_state == sp.LinkState.NLOS
+    assert 0 < hidden.sum() < len(RX)
+    np.testing.assert_array_equal(mean.link_state, mapped.link_state)
+    np.testing.assert_array_equal(mean.gain_db[~hidden], mapped.gain_db[~hidden])
+    np.testing.assert_array_equal(mean.gain_db, again.links(TX, RX).gain_db)
+    assert (mean.gain_db != mapped.gain_db)[hidden].all()
+    drawn = [three._finder_of(draw) for draw in (1, 2)]
+    found = [paths for finder in drawn for _, paths in finder.paths(TX, RX, 1, lambda *_: None)]
+    power = 10.0 ** (mapped.gain_db / 10.0)
+    for paths in found:
+        np.add.at(power, paths.path_rx, paths.power)
+    np.testing.assert_allclose(10.0 * np.log10(power[hidden] / 3.0), mean.gain_db[hidden], atol=0.6)
+    for links in (three.paths(TX, RX).links(), three.links(TX, RX, folder=tmp_path / "links")):
+        np.testing.assert_allclose(links.gain_db, mapped.gain_db, atol=0.1)
+    assert three.links(TX, RX).cir().paths.sum() == mapped.cir().paths.sum()
+
+
+@pytest.mark.parametrize(
+    ("noise", "pocket", "settings", "count"),
+    [
+        (1.0, True, sp.TraceSettings(), simulation.GEOMETRIES),
+        (0.0, True, sp.TraceSettings(), 1),
+        (1.0, False, sp.TraceSettings(), 1),
+        (1.0, True, sp.TraceSettings(refraction=True), 1),
+        (1.0, True, sp.TraceSettings(power_tolerance_db=0.1), 1),
+    ],
+)
+def test_geometries_are_drawn_where_a_nearly_complete_map_is_noisy(
+    noise: float, pocket: bool, settings: sp.TraceSettings, count: int
+) -> None:
+    state = _plan().state.copy()
+    state[8:11, 8:11] = sp.CellState.UNKNOWN if pocket else sp.CellState.FREE
+    partial = sp.PartialMap(state, 0.1)
+    vars(partial)["wall_noise"] = noise
+    assert sp.Simulation(partial, settings).resolved.scene_settings.geometries == count

@@ -11,7 +11,8 @@ import sionna_partial as sp
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.evaluation import WITH_INDOOR, Evaluation
-from sionna_partial.prediction.features import LEAST_NOISE, excess_noise
+from sionna_partial.maps.wall_cells import LEAST_NOISE
+from sionna_partial.prediction.features import excess_noise
 from sionna_partial.prediction.map_networks import SEEN_WIDENING, WIDENING
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.resources import scenes_folder

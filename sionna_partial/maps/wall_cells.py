@@ -50,6 +50,9 @@ _DEPTH_M = 0.0125
 Simulated lidars of 1, 2, 3 and 5 cm range noise make 0.002, 0.03, 0.05 and 0.08 m, real robots 0 to 0.08 m.
 """
 
+LEAST_NOISE = 0.05
+"""Noise of walls up to which a map counts as exact: those that were cut out of meshes have as much."""
+
 RAGGED_FACTOR = 2.0
 """Largest distance of a line from ragged walls, in tolerances."""
 

@@ -17,6 +17,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.unobserved import (
     GRAZE,
     draw_windows,
@@ -43,9 +44,6 @@ _PATHS_AT_ONCE = 100_000
 
 SEEN_M = 1e-3
 """Unobserved length below which a path is wholly in observed space [m]."""
-
-LEAST_NOISE = 0.05
-"""Noise of walls up to which a map counts as exact: those that were cut out of meshes have as much."""
 
 _ASIDE_CELLS = 1.5
 """Distance to both sides within which a line must meet a known wall to cross it: the uncertainty of a map [cells]."""

@@ -38,6 +38,10 @@ SIONNA_LOAD_GHZ = 3.5
 """Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
 
 
+VERTEX_STD_M = 0.03
+"""Standard deviation of the vertices of drawn walls, in x and in y [m]."""
+
+
 class _Walls(NamedTuple):
     """Outlines, and of each segment the number of its material (S,) and its height (S,) [m]."""
 
@@ -158,13 +162,16 @@ def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
     return settings.material is None and partial.material is None and not named
 
 
-def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
-    """Turn a map into walls, floor and ceiling."""
+def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw: int = 0) -> SceneGeometry:
+    """Turn a map into walls, floor and ceiling; the vertices of drawn walls, of draw 1 and more, are moved."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
     walls = _walls(partial, settings)
+    vertices_m = walls.outlines.vertices_m
+    if draw:
+        vertices_m = vertices_m + VERTEX_STD_M * np.random.default_rng(draw).standard_normal(vertices_m.shape)
     return SceneGeometry(
-        vertices_m=walls.outlines.vertices_m,
+        vertices_m=vertices_m,
         segments=walls.outlines.segments,
         open_end=_open_ends(partial, walls.outlines),
         wall_material=walls.material,
@@ -261,7 +268,13 @@ def export_scene(
 
 
 def write_map(
-    partial: PartialMap, folder: Path, settings: SceneSettings, *, offset_m: Sequence[float], frequency_hz: float
+    partial: PartialMap,
+    folder: Path,
+    settings: SceneSettings,
+    *,
+    offset_m: Sequence[float],
+    frequency_hz: float,
+    draw: int = 0,
 ) -> tuple[Path, SceneGeometry | SceneMesh]:
     """Write the scene of a map into an existing folder; return its `scene.xml` and its geometry.
 
@@ -274,7 +287,7 @@ def write_map(
             environment, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
         )
         return path, environment
-    geometry = build_scene(partial, settings)
+    geometry = build_scene(partial, settings, draw)
     return write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz), geometry
 
 

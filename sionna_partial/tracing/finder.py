@@ -2,7 +2,7 @@
 
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
+from sionna_partial.display import part_of
 from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import narrow_areas
 from sionna_partial.maps.partial_map import PartialMap
@@ -164,15 +165,44 @@ class RayFinder:
             yield None, paths
 
 
+@dataclass(frozen=True)
+class MeanFinder:
+    """Finds paths between mapped and drawn walls, with powers whose sum is the mean over these geometries.
+
+    Links in sight between the mapped walls have the paths of these; others have no direct path.
+    """
+
+    mapped: ExactFinder | RayFinder
+    drawn: list[ExactFinder | RayFinder]
+
+    def paths(
+        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
+    ) -> Iterator[Found]:
+        """Find the paths as `ExactFinder.paths` does, without candidates."""
+        count = 1 + len(self.drawn)
+        found = list(self.mapped.paths(tx_m, rx_m, polarisations, part_of(report, 0.0, 1.0 / count), antenna))
+        amplitude = np.full(len(rx_m), count**-0.5)
+        for _, paths in found:
+            amplitude[paths.path_rx[paths.is_direct]] = 1.0
+        hidden = np.flatnonzero(amplitude < 1.0).astype(np.int32)
+        for number, finder in enumerate(self.drawn, start=1):
+            part = part_of(report, number / count, (number + 1) / count)
+            for _, paths in finder.paths(tx_m, rx_m[hidden], polarisations, part, antenna):
+                indirect = paths.take(~paths.is_direct)
+                found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
+        for _, paths in found:
+            yield None, replace(paths, transfer=paths.transfer * amplitude[paths.path_rx, None, None])
+
+
 def write_scene_of(
-    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
+    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings, draw: int = 0
 ) -> PlanScene | MeshScene:
     """Write the scene of a map to an existing folder, its origin the lower-left corner of the map.
 
-    Settings come from `resolved_settings`.
+    Settings come from `resolved_settings`, `draw` is as of `build_scene`.
     """
     offset_m, frequency_hz = partial.origin_m, settings.frequency_hz
-    xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz)
+    xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz, draw=draw)
     if isinstance(geometry, SceneMesh):
         shapes = tuple(f"part{index}" for index in range(len(geometry.materials)))
         free = partial.state == CellState.FREE

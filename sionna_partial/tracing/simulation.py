@@ -31,15 +31,22 @@ from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
+from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
-from sionna_partial.tracing.finder import ExactFinder, Found, RayFinder, write_scene_of
+from sionna_partial.tracing.finder import ExactFinder, Found, MeanFinder, RayFinder, write_scene_of
 from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
 from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
+
+GEOMETRIES = 3
+"""Default of `SceneSettings.geometries` on nearly complete maps with range noise."""
+
+DRAWN_TOLERANCE_DB = 0.5
+"""Tolerance of powers between drawn walls [dB]."""
 
 InvalidLinks = Literal["raise", "nan"]
 """Treatment of links that cannot be traced."""
@@ -174,6 +181,7 @@ class Simulation:
                 ends |= self._fill(columns, tx_m, rx_m, valid, part, polarisations)
                 links = TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
                 return links if self.trace_settings.power_tolerance_db is not None else links.of_map(self.partial)
+            settings["scene_settings"] = replace(self.resolved.scene_settings, geometries=1)
             with atomic_files(folder) as files:
                 paths = PathFiles(room[0], files, polarisations)
                 ends |= self._fill(paths, tx_m, rx_m, valid, part, polarisations)
@@ -215,7 +223,8 @@ class Simulation:
         With an antenna, both polarisations are traced, and paths are left out that are weak with it.
         """
         polarisations = 1 if antenna is None else 2
-        for group in self._groups(tx_m[None], rx_m, [np.arange(len(rx_m))], report, polarisations, antenna):
+        every = [np.arange(len(rx_m))]
+        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, averaged=True):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
@@ -284,15 +293,27 @@ class Simulation:
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
         """Return the finder of the paths, with the scene in memory; a warning is logged where only rays do."""
+        return self._finder_of(0)
+
+    @cached_property
+    def _mean_finder(self) -> ExactFinder | RayFinder | MeanFinder:
+        """Return the finder of the paths whose powers are averaged over geometries."""
+        draws = range(1, self.resolved.scene_settings.geometries or 1)
+        return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
+
+    def _finder_of(self, draw: int) -> ExactFinder | RayFinder:
         if self._only_by_rays:
             names = [f"{kind.setting} on a mesh" if kind.exact_on else kind.setting for kind in self._only_by_rays]
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
         with temporary_folder() as folder:
-            scene = write_scene_of(self.partial, folder, *self.resolved)
+            settings, scene_settings = self.resolved
+            if draw:
+                settings = replace(settings, power_tolerance_db=DRAWN_TOLERANCE_DB)
+            scene = write_scene_of(self.partial, folder, settings, scene_settings, draw)
             if self._only_by_rays or engine_fault():
                 return RayFinder(scene)
-            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, self.resolved.trace_settings))
+            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, settings))
 
     def _groups(
         self,
@@ -302,8 +323,11 @@ class Simulation:
         report: Progress,
         polarisations: int = 1,
         antenna: Antenna | None = None,
+        *,
+        averaged: bool = False,
     ) -> Iterator[Iterator[Found]]:
         """Find the paths from transmitters (T, 3) to some receivers each, for so many receivers at once as fit."""
+        finder = self._mean_finder if averaged else self._finder
         at_once = self.partial.environment.receivers_at_once
         groups = [
             (tx, chosen[start : start + at_once].astype(np.int32))
@@ -313,7 +337,7 @@ class Simulation:
         for number, (tx, chosen) in enumerate(groups):
             part = part_of(report, number / len(groups), (number + 1) / len(groups))
             ends = self.in_scene(tx_m[tx]), self.in_scene(rx_m[chosen])
-            yield self._in_world(tx, chosen, self._finder.paths(*ends, polarisations, part, antenna))
+            yield self._in_world(tx, chosen, finder.paths(*ends, polarisations, part, antenna))
 
     def _in_world(self, tx: int, chosen: NDArray[np.int32], found: Iterator[Found]) -> Iterator[Found]:
         """Return paths in coordinates of the world, with the numbers of their transmitter and receivers."""
@@ -333,7 +357,8 @@ class Simulation:
     ) -> dict[str, Any]:
         """Trace the links of a mask (T, N) into columns of paths; return their states and gains [dB]."""
         sums = LinkSums(*valid.shape)
-        for group in self._groups(tx_m, rx_m, map(np.flatnonzero, valid), report, polarisations):
+        rx_of_tx, averaged = map(np.flatnonzero, valid), isinstance(columns, PathColumns)
+        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, averaged=averaged):
             parts = [paths for _, paths in group]
             columns.append(parts)
             for paths in parts:
@@ -478,7 +503,16 @@ def resolved_settings(
     scene_settings = scene_settings_of(partial, scene_settings)
     for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
+    scene_settings = replace(scene_settings, geometries=_geometries(partial, trace_settings, scene_settings))
     return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
+
+
+def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> int:
+    """Return the number of geometries over which powers are averaged."""
+    if not partial.environment.is_extruded or trace_settings.power_tolerance_db is not None:
+        return 1
+    certain = partial.is_complete or not partial.is_nearly_complete or trace_settings.through_walls
+    return scene_settings.geometries or (1 if certain or partial.wall_noise <= LEAST_NOISE else GEOMETRIES)
 
 
 def nearest_m(frequency_hz: float) -> float:
