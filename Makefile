@@ -6,8 +6,8 @@ BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
-CORE := $(patsubst %,tests/test_%.py,arrays cli coverage export features files house link_model map_files measurements metrics \
-	network outlines paper_networks partial_map predictor ros_map scene settings slab trace unobserved)
+CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
+	network outlines partial_map predictor ros_map scene settings slab trace unobserved)
 LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
 FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 

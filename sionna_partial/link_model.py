@@ -15,12 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import (
-    Progress,
-    no_progress,
-    require,
-    shown,
-)
+from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map

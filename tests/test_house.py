@@ -53,7 +53,7 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
-    "measurements": ("measurements", "recordings", "wall_evidence", "assimilation", "localisation"),
+    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
     "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),
@@ -238,7 +238,7 @@ for name in ("", *typer.main.get_command(app).commands):
         assert not reader & {f"sionna_partial.maps.{name}" for name in others}
         assert not libraries(reader) & {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
-        assert len(own) <= 68
+        assert len(own) <= 56
 
     def test_a_prediction_runs_few_modules(self) -> None:
         codes: set[CodeType] = set()
@@ -249,7 +249,7 @@ for name in ("", *typer.main.get_command(app).commands):
         finally:
             sys.setprofile(None)
         files = {code.co_filename for code in codes if code.co_name != "<module>"}
-        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 41
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 37
 
 
 class TestPublicNames:

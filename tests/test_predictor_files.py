@@ -1,5 +1,6 @@
 import io
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -99,44 +100,61 @@ def _forge(path, archive):
     path.with_suffix(".json").write_text(json.dumps({**card, "sha256": digest(archive)}))
 
 
-def test_missing_file(tmp_path):
-    with pytest.raises(PredictorError, match=r"none\.keras' cannot be read \(No such file.*check the path"):
-        Predictor.load(tmp_path / "none.keras")
+def _packed(contents):
+    """Return an archive with these members."""
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
+        for name, content in contents.items():
+            target.writestr(name, content)
+    return packed.getvalue()
+
+
+def _without_weights(path):
+    with zipfile.ZipFile(path) as source:
+        _forge(path, _packed({name: source.read(name) for name in ("metadata.json", "config.json")}))
+
+
+def _other_model(path):
+    keras = import_keras()
+    distance = keras.Input((1,), name="distance_m")
+    keras.Model({"distance_m": distance}, {"gain": keras.layers.Dense(1)(distance)}).save(path)
+    _forge(path, path.read_bytes())
+
+
+SPOILT = {
+    r"mine\.keras' cannot be read \(No such file.*check the path": [lambda path: path.unlink()],
+    r"mine\.json' cannot be read": [lambda path: path.with_suffix(".json").unlink()],
+    r"mine\.keras' has SHA-256 .* the file is truncated, was changed": [
+        lambda path: path.write_bytes(path.read_bytes()[:-500]),
+        lambda path: path.write_bytes(b""),
+        lambda path: path.write_bytes(path.read_bytes()[:900] + b"\x00" + path.read_bytes()[901:]),
+    ],
+    r"mine\.keras' is no Keras archive": [
+        lambda path, archive=archive: _forge(path, archive)
+        for archive in (b"", b"no archive at all", b"PK\x03\x04" + bytes(50))
+    ],
+    r"mine\.keras' cannot be loaded by Keras": [_without_weights],
+    "unpacks to more than 64,000,000 bytes": [lambda path: _forge(path, _packed({"config.json": bytes(70_000_000)}))],
+    "has more than 64,000,000 bytes": [lambda path: os.truncate(path, 64_000_001)],
+    r"has inputs \['distance_m'\] and outputs": [_other_model],
+    r"mine\.json' is not JSON": [
+        lambda path, text=text: path.with_suffix(".json").write_bytes(text)
+        for text in (b"", b"{", b"[" * 100_000, b"\xff")
+    ],
+}
+"""Words of the message, and what is done to the file of a predictor."""
+
+
+@pytest.mark.parametrize(("message", "spoil"), [(message, each) for message, all_ in SPOILT.items() for each in all_])
+def test_spoilt_files(saved, message, spoil):
+    spoil(saved)
+    with pytest.raises(PredictorError, match=message):
+        Predictor.load(saved)
 
 
 def test_name_that_is_no_path():
     with pytest.raises(PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', the path of"):
         Predictor.load(3)
-
-
-def test_missing_card(saved):
-    saved.with_suffix(".json").unlink()
-    with pytest.raises(PredictorError, match=r"mine\.json' cannot be read"):
-        Predictor.load(saved)
-
-
-@pytest.mark.parametrize("damage", [lambda b: b[:-500], lambda b: b"", lambda b: b[:900] + b"\x00" + b[901:]])
-def test_truncated_or_changed_file(saved, damage):
-    saved.write_bytes(damage(saved.read_bytes()))
-    with pytest.raises(PredictorError, match=r"mine\.keras' has SHA-256 .* the file is truncated, was changed"):
-        Predictor.load(saved)
-
-
-@pytest.mark.parametrize("archive", [b"", b"no archive at all", b"PK\x03\x04" + bytes(50)])
-def test_no_archive(saved, archive):
-    _forge(saved, archive)
-    with pytest.raises(PredictorError, match=r"mine\.keras' is no Keras archive"):
-        Predictor.load(saved)
-
-
-def test_archive_without_weights(saved):
-    packed = io.BytesIO()
-    with zipfile.ZipFile(saved) as source, zipfile.ZipFile(packed, "w") as target:
-        for name in ("metadata.json", "config.json"):
-            target.writestr(name, source.read(name))
-    _forge(saved, packed.getvalue())
-    with pytest.raises(PredictorError, match=r"mine\.keras' cannot be loaded by Keras"):
-        Predictor.load(saved)
 
 
 def test_foreign_code_is_refused(saved):
@@ -196,31 +214,6 @@ def test_link_network_of_other_shape_is_refused(saved):
             Predictor.load(saved)
 
 
-def test_zip_bomb_is_refused(saved):
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
-        target.writestr("config.json", bytes(70_000_000))
-    _forge(saved, packed.getvalue())
-    with pytest.raises(PredictorError, match="unpacks to more than 64,000,000 bytes"):
-        Predictor.load(saved)
-
-
-def test_huge_file_is_refused(saved):
-    with saved.open("r+b") as stream:
-        stream.truncate(64_000_001)
-    with pytest.raises(PredictorError, match="has more than 64,000,000 bytes"):
-        Predictor.load(saved)
-
-
-def test_other_keras_model(saved):
-    keras = import_keras()
-    distance = keras.Input((1,), name="distance_m")
-    keras.Model({"distance_m": distance}, {"gain": keras.layers.Dense(1)(distance)}).save(saved)
-    _forge(saved, saved.read_bytes())
-    with pytest.raises(PredictorError, match=r"has inputs \['distance_m'\] and outputs"):
-        Predictor.load(saved)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -272,13 +265,6 @@ def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path
     (tmp_path / "map.json").write_text(json.dumps({**card, "settings": {**card["settings"], "frequency_hz": 60e9}}))
     with pytest.raises(PredictorError, match=r"map\.json' has SHA-256 .* was changed; install sionna-partial again"):
         predictor_files.read_files(tmp_path / "map.keras")
-
-
-@pytest.mark.parametrize("text", ["", "{", "[" * 100_000, "\xff"])
-def test_card_that_is_no_json(saved, text):
-    saved.with_suffix(".json").write_bytes(text.encode("latin-1"))
-    with pytest.raises(PredictorError, match=r"mine\.json' is not JSON"):
-        Predictor.load(saved)
 
 
 @pytest.mark.parametrize("name", ["mine.h5", "paper.pkl", "default"])

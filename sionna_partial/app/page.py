@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import LENGTH, STROKES
+from sionna_partial.app.drawing import LENGTH, STRAIGHT, STROKES
 from sionna_partial.app.files import FILES
 from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
@@ -410,6 +410,7 @@ class Page:
         self.stroke.options = options if is_measured else [(LENGTH, STROKES[LENGTH])]
         if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
             self.stroke.value = self.stroke.options[0][0]
+        self.brush.visible = self.stroke.value not in ("", *STRAIGHT)
         axes = zip(self.picture.plot.axis, "xy", strict=True)
         for axis, name in axes:
             axis.axis_label = f"{name} [{'m' if is_measured else 'pixels'}]"

@@ -12,13 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.checks import (
-    number_of,
-    require,
-    require_names,
-    require_type,
-    require_whole,
-)
+from sionna_partial.checks import number_of, require, require_names, require_type, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.coverage.dataset import ANTENNA, COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
 from sionna_partial.coverage.link_budget import LinkBudget, transmit_powers_dbm

@@ -87,7 +87,7 @@ def read_vacuum_map(path: Path) -> PartialMap:
     if nx * ny > MAX_CELLS:
         raise MapError(f"{path}: layers span {nx} x {ny} pixels, more than {MAX_CELLS:,}: export the map again.")
     state, room = np.full((ny, nx), CellState.UNKNOWN, np.uint8), np.zeros((ny, nx), np.uint8)
-    names = _room_names([layer for layer in used if layer.kind == "segment"])[:MAX_WALL_MATERIALS]
+    names = [*dict.fromkeys(layer.name for layer in used if layer.kind == "segment")][:MAX_WALL_MATERIALS]
     for layer in sorted(used, key=lambda layer: STATES[layer.kind]):
         where = bottom - layer.cells[:, 1], layer.cells[:, 0] - left
         state[where] = STATES[layer.kind]
@@ -145,10 +145,6 @@ def _listed(path: Path, name: str, value: Any) -> Sequence[Any]:
     if not isinstance(value, list):
         raise MapError(f"{path}: {name} = {shown(value)} is not allowed: {_GIVE}.")
     return value
-
-
-def _room_names(segments: Sequence[_Layer]) -> list[str]:
-    return [*dict.fromkeys(layer.name for layer in segments)]
 
 
 def _note_entities(path: Path, entities: Any, frame: VacuumFrame, notes: ImportNotes) -> None:

@@ -24,8 +24,11 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.measurements.wall_evidence import (
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.wall_materials import (
     FADINGS_DB,
+    LIKELY_STD_DB,
     OTHERS_WEIGHT,
     OWN_WEIGHT,
     STDS_DB,
@@ -33,9 +36,6 @@ from sionna_partial.measurements.wall_evidence import (
     log_std_prior,
     mean_square,
 )
-from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.wall_materials import LIKELY_STD_DB
 from sionna_partial.settings import FREQUENCIES_HZ
 
 CELL_M = 0.3
@@ -628,8 +628,10 @@ class Assimilation(Shown):
         """
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
+        opaque = self._fits[0] is not None and self._fits[0].kind.exact
+        materials = (prior,) if opaque else prior.by_material[0]
         updated, across = [], None
-        for fit, links in zip(self._fits, prior.by_material[0], strict=True):
+        for fit, links in zip(self._fits, materials, strict=True):
             if fit is not None:
                 across = self._links.correlation(rx_m, fit.kind) if across is None else across
                 updated.append(self._updated(fit, across, rx_m, links))

@@ -27,9 +27,9 @@ MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements, of each of which one is traced."""
 
-CORRELATION_M, CORRELATION_THROUGH_WALLS_M = 3.0, 2.0
+CORRELATION_M = 3.0
 """Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 % of the
-transmitters of procedural homes, also of those that no measurement received, and of a measured flat."""
+transmitters of procedural homes, also of those that no measurement received."""
 
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
@@ -115,7 +115,6 @@ def locate_transmitter(
     points_m = posterior.points_m
     received = measured.gain_db > measured.sensitivity_db
     groups = MOST_GROUPS_THROUGH_WALLS if through_walls else MOST_GROUPS
-    correlation_m = CORRELATION_THROUGH_WALLS_M if through_walls else CORRELATION_M
     some = measured.take(grouped(measured.rx, received, groups)[0])
     possible = np.flatnonzero(allowed(points_m))
     if not len(possible):
@@ -129,8 +128,8 @@ def locate_transmitter(
         materials, weights = prediction.by_material
         one = some.take(np.array([index]))
         log_p = log_p + np.stack([_log_likelihood(each, one, antenna_db) for each in materials])
-    walks_m = Walks(partial, some.rx, 10.0 * correlation_m).lengths_m(some.rx)
-    log_p *= len(some) / np.exp(-walks_m / correlation_m).sum()
+    walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
+    log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
     log_p = logsumexp(log_p + np.log(weights)[:, None, None], axis=0)
     log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
     joint = np.exp(log_p - logsumexp(log_p))

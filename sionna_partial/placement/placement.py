@@ -407,11 +407,7 @@ class Search:
     area: PlacementArea
 
     @classmethod
-    def on(
-        cls,
-        model: LinkModel,
-        settings: PlacementSettings,
-    ) -> "Search":
+    def on(cls, model: LinkModel, settings: PlacementSettings) -> "Search":
         """Check the settings against a map."""
         for name in ("tx_height_m", "rx_height_m"):
             require_height(model.partial, name, getattr(settings, name))

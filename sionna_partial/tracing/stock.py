@@ -1,6 +1,6 @@
 """Paths and radio maps by Sionna RT's public solvers, which shoot rays and find most paths of any kind, not all."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from importlib import metadata
 from typing import Any
@@ -167,7 +167,7 @@ class MapPlane:
         }
 
 
-def planar_radio_map(scene: Any, plane: MapPlane, tx: Mapping[str, Sequence[float]], gain_db: Floats) -> Any:
+def planar_radio_map(scene: Any, plane: MapPlane, tx: Mapping[str, Floats], gain_db: Floats) -> Any:
     """Return path gains (T, ny, nx) as a PlanarRadioMap; the scene's transmitters are replaced by `tx`."""
     rt = load_sionna()
     import mitsuba as mi
@@ -184,7 +184,7 @@ def planar_radio_map(scene: Any, plane: MapPlane, tx: Mapping[str, Sequence[floa
     return found
 
 
-def stock_gain_db(scene: Any, plane: MapPlane, tx: Mapping[str, Sequence[float]], settings: TraceSettings) -> Floats:
+def stock_gain_db(scene: Any, plane: MapPlane, tx: Mapping[str, Floats], settings: TraceSettings) -> Floats:
     """Return the path gains (T, ny, nx) of Sionna RT's RadioMapSolver, -150 dB where it finds no path.
 
     The frequency of the scene and its transmitters are replaced; it gets isotropic antennas if it has none.

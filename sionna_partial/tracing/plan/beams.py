@@ -76,7 +76,8 @@ class BeamTree(NamedTuple):
 
     def extended(self, beams: "Beams") -> "BeamTree":
         """Add beams whose parents are in the tree."""
-        return BeamTree(*(np.concatenate(columns) for columns in zip(self, BeamTree.of(beams), strict=True)))
+        columns: Any = zip(self, BeamTree.of(beams), strict=True)
+        return BeamTree(*map(np.concatenate, columns))
 
 
 class Needed(NamedTuple):
@@ -120,8 +121,8 @@ class Beams(NamedTuple):
         windows_m = (np.tile(sources_m, 3)[:, None] + np.array(window)).reshape(-1, 6)
         count = len(windows_m)
         none, left = np.full(count, -1, np.int32), np.tile([power, 1.0], (count, 1))
-        crossed, more = np.zeros(count, np.int32), np.repeat(more, 4).astype(np.int32)
-        return cls(none, none, windows_m, left, crossed, more, np.arange(count) // 4)
+        crossed, reflections = np.zeros(count, np.int32), np.repeat(more, 4).astype(np.int32)
+        return cls(none, none, windows_m, left, crossed, reflections, np.arange(count) // 4)
 
 
 class Task(NamedTuple):
@@ -210,7 +211,7 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
     _, sequence = np.unique(beams.sequence[columns[0] - before] * lines + line, return_inverse=True)
     pairs, receivers = np.concatenate(pair), max(1, len(task.receivers.order))
     _, once = np.unique(beams.sequence[pairs[:, 0] - before] * receivers + pairs[:, 1], return_index=True)
-    return Beams(*columns, sequence), pairs[once], np.concatenate(through)[once]
+    return Beams(*[*columns, sequence]), pairs[once], np.concatenate(through)[once]
 
 
 @njit(cache=True, nogil=True)
