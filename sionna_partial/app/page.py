@@ -203,18 +203,8 @@ class Page:
         self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
 
     def _roots(self) -> dict[str, Any]:
-        from bokeh.layouts import column, row
-        from bokeh.models import CustomJS, Row
-
-        def pair(*models: Any) -> Row:
-            for model in models:
-                model.sizing_mode, model.width = "stretch_width", None
-            return row(*models, sizing_mode="stretch_width")
-
-        def wide(*models: Any) -> Any:
-            for model in models:
-                model.sizing_mode = "stretch_width"
-            return column(*models, sizing_mode="stretch_width")
+        from bokeh.layouts import row
+        from bokeh.models import CustomJS
 
         session = self.session
         upload_map, upload_csv, copy = (
@@ -233,42 +223,42 @@ class Page:
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing = self.radio.values()
         return {
-            "status": wide(row(self.message, self.cancel), self.warnings),
-            "layers": pair(self.layer, self.which),
-            "choices": pair(self.threshold, self.outline, self.truth),
+            "status": _wide(row(self.message, self.cancel), self.warnings),
+            "layers": _pair(self.layer, self.which),
+            "choices": _pair(self.threshold, self.outline, self.truth),
             "picture": self.picture.plot,  # nothing above it changes its height with an answer: a drag would miss
             "summary": self.summary,
             "links": self.links,
-            "map": wide(
+            "map": _wide(
                 self.example,
                 upload_map,
                 self.map_text,
-                pair(self.length, self.dark),
+                _pair(self.length, self.dark),
                 self.stroke,
-                pair(self.brush, self.undo),
+                _pair(self.brush, self.undo),
             ),
-            "transmitters": wide(
-                pair(self.chosen, self.name),
-                pair(x, y),
-                pair(z, eirp),
-                pair(self.pattern, *self.aims.values()),
-                pair(
+            "transmitters": _wide(
+                _pair(self.chosen, self.name),
+                _pair(x, y),
+                _pair(z, eirp),
+                _pair(self.pattern, *self.aims.values()),
+                _pair(
                     self._button("Add", lambda: session.add()),
                     self._button("Remove", lambda: session.remove(session.chosen)),
                 ),
                 self._button("Place it for me", lambda: session.place(), button_type="primary"),
             ),
-            "radio": wide(
-                self.preset, pair(frequency, bandwidth), pair(self.walls, self.material), pair(height, spacing)
+            "radio": _wide(
+                self.preset, _pair(frequency, bandwidth), _pair(self.walls, self.material), _pair(height, spacing)
             ),
-            "robot": wide(
+            "robot": _wide(
                 self.more,
                 self._button("Best next views", lambda: session.find_views()),
                 upload_csv,
                 self.measured_text,
                 self.forget,
             ),
-            "repeat": wide(self.python, copy),
+            "repeat": _wide(self.python, copy),
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
@@ -518,6 +508,24 @@ _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
     "a { display: inline-block; padding: 0.25em 0.7em; margin: 0.15em; border: 1px solid #93a1b0; border-radius: 6px }"
 )
+
+
+def _pair(*models: Any) -> Any:
+    """Put models beside each other, over the whole width."""
+    from bokeh.layouts import row
+
+    for model in models:
+        model.sizing_mode, model.width = "stretch_width", None
+    return row(*models, sizing_mode="stretch_width")
+
+
+def _wide(*models: Any) -> Any:
+    """Put models below each other, over the whole width."""
+    from bokeh.layouts import column
+
+    for model in models:
+        model.sizing_mode = "stretch_width"
+    return column(*models, sizing_mode="stretch_width")
 
 
 def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
