@@ -1,12 +1,13 @@
 """Time and memory of `predict_map` on large maps: growth with receivers, with wall segments, and real buildings.
 
-Every measurement runs in a process of its own, on all cores. Exponents of growth are fitted to the times above one
-second. Run it with
+Every measurement runs in a process of its own, on all cores: the first call of the process (cold), and the same again
+(warm). Buildings are predicted at 28 and at 5.2 GHz. Exponents of growth are fitted to warm times above one second. Run
+it with
 
     python benchmarks/scale.py --maps ../shared/slam/*.yaml ../shared/floors/*/map.yaml
 
-which takes about half an hour on two cores; `--only receivers`, for instance, runs one part. The maps are measured
-among the buildings, those that are not there are skipped.
+which takes about an hour on two cores; `--only buildings --maps ../shared/slam/depot.yaml`, for instance, measures one
+more map among the buildings. Maps that are not there are skipped.
 """
 
 import argparse
@@ -26,7 +27,9 @@ from sionna_partial.scene.scene import build_scene
 RECEIVERS = 20_000
 """Number of receivers in a building, about."""
 
-_COLUMNS = "map", "segments", "receivers", "seconds", "ms a receiver", "paths for a receiver", "peak memory"
+FREQUENCIES_HZ = (28e9, 5.2e9)
+
+_COLUMNS = "map", "GHz", "segments", "receivers", "cold [s]", "warm [s]", "paths for a receiver", "peak memory"
 HEAD = f"\n| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 
 
@@ -65,7 +68,8 @@ def buildings(maps: Iterable[Path]) -> None:
     """Print the same for a hall as a robot maps it, complete and half, and for real maps."""
     print(HEAD)
     for name in ("hall", "half hall", *maps):
-        isolated(measure, str(name), RECEIVERS)
+        for frequency_hz in FREQUENCIES_HZ:
+            isolated(measure, str(name), RECEIVERS, frequency_hz)
     row = isolated(placement)
     print(f"\nplace_transmitter on half the hall: {row['seconds']:.1f} s, {row['memory_gb']:.2f} GB")
 
@@ -85,8 +89,8 @@ def limits() -> None:
         print(f"\nrefused: {error}")
 
 
-def measure(name: str, count: int) -> dict:
-    """Predict one map with about so many receivers, warm, and print a row."""
+def measure(name: str, count: int, frequency_hz: float = FREQUENCIES_HZ[0]) -> dict:
+    """Predict one map with about so many receivers, cold and warm, and print a row."""
     partial = named_map(name)
     free = np.argwhere(partial.state == CellState.FREE)
     middle = free[len(free) // 2]
@@ -95,21 +99,22 @@ def measure(name: str, count: int) -> dict:
     row, column = max(free[near], key=lambda cell: distance[tuple(cell)])
     tx = np.array(partial.origin_m) + (np.array([column, row]) + 0.5) * partial.resolution_m
     known = (partial.state != CellState.WALL).sum() * partial.resolution_m**2
-    sp.predict_map(partial, tx, spacing_m=np.sqrt(known / 50))
-    start = time.perf_counter()
-    coverage = sp.predict_map(partial, tx, spacing_m=np.sqrt(known / count))
-    seconds = time.perf_counter() - start
+    settings, seconds = sp.TraceSettings(frequency_hz), []
+    for _ in range(2):
+        start = time.perf_counter()
+        coverage = sp.predict_map(partial, tx, spacing_m=np.sqrt(known / count), trace_settings=settings)
+        seconds.append(time.perf_counter() - start)
     memory_gb, valid = peak_memory_gb(), coverage["valid"].to_numpy()
     x, y = np.meshgrid(coverage["x"], coverage["y"])
     some = np.column_stack([x[valid], y[valid], np.full(valid.sum(), 1.5)])[:: max(1, int(valid.sum()) // 200)]
-    links = sp.trace_links(partial, (*tx, 1.5), some)
+    links = sp.trace_links(partial, (*tx, 1.5), some, trace_settings=settings)
     segments, receivers = len(build_scene(partial).segments), int(valid.sum())
     print(
-        f"| {name} | {segments} | {receivers} | {seconds:.1f} | {1e3 * seconds / receivers:.2f} "
+        f"| {name} | {frequency_hz / 1e9:g} | {segments} | {receivers} | {seconds[0]:.1f} | {seconds[1]:.1f} "
         f"| {len(links.a) / len(some):.0f} | {memory_gb:.2f} GB |",
         flush=True,
     )
-    return {"segments": segments, "receivers": receivers, "seconds": seconds}
+    return {"segments": segments, "receivers": receivers, "seconds": seconds[1]}
 
 
 def named_map(name: str) -> sp.PartialMap:
