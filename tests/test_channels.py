@@ -371,8 +371,7 @@ class TestResponses:
             lambda: several.beam_gains(np.eye(4), **arrays).gain_db,
         )
         whole = [call().to_numpy() for call in calls]
-        for module in ("responses", "beams"):
-            monkeypatch.setattr(f"sionna_partial.channels.{module}.WORK_BYTES", 1)
+        monkeypatch.setattr("sionna_partial.channels.responses.WORK_BYTES", 1)
         for before, call in zip(whole, calls, strict=True):
             np.testing.assert_allclose(call().to_numpy(), before, rtol=1e-5, atol=1e-12)
 

@@ -261,9 +261,9 @@ class TestErrors:
         assert sp.DifferentiableScene(MAPS["partial"], trace_settings=opaque).links(TX_M, RX_M)().p_los.shape == (6,)
 
     def test_paths_through_walls_on_a_complete_map(self):
-        settings = replace(TRACE, frequency_hz=5e9)
-        links = sp.DifferentiableScene(MAPS["complete"], trace_settings=settings).links(TX_M, RX_M)
-        traced = sp.trace_links(MAPS["complete"], TX_M, RX_M, trace_settings=settings)
+        settings = {"trace_settings": replace(TRACE, frequency_hz=5e9), "scene_settings": SCENE}
+        links = sp.DifferentiableScene(MAPS["complete"], **settings).links(TX_M, RX_M)
+        traced = sp.trace_links(MAPS["complete"], TX_M, RX_M, **settings)
         np.testing.assert_allclose(links().gain_mean_db, traced.gain_db, rtol=1e-6)
 
     def test_within_a_function(self, links_of):
