@@ -100,11 +100,12 @@ def main() -> None:
             coarse_s, fine_s = np.median(dropped_s(tab, 0.2), axis=0)
             print(f"from a drop to the coarse picture {coarse_s:.2f} s, to the fine one {fine_s:.2f} s (median of 5)")
             tab.run(f"{MODEL}('preset').value = 'Wi-Fi 5 GHz', {MODEL}('layer').value = 'power_mean_dbm', 0")
+            tab.wait(f"{MODEL}('python').value.includes('5210')", WAIT_S)
             tab.run(
                 f"(() => {{ const points = {MODEL}('points'); points.data = {{x: [7, 7.5], y: [9.8, 3.5], "
                 "name: ['tx1', ''], colour: ['', '']}}; return 0 }})()"
             )
-            tab.wait(f"{MODEL}('python').value.includes('tx2') && {MODEL}('python').value.includes('5210')", WAIT_S)
+            tab.wait(f"{MODEL}('python').value.includes('tx2')", WAIT_S)
             tab.wait(READY, WAIT_S)
             tab.run("new Promise(done => setTimeout(done, 1000))")
             tab.screenshot(given.out)

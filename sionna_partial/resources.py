@@ -9,7 +9,7 @@ from typing import Any
 from sionna_partial.errors import BackendError, SceneError, SionnaPartialError
 
 EXTRAS = {
-    "app": ("bokeh", "contourpy", "tornado"),
+    "app": ("bokeh", "tornado"),
     "channels": ("dask", "zarr"),
     "datasets": ("dask", "distributed", "pyarrow", "rasterio"),
     "geo": ("rasterio",),

@@ -123,7 +123,7 @@ NOT_IMPORTED = {
 }
 """Declared dependencies that no module imports, and why they are needed."""
 
-COME_WITH = {"drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
+COME_WITH = {"contourpy": "matplotlib", "drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
 """Imported packages that a declared one cannot do without, and which it therefore installs in a version that fits."""
 
 

@@ -4,6 +4,7 @@ import math
 from typing import Any
 
 import numpy as np
+from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
@@ -217,8 +218,6 @@ class Picture:
         self.values.data = columns
         lines: list[Any] = []
         if outline:
-            from contourpy import contour_generator
-
             height = {"power_mean_dbm": threshold_dbm, "p_above": LIKELY}[outline]
             field: Any = contour_generator(one["x"], one["y"], np.ma.masked_invalid(columns[outline][0]))
             lines = field.lines(height)
