@@ -103,7 +103,7 @@ def main() -> None:
             tab.wait(f"{MODEL}('python').value.includes('5210')", WAIT_S)
             tab.run(
                 f"(() => {{ const points = {MODEL}('points'); points.data = {{x: [7, 7.5], y: [9.8, 3.5], "
-                "name: ['tx1', ''], colour: ['', '']}}; return 0 }})()"
+                "name: ['tx1', ''], colour: ['', '']}; return 0 })()"
             )
             tab.wait(f"{MODEL}('python').value.includes('tx2')", WAIT_S)
             tab.wait(READY, WAIT_S)
