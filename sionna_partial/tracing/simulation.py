@@ -511,8 +511,11 @@ def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settin
     """Return the number of geometries over which powers are averaged."""
     if not partial.environment.is_extruded or trace_settings.power_tolerance_db is not None:
         return 1
-    certain = partial.is_complete or not partial.is_nearly_complete or trace_settings.through_walls
-    return scene_settings.geometries or (1 if certain or partial.wall_noise <= LEAST_NOISE else GEOMETRIES)
+    if scene_settings.geometries is not None:
+        return scene_settings.geometries
+    if trace_settings.through_walls or partial.is_complete or not partial.is_nearly_complete:
+        return 1
+    return 1 if partial.wall_noise <= LEAST_NOISE else GEOMETRIES
 
 
 def nearest_m(frequency_hz: float) -> float:

@@ -15,8 +15,7 @@ no path crosses: `Limits.walls` is 0. Walls in a beam are sorted in one of two w
   the walls in front of any point are known, and with them a bound of the power there. Beams too weak for every
   receiver end.
 
-With `_lay` and `_add_pairs` for opaque walls, too, beams between them took two to three times as long, and the trace
-of a map 13 to 24 % longer.
+With `_lay` and `_add_pairs` for opaque walls, too, traces between them took longer.
 """
 
 import math
