@@ -235,7 +235,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         height_m : float
             Height of their tops [m]; from `wall_height_m` on they are walls.
         where : (ny, nx) bool array, (M, 2) array-like, shapely geometry or None
-            The area as in `with_wall_material`. None selects free-standing wall cells: pieces within 2.5 m along x and y
+            The area as in `with_wall_material`. None selects free-standing walls: pieces within 2.5 m along x and y
             with only free cells around them, pillars included.
 
         Raises
