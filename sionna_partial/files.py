@@ -464,7 +464,6 @@ def _hidden_folder(target: Path, parent: Path) -> AbstractContextManager[Path]:
 
 @contextmanager
 def _own_folder(parent: Path, prefix: str, failed: Callable[[OSError], OutputError]) -> Iterator[Path]:
-    """Open an `own_folder`; `failed` converts errors of the operating system."""
     folder: Path | None = None
     try:
         with own_folder(parent, prefix) as folder:

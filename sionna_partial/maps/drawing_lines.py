@@ -189,7 +189,6 @@ class DrawnLines:
         return found
 
     def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
-        """Return pieces (N, 2, 3) of lines by layer."""
         parts: dict[str, list[Segments]] = {}
         pieces = 0
         for entity in entities:
@@ -263,7 +262,6 @@ def _pieces(entity: Any) -> Iterator[Segments]:
 
 
 def _curves(entity: Any) -> Iterator[Floats]:
-    """Yield the corners (N, 3) of the polygons of an entity."""
     from ezdxf.path import from_hatch, make_path
 
     for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:

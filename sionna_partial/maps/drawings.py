@@ -170,7 +170,6 @@ class _Plan(NamedTuple):
         return cls(path, drawing, visible, lines)
 
     def unit(self, segments: Segments) -> tuple[float, str]:
-        """Return the length of a unit [m] and its source."""
         header, texts = self.drawing.header, self.drawing.modelspace().query("TEXT MTEXT")
         names = {"TEXT": "height", "MTEXT": "char_height"}
         heights = np.array([float(text.dxf.get(names[text.dxftype()], 0.0)) for text in texts])
@@ -178,7 +177,6 @@ class _Plan(NamedTuple):
         return unit_of(self.path, code, is_metric, segments, heights)
 
     def listed(self) -> str:
-        """Return the names of the layers with their numbers of lines."""
         counts = self.lines.line_counts()
         names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
         texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
@@ -211,7 +209,6 @@ class _Plan(NamedTuple):
         return segments, on_layer
 
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
-        """Note used and skipped elements, and warn of possible walls that cannot be read."""
         lost = dict[str, int]()
         for (name, kind), count in self.lines.counts.items():
             layer = self.lines.names.get(name, name)
@@ -231,7 +228,6 @@ class _Plan(NamedTuple):
 
 
 def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
-    """Return the cell states (ny, nx) of lines [m], and an empty map of these cells."""
     extent = np.ptp(segments.reshape(-1, 2), axis=0)
     if not POSSIBLE_M[0] <= extent.max() <= POSSIBLE_M[1]:
         raise MapError(
@@ -279,7 +275,6 @@ def _warn_of_close_lines(path: Path, segments: Segments, unit_m: float, resoluti
 
 
 def _by_layer(name: str, plan: _Plan, layers: set[str], given: Any, checked: Any) -> dict[Any, set[str]]:
-    """Return the layers with walls for each value of an option with values by layer."""
     given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise MapError(f"{name} = {shown(given)} is not allowed: give values by the names of layers.")
@@ -448,7 +443,6 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
 
 
 def _shades(path: Path) -> States:
-    """Return the shades of grey (rows, columns); transparent pixels are white."""
     image = ImageOps.exif_transpose(opened_image(path, f"path = '{path}'", ("PNG", "JPEG", "BMP")))
     if image.mode.startswith(("I", "F")):
         values = np.asarray(image, dtype=np.float64)

@@ -155,7 +155,6 @@ def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tup
 
 
 def _given(path: Path, model: Any, given: Mapping[str, Material | str]) -> dict[str, Material]:
-    """Return the given materials by type."""
     found = dict[str, Material]()
     for name, value in given.items():
         present = [kind for kind in TYPES if model.by_type(kind) and fnmatch(kind.lower(), str(name).lower())]
@@ -230,7 +229,6 @@ def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) 
 
 
 def _cut(corners_m: Floats, height_m: float) -> Segments:
-    """Cut triangles (F, 3, 3) [m] by a horizontal plane into segments (N, 2, 2) [m] with exactly equal ends."""
     above = corners_m[..., 2] > height_m
     crossed = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
     corners_m, above = corners_m[crossed], above[crossed]
@@ -298,7 +296,6 @@ def _width_m(area: shapely.Geometry) -> float:
 
 
 def _layers(found: Any) -> list[tuple[float, str]]:
-    """Return thickness in units of the model (0 if missing) and name of each material of a set."""
     if found.is_a("IfcMaterial"):
         return [(0.0, found.Name or "")]
     of_kind = {

@@ -499,7 +499,6 @@ _READERS = {
 
 
 def _reader_of(source: Path) -> tuple[Path, _Reader]:
-    """Return the file that a path leads to, and its reader."""
     suffix = source.suffix.lower()
     if suffix not in BAG_SUFFIXES and (source / "metadata.yaml").is_file():
         return source, _BAG

@@ -466,7 +466,6 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
     def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
-        """Return, for each fault, its points (N,), its description and the remedy."""
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         finite = np.asarray(np.isfinite(points_m).all(axis=1))

@@ -156,7 +156,6 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
 
 
 def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
-    """Return the list of values that the shades of a layer's image count."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
     other = sorted(str(key) for key in given if key not in ("image", listed))
@@ -174,7 +173,6 @@ def _layer(
     shape: tuple[int, ...],
     origin: tuple[float, float, float],
 ) -> States:
-    """Return the cells of a layer, which are the shades of its image."""
     if image.mode != "L" or image.size != shape[::-1]:
         what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th listed."
         raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
@@ -585,7 +583,6 @@ def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
 
 
 def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
-    """Warn of dark grey pixels between the thresholds, if they outnumber the walls."""
     full = 255 * pixels.per_shade + pixels.opaque
     occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
     dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)

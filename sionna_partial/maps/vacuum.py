@@ -102,8 +102,6 @@ def read_vacuum_map(path: Path) -> PartialMap:
 
 
 class _Layer(NamedTuple):
-    """Type of a layer, name of its room, and its pixels (N, 2), x and y."""
-
     kind: str
     name: str
     cells: Indices

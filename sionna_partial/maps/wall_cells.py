@@ -155,7 +155,6 @@ def ragged_edges(wall: Bools) -> float:
 
 
 def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
-    """Return the walls and the FREE cells with level faces, and the roughness of `CleanWalls`."""
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
     was_free = free
@@ -230,7 +229,6 @@ def _without_bumps(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
 
 
 def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> Bools:
-    """Return short horizontal gaps between walls that are longer than they are thick."""
     row, start, end = row_runs(wall)
     gap = np.where(row[1:] == row[:-1], start[1:] - end[:-1], 0)
     longest = min(MAX_GAP_CELLS, int(bridge_gap_m / resolution_m + 1e-6))
@@ -312,7 +310,6 @@ def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Float
 
 @njit(cache=True)
 def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
-    """Write the start of the cheapest run to every corner, and whether it is along y, by dynamic programming."""
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
@@ -383,7 +380,6 @@ def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
-    """Keep the lines that pass the middles of an element's first and last unit edge within the tolerance."""
     x0, y0, x1, y1, steps = element
     if size > 0:
         size = _clip(polygon, size, x0, y0, tolerance)

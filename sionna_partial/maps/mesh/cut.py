@@ -147,7 +147,6 @@ def _points_on_edges(
 
 
 def _seen_from_above(flat_m: Floats) -> tuple[Floats, Bools]:
-    """Return the longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
     edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
     lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
     longest = np.argmax(lengths, axis=1)

@@ -67,7 +67,6 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
     """Resolver that returns only buffers of a .gltf in its folder."""
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file."""
         path = confined_path(Path(self.parent), name, f"'{self.file_path}' asks for the file")
         return read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
 
@@ -139,7 +138,6 @@ def _require_whole(kind: str, content: bytes, triangles: int) -> None:
 
 
 def _placed_parts(path: Path, scene: Any, notes: ImportNotes) -> Iterator[Triangles]:
-    """Yield the triangles of every node of a trimesh scene, in the axes of the scene."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
@@ -252,7 +250,6 @@ def _read_shapes(path: Path, notes: ImportNotes) -> tuple[ET.Element, list[tuple
 
 
 def _shape_triangles(path: Path, shape: ET.Element, notes: ImportNotes) -> Triangles:
-    """Return the triangles of a shape, with the steps of its to_world applied in order."""
     kind, matrix = str(shape.get("type")), np.eye(4)
     _require_known(path, shape, SHAPE_PROPERTIES)
     if kind in _SHAPES:
@@ -284,7 +281,6 @@ def _affine(matrix: Floats) -> Floats:
 
 
 def _step(step: ET.Element) -> Floats:
-    """Return the matrix (4, 4) of one step of a to_world."""
     if not {*step.attrib} <= {"value", "x", "y", "z", "angle"}:
         raise ValueError(step.attrib)
     value = np.array([float(word) for word in step.get("value", "").replace(",", " ").split()])
@@ -319,7 +315,6 @@ def _require_known(path: Path, element: ET.Element, names: Collection[str]) -> N
 
 
 def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Material | None]) -> Material | None:
-    """Return the material of a shape: its own bsdf, or a named one of the scene."""
     for bsdf in shape.findall("bsdf"):
         return _material(path, bsdf)
     for ref in shape.findall("ref"):
