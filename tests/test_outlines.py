@@ -89,10 +89,6 @@ def distances_from_outlines(partial: PartialMap, outlines: Outlines) -> NDArray[
     return np.asarray(shapely.distance(lines, shapely.points(column + 0.5, row + 0.5)))
 
 
-def farthest_from_outlines(partial: PartialMap, outlines: Outlines) -> float:
-    return float(distances_from_outlines(partial, outlines).max())
-
-
 def kept_regions(partial: PartialMap, outlines: Outlines, scale: int = 5) -> int:
     """Number of regions, which are the same ones between walls as between outlines at every cell away from walls."""
     wall = partial.state == CellState.WALL
@@ -318,7 +314,7 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         found = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0]))
         assert abs((found - angle_deg + 90) % 180 - 90) < 0.6
         assert 97 < np.hypot(*(end - start)) < 101
-        assert farthest_from_outlines(partial, outlines) < 0.8
+        assert distances_from_outlines(partial, outlines).max() < 0.8
 
 
 @pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 4), (17, 6), (45, 4), (45, 6)])
@@ -338,7 +334,7 @@ def test_ragged_rooms_keep_their_regions(thickness: int, fraction: float) -> Non
     assert_sound(outlines)
     assert kept_regions(partial, outlines) == 2
     assert farthest_from_walls(partial, outlines) < 1.6
-    assert farthest_from_outlines(partial, outlines) < 2.3
+    assert distances_from_outlines(partial, outlines).max() < 2.3
     assert len(outlines.segments) < 70 + 900 * fraction
 
 
@@ -374,7 +370,7 @@ def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: 
     assert 8 <= len(outlines.segments) <= most
     assert kept_regions(partial, outlines, scale=3) > 0
     assert farthest_from_walls(partial, outlines) < 2.0
-    assert farthest_from_outlines(seen_from_inside(partial), outlines) < 3.5
+    assert distances_from_outlines(seen_from_inside(partial), outlines).max() < 3.5
 
 
 def seen_from_inside(partial: PartialMap) -> PartialMap:
@@ -485,18 +481,6 @@ def test_map_that_is_its_own_mirror_image_has_sound_outlines() -> None:
         assert {tuple(p) for p in turned.tolist()} == {tuple(p) for p in corners.tolist()}
 
 
-def test_large_warehouse_is_quick_and_few() -> None:
-    """A hall of 50 x 30 m with racks at 0.03 m, unknown all around."""
-    state = np.full((1200, 1870), CellState.UNKNOWN, dtype=np.uint8)
-    state[96:1104, 96:1774] = CellState.WALL
-    state[100:1100, 100:1770] = CellState.FREE
-    for row in range(200, 1000, 100):
-        for column in range(200, 1400, 370):
-            state[row : row + 33, column : column + 300] = CellState.WALL
-    outlines = wall_outlines(PartialMap(state, 0.03))
-    assert len(outlines.segments) == 4 + 4 * 8 * 4
-
-
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")
 @pytest.mark.parametrize("home", ["Shelbiana", "Kerrtown", "Brevort"])
 def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
@@ -513,35 +497,16 @@ def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        pytest.param("....... .#####. .......", path((1.5, 1.5), (5.5, 1.5)), id="lying"),
-        pytest.param("... .#. .#. .#. ...", path((1.5, 1.5), (1.5, 3.5)), id="upright"),
-        pytest.param(
-            "....... ...###. .###... .......", path((1.5, 1.5), (3.5, 1.5), (3.5, 2.5), (5.5, 2.5)), id="tilted"
-        ),
         pytest.param(
             "....... ....##. .###... .......", path((1.5, 1.5), (3.5, 1.5), (4.5, 2.5), (5.5, 2.5)), id="corner touch"
         ),
-        pytest.param("..... .#... ..#.. ...#. .....", path((1.5, 3.5), (3.5, 1.5)), id="diagonal"),
         pytest.param("##. #.. ...", path((0.5, 1.5), (0.5, 2.5), (1.5, 2.5)), id="no diagonal where edges touch"),
-        pytest.param("##### #...# #...# #####", ring(0.5, 0.5, 4.5, 3.5), id="room"),
         pytest.param(".#. #.# .#.", path((0.5, 1.5), (1.5, 2.5), (2.5, 1.5), (1.5, 0.5), (0.5, 1.5)), id="diamond"),
         pytest.param(
             "##### ..#.. ..#..", path((0.5, 2.5), (2.5, 2.5), (4.5, 2.5)) | path((2.5, 0.5), (2.5, 2.5)), id="junction"
         ),
-        *[
-            pytest.param("###### " * rows, ring(0.5, 0.5, 5.5, rows - 0.5), id=f"{rows} cells thick")
-            for rows in (2, 3, 5)
-        ],
+        pytest.param("###### ###### ######", ring(0.5, 0.5, 5.5, 2.5), id="thick"),
         pytest.param("... .#. ...", ring(1.0, 1.0, 2.0, 2.0), id="lone cell"),
-        *[
-            pytest.param(
-                f"....... .##{gap}##. .......",
-                path((1.5, 1.5), (2.5, 1.5)) | path((4.5, 1.5), (5.5, 1.5)),
-                id=f"gap {gap}",
-            )
-            for gap in ".?"
-        ],
-        pytest.param(".... ....", set(), id="no wall"),
     ],
 )
 def test_staircases(text: str, expected: set[tuple[tuple[float, ...], ...]]) -> None:
@@ -560,14 +525,9 @@ def random_map(seed: int, ny: int, nx: int, fraction: float) -> PartialMap:
 
 @settings(max_examples=60, deadline=None)
 @given(MAPS)
-def test_staircases_are_sound(case: tuple[int, int, int, float]) -> None:
-    assert_sound(lattice_outlines(random_map(*case)))
-
-
-@settings(max_examples=60, deadline=None)
-@given(MAPS)
 def test_where_two_segments_meet_one_ends_the_other_begins_and_they_turn(case: tuple[int, int, int, float]) -> None:
     outlines = lattice_outlines(random_map(*case))
+    assert_sound(outlines)
     count = len(outlines.vertices_m)
     begins, ends = (np.bincount(outlines.segments[:, side], minlength=count) for side in (0, 1))
     two = begins + ends == 2

@@ -1,6 +1,5 @@
 """ROS map_server YAML and image, read as nav2_map_server reads them."""
 
-import logging
 import math
 import re
 from pathlib import Path
@@ -70,13 +69,10 @@ def test_orientation_and_place(tmp_path: Path) -> None:
 
 PGMS = {
     "binary": b"P5\n3 1\n255\n\x00\xcd\xfe",
-    "binary with comments": b"P5 # made by\n# CREATOR: me 0.050 m/pix\n3 # wide\n1\n255\n\x00\xcd\xfe",
     "text": b"P2\n3 1\n255\n0 205 254\n",
     "text with comments": b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
     "binary, maxval 100": b"P5\n3 1\n100\n\x00\x32\x64",
-    "text, maxval 4": b"P2\n3 1\n4\n0 2 4\n",
     "binary, 16 bit": b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
-    "binary, maxval 1000": b"P5\n3 1\n1000\n\x00\x00\x02\x58\x03\xe8",
     "text, 16 bit": b"P2\n3 1\n65535\n0 40000 65535\n",
 }
 
@@ -107,15 +103,6 @@ def test_thresholds_are_strict(tmp_path: Path) -> None:
     """nav2: occupancy > occupied_thresh is wall, < free_thresh is free; negated 51 and 204 have exactly 0.2 and 0.8."""
     thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}
     assert load_state(tmp_path, [[50, 51, 52, 203, 204, 205]], **thresholds) == [[FREE, 2, 2, 2, 2, WALL]]
-
-
-def test_negate(tmp_path: Path) -> None:
-    shades = np.arange(256)[None]
-    for negate in (1, True):
-        there = load_state(tmp_path, shades, negate=negate)
-        assert there == load_state(tmp_path, 255 - shades, negate=0)
-        assert there[0][0] == FREE
-        assert there[0][255] == WALL
 
 
 @pytest.mark.parametrize("mode", ["trinary", "Trinary", "scale", "SCALE"])
@@ -264,7 +251,7 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
         (
             "material",
             (3, {"color": "red"}, {"relative_permittivity": 0.5}),
-            "give a name, or relative_permittivity, .*thickness_m, itu, conductivity_exponent",
+            "give a name, or relative_permittivity, .*itu",
         ),
         ("interior_cells", (-1, 2.5, "many", True), "give the number of free cells"),
     ],
@@ -279,12 +266,6 @@ def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], messa
             load_map(path)
         shown = str(value)
         assert len(shown) > 100 or shown in str(caught.value) or {"\0", "\ud800"} & {*shown}
-
-
-def test_origin_too_far(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0]], origin=[0.0, -2e8, 0.0])
-    with pytest.raises(MapError, match=r"origin_m = -200000000.0 is not allowed: give a number of metres in"):
-        load_map(path)
 
 
 @pytest.mark.parametrize(
@@ -472,6 +453,8 @@ def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -
     new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
     assert PartialMap(new, resolution_m, origin_m).is_complete
     assert label(new != WALL, np.ones((3, 3)))[1] == 2 or not corners
+    state[1, 2] = FREE
+    assert not PartialMap(turn_grid(state, 0.1, (0.0, 0.0, yaw))[0], resolution_m).is_complete
 
 
 def test_diagonal_walls_stay_closed() -> None:
@@ -487,26 +470,13 @@ def test_diagonal_walls_stay_closed() -> None:
             assert (new == FREE).sum() == pytest.approx(4 * (state == FREE).sum(), rel=0.06)
 
 
-def test_frontiers_stay_open() -> None:
-    """Turning closes no opening towards unknown cells."""
-    state = room(10, 10)
-    state[1, 4:8] = FREE
-    new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, 0.4))
-    assert not PartialMap(new, resolution_m, origin_m).is_complete
-    assert (new == WALL).sum() == pytest.approx(4 * (state == WALL).sum(), rel=0.05)
-
-
-def test_small_tilt_is_below_the_resolution() -> None:
+def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) -> None:
     state = room(96, 96)
     limit = 0.5 / math.hypot(100, 100)
     assert turn_grid(state, 0.1, (0.0, 0.0, 0.99 * limit))[1] == 0.1
+    assert not caplog.text
     assert turn_grid(state, 0.1, (0.0, 0.0, 1.01 * limit))[1] == 0.05
-
-
-def test_turning_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        turn_grid(GRID, 0.1, (0.0, 0.0, 0.3))
-    assert "origin yaw 0.3 rad: the map is turned onto cells of 0.05 m" in caplog.text
+    assert "rad: the map is turned onto cells of 0.05 m" in caplog.text
 
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
