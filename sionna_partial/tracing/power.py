@@ -143,7 +143,7 @@ ISOTROPIC = Gains(np.ones((1, 1)), np.ones(1), 1.0)
 
 
 @njit(cache=True)
-def gain_towards(gains, x, y, z):  # type: ignore[no-untyped-def]
+def gain_towards(gains, x, y, z):
     if len(gains.table) == 1:
         return 1.0
     zenith, azimuth = math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x))
@@ -151,15 +151,14 @@ def gain_towards(gains, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def gain_at_azimuth(gains, x, y):  # type: ignore[no-untyped-def]
-    """Return the largest gain in a horizontal direction, at any zenith."""
+def gain_at_azimuth(gains, x, y):
     if len(gains.by_azimuth) == 1:
         return 1.0
     return gains.by_azimuth[int(math.degrees(math.atan2(y, x)) + 360.5) % 360]
 
 
 @njit(cache=True)
-def gain_between(gains, first, second):  # type: ignore[no-untyped-def]
+def gain_between(gains, first, second):
     """Return the largest gain between two horizontal directions, counterclockwise, less than half a turn apart."""
     if len(gains.by_azimuth) == 1:
         return 1.0
@@ -207,14 +206,14 @@ def _transition_table() -> NDArray[np.complex128]:
 
 
 @njit(cache=True)
-def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
+def reflected_power(largest, cosine):
     """Return the largest fraction of power reflected, for any material and polarisation."""
     at = min(int(abs(cosine) * _ANGLES), _ANGLES - 1)
     return max(largest[at, 0], largest[at, 1]) ** 2
 
 
 @njit(cache=True)
-def power_near(table, material, cosine):  # type: ignore[no-untyped-def]
+def power_near(table, material, cosine):
     """Return the power that a slab reflects or transmits, for the better polarisation."""
     at = min(int(cosine * COSINES + 0.5), COSINES)
     te, tm = table[material, at, 0], table[material, at, 1]
@@ -222,8 +221,7 @@ def power_near(table, material, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
-    """Interpolate the coefficients TE and TM of a slab."""
+def _coefficients(table, material, cosine):
     at = cosine * COSINES
     low = min(int(at), COSINES - 1)
     part, te, tm = at - low, table[material, low, 0], table[material, low, 1]
@@ -231,13 +229,13 @@ def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def most_at_wall(largest, material, cosine):  # type: ignore[no-untyped-def]
+def most_at_wall(largest, material, cosine):
     """Return the largest factor of a field at a reflection, for this cosine of incidence or a larger one."""
     return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
 
 
 @njit(cache=True)
-def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-untyped-def]
+def at_wall(largest, material, cosine, sine, slope, field):
     """Return bounds of a reflected field: vertical, horizontal, and the part that is never turned.
 
     `cosine` is for the angle of incidence seen from above; `sine` and `slope` are the horizontal and vertical part of
@@ -253,7 +251,7 @@ def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # type: ignore[no-untyped-def]
+def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
     """Return bounds of a diffracted field as `at_wall` does, without the spread of the wave.
 
     `tables` are `reflection` and `transition` of `Materials`, `boundary` is sqrt(2 k L), `cosines` are for incidence
@@ -272,7 +270,7 @@ def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # 
 
 
 @njit(cache=True)
-def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-def]
+def most_at_edge(terms, boundary, face_0, face_n):
     """Return a rough bound of a diffracted field, from the largest reflections of both faces."""
     size = 0.0
     for k, other, face in ((0, 3, face_0), (1, 2, face_n)):
@@ -286,7 +284,7 @@ def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyped-def]
+def at_flats(largest, material, slope, bounces, field):
     """Return a bound of a vertical field after reflections off floor and ceiling, anywhere in the path."""
     at = min(int(slope * _ANGLES), _ANGLES - 1)
     te, tm = largest[material, at, 0], largest[material, at, 1]
@@ -295,7 +293,7 @@ def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _te_part(along, sine, slope):  # type: ignore[no-untyped-def]
+def _te_part(along, sine, slope):
     """Return the fraction of a vertical field's power perpendicular to the plane of incidence at a wall.
 
     `along` is the squared cosine of the angle between path and wall, seen from above.
@@ -304,7 +302,7 @@ def _te_part(along, sine, slope):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-def]
+def _at_face(faces, material, cosine, sine, slope):
     """Return the coefficient of a vertical field at a face of a wedge, and magnitudes of the others.
 
     To Sionna RT, a face in the shadow (negative cosine) is a perfect mirror.
@@ -320,13 +318,13 @@ def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _size(number):  # type: ignore[no-untyped-def]
+def _size(number):
     """Return the magnitude of a complex number; `abs` is slower, as it guards against overflow."""
     return math.sqrt(number.real * number.real + number.imag * number.imag)
 
 
 @njit(cache=True)
-def wedge_angle(angle, exterior):  # type: ignore[no-untyped-def]
+def wedge_angle(angle, exterior):
     """Return sine and cosine of an angle / 2 n, and of half of it, for `utd_terms`; n is the exterior angle / pi."""
     scaled = angle * 0.5 * math.pi / exterior
     return math.sin(scaled), math.cos(scaled), math.sin(0.5 * angle), math.cos(0.5 * angle)
@@ -340,7 +338,7 @@ def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def utd_terms(wedge, arrival, departure, terms):  # type: ignore[no-untyped-def]
+def utd_terms(wedge, arrival, departure, terms):
     """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
 
     `terms` (4, 3) receives cot(psi) / 2 n, with y = sqrt(a / 2) the sine of n times the angle from psi to the nearest
@@ -362,8 +360,7 @@ def utd_terms(wedge, arrival, departure, terms):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def utd_term(transition, terms, k, boundary):  # type: ignore[no-untyped-def]
-    """Return one of the terms of `utd_terms` for sqrt(2 k L)."""
+def utd_term(transition, terms, k, boundary):
     y = boundary * terms[k, 1]
     if y < _ASYMPTOTIC:
         at = int(y * _STEPS)
@@ -373,22 +370,21 @@ def utd_term(transition, terms, k, boundary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def vertical_field(k):  # type: ignore[no-untyped-def]
+def vertical_field(k):
     """Return the field of a vertical antenna: the unit vector along theta of spherical coordinates."""
     flat = max(np.hypot(k[0], k[1]), 1e-12)
     return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
 
 
 @njit(cache=True)
-def received_power(k, e):  # type: ignore[no-untyped-def]
-    """Return the fraction of a field's power that a vertical antenna receives."""
+def received_power(k, e):
     vertical = vertical_field(k)
     field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
     return field.real**2 + field.imag**2
 
 
 @njit(cache=True)
-def at_slab(k, e, n, materials, material, kind):  # type: ignore[no-untyped-def]
+def at_slab(k, e, n, materials, material, kind):
     """Return direction and field after a reflection at a slab with unit normal `n`, or a refraction."""
     along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]
     sx, sy, sz = k[1] * n[2] - k[2] * n[1], k[2] * n[0] - k[0] * n[2], k[0] * n[1] - k[1] * n[0]

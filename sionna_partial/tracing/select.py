@@ -220,7 +220,7 @@ class Limits(NamedTuple):
 
 
 @njit(cache=True)
-def discount_after(limits, reflections):  # type: ignore[no-untyped-def]
+def discount_after(limits, reflections):
     """Return the discount of power after so many reflections at walls."""
     return limits.discount ** max(0, reflections - _USUAL_REFLECTIONS)
 
@@ -246,7 +246,7 @@ def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: f
 
 
 @njit(cache=True)
-def matters(fraction, near, needed):  # type: ignore[no-untyped-def]
+def matters(fraction, near, needed):
     """Return whether a ray with a fraction of its power left, at least `near` long, may matter to any receiver."""
     at = np.searchsorted(needed.distance_m, near)
     if at < len(needed.distance_m) and fraction >= needed.relative[at]:
@@ -255,7 +255,7 @@ def matters(fraction, near, needed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _first_needed(start, power, allowed):  # type: ignore[no-untyped-def]
+def _first_needed(start, power, allowed):
     """Return the first power of each receiver (N,), the weakest first, that may not be left out.
 
     Receiver k has the powers `start[k]` to `start[k + 1]` and may lack `allowed[k]` in all.
@@ -272,7 +272,6 @@ def _first_needed(start, power, allowed):  # type: ignore[no-untyped-def]
 
 
 def levels_of(bound: Floats) -> NDArray[np.uint8]:
-    """Return the levels (C,) of upper bounds of power (C,)."""
     mantissa, exponent = np.frexp(bound)
     level = np.clip(_STRONGEST - 2 * exponent + (mantissa < math.sqrt(0.5)), 1, LEVELS - 1)
     level = np.where(bound > 0.0, level, LEVELS - 1)

@@ -338,7 +338,6 @@ class Simulation:
             yield self._in_world(tx, chosen, finder.paths(*ends, polarisations, part, antenna))
 
     def _in_world(self, tx: int, chosen: NDArray[np.int32], found: Iterator[Found]) -> Iterator[Found]:
-        """Return paths in world coordinates, with the numbers of their transmitter and receivers."""
         for candidates, paths in found:
             if len(paths.a):
                 world = replace(paths, vertices_m=self.in_world(paths.vertices_m))
@@ -501,7 +500,6 @@ def resolved_settings(
 
 
 def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> int:
-    """Return the number of geometries over which powers are averaged."""
     if not partial.environment.is_extruded or trace_settings.power_tolerance_db is not None:
         return 1
     if scene_settings.geometries is not None:

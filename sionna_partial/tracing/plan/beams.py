@@ -209,7 +209,7 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _follow_beams(beams, before, first, stop, task):  # type: ignore[no-untyped-def]
+def _follow_beams(beams, before, first, stop, task):
     """Follow some beams, of which there are others `before`; return as `follow`, without sequences."""
     layers, building = _layers_of(task.building.plan), task.building
     plan, opaque, room, receivers = building.plan, building.limits.walls == 0, building.room, task.receivers
@@ -259,8 +259,7 @@ def _follow_beams(beams, before, first, stop, task):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _layers_of(plan):  # type: ignore[no-untyped-def]
-    """Make scratch for the walls in one beam and their layers."""
+def _layers_of(plan):
     size = len(plan.pieces_m)
     edges = 2 * size + 2
     return _Layers(
@@ -277,7 +276,7 @@ def _layers_of(plan):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip_walls(plan, beam, own, opaque, layers):  # type: ignore[no-untyped-def]
+def _clip_walls(plan, beam, own, opaque, layers):
     """Clip the walls in a beam, only the nearest if opaque, and sort their edges; return their number."""
     scratch, grid = layers.clipped, plan.cells.grid
     scratch.visit[-1] += 1
@@ -305,7 +304,7 @@ def _clip_walls(plan, beam, own, opaque, layers):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _look(count, line, low, layers, span, wall):  # type: ignore[no-untyped-def]
+def _look(count, line, low, layers, span, wall):
     """Split a beam by the nearest opaque wall and the low walls before it.
 
     Returns windows (t0, 1 / r0, t1, 1 / r1), their clipped walls, -1 for none, and their number.
@@ -346,7 +345,7 @@ def _look(count, line, low, layers, span, wall):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _lay(beam, count, task, layers, windows):  # type: ignore[no-untyped-def]
+def _lay(beam, count, task, layers, windows):
     """Put the walls of a beam into layers; return the windows that reflect it.
 
     Windows are (t from, t to, power after reflections, power after walls), (clipped wall, walls crossed), and their
@@ -366,15 +365,14 @@ def _lay(beam, count, task, layers, windows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _nearness(layers, c, t):  # type: ignore[no-untyped-def]
+def _nearness(layers, c, t):
     """Return 1 / r of a clipped wall at t."""
     found = layers.clipped.found
     return found[c, 1] + layers.slope[c] * (t - found[c, 0])
 
 
 @njit(cache=True)
-def _sort_by_distance(layers, count, t):  # type: ignore[no-untyped-def]
-    """Sort the active walls, which are nearly sorted, by distance at t."""
+def _sort_by_distance(layers, count, t):
     active = layers.clipped.active
     for j in range(1, count):
         c, k = active[j], j
@@ -386,7 +384,7 @@ def _sort_by_distance(layers, count, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped-def]
+def _lay_one(beam, i, active, task, layers, windows):
     """Put the walls between two edges into layers."""
     scratch, plan_line, low = layers.clipped, task.building.plan.line, task.building.plan.low
     pieces = task.building.plan.pieces_m
@@ -440,7 +438,7 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _is_solid(pieces, solid, beam, piece):  # type: ignore[no-untyped-def]
+def _is_solid(pieces, solid, beam, piece):
     """Return whether a beam meets a wall from inside it."""
     px, py = pieces[piece, 0, 0], pieces[piece, 0, 1]
     dx, dy = pieces[piece, 1, 0] - px, pieces[piece, 1, 1] - py
@@ -449,7 +447,7 @@ def _is_solid(pieces, solid, beam, piece):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _extend(layers, lines, material, c, new, windows):  # type: ignore[no-untyped-def]
+def _extend(layers, lines, material, c, new, windows):
     """Add a window that reflects a beam, or enlarge the one beside it."""
     t0, t1, reflected, left, crossed = new
     span, wall, count = windows
@@ -469,14 +467,14 @@ def _extend(layers, lines, material, c, new, windows):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _piece_of(layers, c, span):  # type: ignore[no-untyped-def]
+def _piece_of(layers, c, span):
     """Return a part of a view as input of `reflect`: (t0, w0, t1, w1)."""
     w0, w1 = _nearness(layers, c, span[0]), _nearness(layers, c, span[1])
     return span[0], max(w0, 1e-9), span[1], max(w1, 1e-9)
 
 
 @njit(cache=True)
-def _is_needed(beam, task):  # type: ignore[no-untyped-def]
+def _is_needed(beam, task):
     """Return whether a beam may matter, now or after more reflections."""
     limits = task.building.limits
     order = limits.reflections - beam.more
@@ -490,8 +488,7 @@ def _is_needed(beam, task):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _window_distance(beam):  # type: ignore[no-untyped-def]
-    """Return the distance of a window from the source of its beam."""
+def _window_distance(beam):
     ax, ay, bx, by = beam[2] - beam[0], beam[3] - beam[1], beam[4] - beam[0], beam[5] - beam[1]
     wx, wy = bx - ax, by - ay
     size = np.hypot(wx, wy)
@@ -501,7 +498,7 @@ def _window_distance(beam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _reaches(beam, near, left, needed):  # type: ignore[no-untyped-def]
+def _reaches(beam, near, left, needed):
     """Return whether a beam would matter to any receiver behind its window if no wall were there."""
     x0, y0, edge, (rows, columns) = needed.grid[0], needed.grid[1], needed.grid[2], needed.cells.shape
     corner = cone_of(beam, True, needed.grid, rows)
@@ -521,7 +518,7 @@ def _reaches(beam, near, left, needed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _add_pairs(beam, number, count, task, layers, pairs):  # type: ignore[no-untyped-def]
+def _add_pairs(beam, number, count, task, layers, pairs):
     """Pair a reflected beam with the receivers that need it, behind a wall or after one."""
     window, receivers, (pair, through, used) = beam.window, task.receivers, pairs
     ax, ay, bx, by = window[2] - window[0], window[3] - window[1], window[4] - window[0], window[5] - window[1]
@@ -552,7 +549,7 @@ def _add_pairs(beam, number, count, task, layers, pairs):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _left_at(beam, count, layers, t, r):  # type: ignore[no-untyped-def]
+def _left_at(beam, count, layers, t, r):
     """Return a bound of a beam's power after walls at a point; 0 if no wall is in front of it."""
     edge = layers.clipped.edge
     low, high = 0, 2 * count + 1
