@@ -80,7 +80,7 @@ class Kind(NamedTuple):
     """Standard deviation of measured gains from a trace through observed space [dB]."""
 
     deepest: float
-    """Lower limit of residuals when kinds are compared: unseen walls make single links arbitrarily deep (times -1)."""
+    """Limit of negative residuals when kinds are compared: unseen walls make single links arbitrarily deep."""
 
     exact: bool
     """True if certain predictions stay certain; for a real radio no trace is certain."""
@@ -411,8 +411,8 @@ class _Compared(NamedTuple):
         return self._hypothesis(k, p)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
-        """Return averages (P,) [dB] of the prior above free space, the measured gain above the prior, and the prior's
-        spread.
+        """Return averages (P,) of the prior above free space, the measured gain above the prior, and the prior's spread
+        [dB].
         """
         averaged, free_db = self.sample.averaged, self.links.free_space_db(self.sample.measured.rx)
         below_db, above_db = prior.gain_mean_db - free_db, self.sample.level_db - prior.gain_mean_db
