@@ -54,7 +54,6 @@ from sionna_partial.worlds.robot import (
 )
 
 GOALS = ("coverage", "state", "area")
-"""Goals of a view; the first is the default."""
 
 MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 """Largest numbers of returned poses and of predicted transmitters."""

@@ -61,7 +61,7 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
 
 
 @njit(cache=True)
-def _join(clearance, order, nx, ratio, smallest):  # type: ignore[no-untyped-def]
+def _join(clearance, order, nx, ratio, smallest):
     parent = np.full(len(clearance), -1)
     openings, count, areas = np.zeros(len(order)), 0, 0
     for cell in order:
@@ -196,11 +196,9 @@ class ImportNotes:
     _counts: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def use(self, name: str, count: int = 1) -> None:
-        """Count used elements."""
         self.skip(name, count, "")
 
     def skip(self, name: str, count: int, reason: str) -> None:
-        """Count skipped elements."""
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
@@ -222,7 +220,6 @@ class ImportNotes:
 
 
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
-    """Return the report of a map with the cells (ny, nx)."""
     free, known = state == CellState.FREE, state != CellState.UNKNOWN
     rooms = rooms_of(free, resolution_m)
     spans = [_span(known.any(axis=axis)) * resolution_m for axis in (0, 1)]

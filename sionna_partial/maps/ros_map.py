@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 MODES = ("trinary", "scale", "raw")
 
 UNKNOWN_SHADE = 205
-"""Shade of unknown cells in saved maps [of 255]."""
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of written maps (map_server's; the shade 205 stays unknown)."""
@@ -231,7 +230,6 @@ def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[flo
 
 
 def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint8]]) -> None:
-    """Write a YAML, and PGM images from pixels (ny, nx) with the smallest y first, all or none."""
     with atomic_write(path, "w") as sheet, ExitStack() as together:
         sheet.write(text)
         sheet.flush()  # a full disk fails here, not after the pictures are there
@@ -513,7 +511,6 @@ def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Imag
 
 
 def bare_image(path: Path) -> MapError:
-    """Return the error for an image without resolution."""
     remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
     if path.suffix.lower() != ".pgm":
         remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"

@@ -309,7 +309,7 @@ def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Float
 
 
 @njit(cache=True)
-def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
+def _find_runs(points, swapped, tolerance, cost, previous, along_y):
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
@@ -320,7 +320,7 @@ def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ig
 
 
 @njit(cache=True)
-def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: ignore[no-untyped-def]
+def _extend(points, tolerance, start, swap, cost, previous, along_y):
     """Lengthen the run from `start` while a line fits, and note where that makes a split cheaper."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
@@ -347,7 +347,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 
 
 @njit(cache=True)
-def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
+def _line(points, start, end, tolerance):
     """Return a point on and the direction of the line that fits a run; a ragged one may be parallel to an axis."""
     for factor in (1.0, RAGGED_FACTOR):
         limit, moments = factor * tolerance, np.zeros(6)
@@ -379,7 +379,7 @@ def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
+def _clip_element(polygon, size, element, tolerance):
     x0, y0, x1, y1, steps = element
     if size > 0:
         size = _clip(polygon, size, x0, y0, tolerance)
@@ -389,7 +389,7 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _middles(points, origin, k):  # type: ignore[no-untyped-def]
+def _middles(points, origin, k):
     x, y = points[k, 0] - points[origin, 0], points[k, 1] - points[origin, 1]
     dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
     a, b = abs(round(dx)), abs(round(dy))
@@ -401,7 +401,7 @@ def _middles(points, origin, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _accumulate(moments, element):  # type: ignore[no-untyped-def]
+def _accumulate(moments, element):
     """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
     x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
@@ -416,7 +416,7 @@ def _accumulate(moments, element):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _residual_variance(moments):  # type: ignore[no-untyped-def]
+def _residual_variance(moments):
     mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
     xx = moments[3] / moments[0] - mean_x * mean_x
     xy = moments[4] / moments[0] - mean_x * mean_y
@@ -425,7 +425,7 @@ def _residual_variance(moments):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _all_lines():  # type: ignore[no-untyped-def]
+def _all_lines():
     polygon = np.empty((_CORNERS, 2))
     for k in range(len(_ALL_LINES)):
         polygon[k, 0], polygon[k, 1] = _ALL_LINES[k, 0], _ALL_LINES[k, 1]
@@ -433,7 +433,7 @@ def _all_lines():  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
+def _clip(polygon, size, x, y, tolerance):
     """Keep the lines that pass (x, y) within the tolerance along y; return the number of corners left."""
     kept = np.empty((_CORNERS, 2))
     for side in (1.0, -1.0):

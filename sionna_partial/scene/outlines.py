@@ -499,7 +499,7 @@ def bin_points(points_m: Floats) -> PointBins:
 
 
 @njit(cache=True)
-def grow(array, size):  # type: ignore[no-untyped-def]
+def grow(array, size):
     """Return the array, enlarged if it has fewer than `size` rows."""
     if size <= array.shape[0]:
         return array
@@ -563,7 +563,7 @@ def _index(walls: Floats) -> WallIndex:
 
 
 @njit(cache=True)
-def _cells_of(walls, grid):  # type: ignore[no-untyped-def]
+def _cells_of(walls, grid):
     x0, y0, edge, columns, rows = grid[0], grid[1], grid[2], int(grid[3]), int(grid[4])
     cell, piece, count = np.empty(1024, np.int64), np.empty(1024, np.int32), np.int64(0)
     for i in range(len(walls)):

@@ -48,7 +48,6 @@ Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
 
 
 def union_of(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
-    """Return the union of shapes on a grid of `GRID_M`."""
     return shapely.union_all(list(shapes), grid_size=GRID_M)
 
 
@@ -59,7 +58,6 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
 
 
 def log_uniform(rng: Rng, between: tuple[float, float]) -> float:
-    """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(*np.log(between))))
 
 

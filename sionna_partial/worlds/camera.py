@@ -227,7 +227,7 @@ class _Walk(NamedTuple):
 
 
 @njit(cache=True)
-def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-untyped-def]
+def _cast_rays(truth, missed, hits, passes, corner, rays):
     """Count the rays of one picture that end in walls and that cross cells, from the cell `corner` on."""
     (x, y), shift, angles, noise, range_cells, cleared_cells, turn, grazing = rays
     for ray in range(len(angles)):
@@ -249,7 +249,7 @@ def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-untyped-def]
+def _fuse(all_hits, all_passes, hits, passes, fusion, seen):
     for row in range(seen.shape[0]):
         for column in range(seen.shape[1]):
             hit, passed = hits[row, column], passes[row, column]
@@ -265,7 +265,7 @@ def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
+def _ranges(truth, x, y, angles, range_cells):
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
         ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells, 0.0)[1]
@@ -273,7 +273,7 @@ def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-untyped-def]
+def _read(truth, missed, x, y, angle, range_cells, grazing):
     """Return what ends a ray (wall, unknown cell, nothing), and a distance within that cell.
 
     The distance is NaN where a wall is missed, or met at a sine of less than `grazing` to its face.
@@ -292,7 +292,7 @@ def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _start(x, y, angle):  # type: ignore[no-untyped-def]
+def _start(x, y, angle):
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
     step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
@@ -304,7 +304,7 @@ def _start(x, y, angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next(walk):  # type: ignore[no-untyped-def]
+def _next(walk):
     row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
     if next_x < next_y:
         column, next_x = column + walk.step_x, next_x + walk.pace_x

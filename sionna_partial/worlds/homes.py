@@ -39,10 +39,8 @@ from sionna_partial.worlds.buildings import (
 )
 
 RESOLUTION_M = 0.05
-"""Default edge of a cell [m]."""
 
 LARGE_RESOLUTION_M = 0.1
-"""Default edge of a cell of the large kinds (floor, hall, warehouse) [m]."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""
