@@ -262,7 +262,7 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Walls from floor to ceiling in all wall cells of a map; the class attributes are as of `SceneMesh`.
+    """Walls from floor to ceiling in all wall cells of a map.
 
     `is_extruded`: the cells show the walls at any height. `suffixes`: possible suffixes of map files, the usual one
     first. `receivers_at_once`: number of receivers whose paths are found at once, which bounds the memory.

@@ -117,9 +117,7 @@ class ImportSource:
 
 @dataclass(frozen=True)
 class ImportReport(ImportSource, Shown):
-    """Report of a map that was read from a file.
-
-    Size, rooms and doors are computed from the cells of the map, and so check the import.
+    """Report of a map that was read from a file; size, rooms and doors are computed from the cells of the map.
 
     Parameters
     ----------
@@ -204,8 +202,7 @@ class ImportNotes:
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
         """Return a PartialMap with its report, and warn of implausible results.
 
-        `size`, `doors` and `area` are remedies for an implausible extent, implausible doors, or hardly any enclosed
-        area. A check without a remedy is skipped.
+        `size`, `doors` and `area` are remedies; a check without a remedy is skipped.
         """
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))

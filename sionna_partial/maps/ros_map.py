@@ -264,8 +264,8 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
     """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
 
     Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is ignored. Any other yaw
-    samples the grid at cells of half the size: a wall of one cell stays at least two cells thick, more than a diagonal
-    step needs (sqrt 2). Gaps where walls meet only at a corner are closed, so that a complete map stays complete.
+    samples the grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs
+    (sqrt 2). Gaps where walls meet only at a corner are closed.
 
     Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
     """
@@ -312,9 +312,9 @@ def fitted_threshold(
 ) -> float | None:
     """Return the occupancy that separates free cells and walls in a map of continuous values, else None.
 
-    Such a map, as of Cartographer, has many seen cells of many values between the thresholds. The threshold is in the
-    valley of the histogram (V,), between two well separated distributions with means below and above 50 percent. An
-    empty remedy keeps the thresholds, which the caller chose.
+    Such a map, as of Cartographer, has many different values between the thresholds. The result is in the valley of the
+    histogram (V,), between two well separated distributions with means below and above 50 percent. An empty remedy
+    keeps the thresholds, which the caller chose.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
     inside = int(count[between].sum())

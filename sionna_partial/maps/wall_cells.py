@@ -79,10 +79,10 @@ class CleanWalls(NamedTuple):
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
     """Clean the wall cells of a map with states (ny, nx).
 
-    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps in
-    seen walls are closed, of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to
-    `MAX_FREE_GAP_M`. Of walls seen from FREE cells only the cells beside these, and inner corners of deep walls, are
-    kept. Walls two cells thick are thinned.
+    Enclosed pinholes are filled, notches and bumps of one by at most two cells are levelled, and gaps in seen walls are
+    closed: of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to `MAX_FREE_GAP_M`. Of walls seen
+    from FREE cells only the cells beside these, and inner corners of deep walls, are kept. Walls two cells thick are
+    thinned.
     """
     wall = _fill_pinholes(state == CellState.WALL)
     free = ~_fill_pinholes((state != CellState.FREE) | wall)
@@ -106,8 +106,8 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
-    Both touch a FREE cell only by a corner. The faces end at an inner corner; behind an outer one, and behind a step of
-    a tilted face, another FREE cell is beside one of them. Walls without FREE cells within `DEEP_CELLS` are deep.
+    Both touch a FREE cell only by a corner. Behind an outer corner, and behind a step of a tilted face, another FREE
+    cell is beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
@@ -128,8 +128,8 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     """Return the noise of `CleanWalls`.
 
-    Rays mark one layer of cells with smooth faces; with noise they mark several, with rough faces. Walls of plans are
-    thick, but smooth.
+    Exact rays mark one layer of cells with smooth faces, noisy ones several with rough faces. Walls of plans are thick,
+    but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
@@ -169,8 +169,8 @@ def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
-    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones, between two pieces. The shortest line between
-    them closes it, or the row itself where rays passed that line.
+    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones. The shortest line between the pieces closes it,
+    or the row itself where rays passed that line.
     """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
     label, _ = ndimage.label(gap, structure=_SQUARE)
@@ -286,11 +286,11 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along x or y
-    (whichever the line is steeper against). A polyline that turns back four times or more, and at least once in 10
-    cells, is ragged: `RAGGED_FACTOR` times the tolerance is allowed. The split minimises the number of runs plus three
-    times their residual variances, in squared tolerances. The line is the least-squares one if it keeps the tolerance;
-    a ragged one is parallel to an axis if that moves its ends by at most half a cell.
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
+    the line is steeper against. Ragged polylines, which turn back four times or more and at least once in 10 cells, get
+    `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
+    variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
+    ragged runs if that moves their ends by at most half a cell.
 
     Returns the index of the first corner of every run (r,), and a point x, y on and the direction x, y of its line (r,
     4).

@@ -74,9 +74,7 @@ class SceneGeometry:
     open_end : (V,) bool array
         True where a wall ends because observation ended.
     wall_material : (S,) int64 array
-        Index into `materials` of each wall.
-    materials : tuple of Material
-        The first is the material of floor and ceiling.
+        Index into `materials`; the first of these is also the material of floor and ceiling.
     top_m : (S,) float64 array
         Height of each wall [m]; less than `height_m` for obstacles.
     lids : tuple of Lid

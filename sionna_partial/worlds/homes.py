@@ -1,8 +1,8 @@
 """Procedural homes: complete floor plans from a seed.
 
-A plan consists of polygons in metres: an outline, rooms, openings along a spanning tree of the rooms and a few more,
-and furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
-robots and scanners. `docs/researchers.md` compares the plans with real homes.
+A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
+furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
+robots. `docs/researchers.md` compares the plans with real homes.
 """
 
 import math

@@ -1,8 +1,7 @@
-"""The exploring robot: frontiers, goals and routes.
+"""The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-It follows Active Neural SLAM (Chaplot et al., ICLR 2020): each action is a quarter of a metre forward or a turn of ten
-degrees, with a long-term goal every 25 steps. Frontiers drawn at random, as Active Neural SLAM draws its goals, and
-shortest paths over seen cells replace the learnt policies.
+Each action is a quarter of a metre forward or a turn of ten degrees, with a long-term goal every 25 steps. Frontiers
+drawn at random and shortest paths over seen cells replace the learnt policies.
 """
 
 import math
