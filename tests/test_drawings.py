@@ -123,7 +123,6 @@ def test_wrong_units(name: str, unit_m: float, message: str | None) -> None:
 @pytest.mark.parametrize("header", [0, 4, 5, 6])
 @pytest.mark.parametrize("unit_m", [0.001, 0.01, 1.0])
 def test_units_of_a_plan(tmp_path: Path, header: int, unit_m: float) -> None:
-    """Right headers are taken without a word; wrong and missing ones are seen by doors and walls."""
     drawing(header, unit_m).saveas(tmp_path / "plan.dxf")
     is_right = {4: 0.001, 5: 0.01, 6: 1.0}.get(header) == unit_m
     message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
@@ -313,7 +312,6 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 
 def test_layers_without_names(tmp_path: Path) -> None:
-    """All visible layers are walls; hidden ones are not."""
     doc = drawing(layer="LAYER1")
     for name in ("A-FURN", "A-DOOR", "A-WALL-HEAD", "A-GLAZ"):
         doc.layers.get(name).off()

@@ -15,7 +15,6 @@ from sionna_partial.settings import SensorSettings
 
 @pytest.fixture(scope="module")
 def home() -> PartialMap:
-    """Two rooms and a door, in the middle of a larger grid."""
     state = np.full((90, 140), CellState.UNKNOWN, dtype=np.uint8)
     state[20:70, 20:120] = CellState.WALL
     state[21:69, 21:119] = CellState.FREE

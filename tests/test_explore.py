@@ -196,8 +196,6 @@ def test_observed_fractions_on_real_homes(homes, expected):
 
 
 class TestFractions:
-    """Stages by the observed fraction of the free area."""
-
     def test_each_is_reached_and_not_long_before(self, home):
         exploration = explore_trajectory(home, (0, 0.25, 0.5, 0.75), 3)
         assert exploration.steps[0] == 0

@@ -264,7 +264,6 @@ def test_failed_scene_leaves_what_was(tmp_path: Path, existing: bool) -> None:
 
 @pytest.mark.parametrize("failing", range(6))
 def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
-    """Whichever of the six moves fails, the old scene is back."""
     write_scene(tmp_path, b"old ")
     moves, move = [], os.replace
 

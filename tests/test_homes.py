@@ -81,7 +81,6 @@ def roamed_fraction(home: PartialMap, radius_m: float) -> float:
 
 
 def test_a_robot_gets_around():
-    """A disc of 0.18 m gets nearly everywhere, though doors and furniture narrow the passages."""
     fractions = [roamed_fraction(made(seed), 0.18) for seed in range(16)]
     assert np.mean(np.array(fractions) >= 0.95) >= 0.9, fractions
     assert min(fractions) > 0.8, fractions
@@ -95,7 +94,6 @@ def rooms_of(home: PartialMap, smallest_m2: float) -> int:
 
 
 def test_rooms_are_behind_doors():
-    """A body wider than any door is shut in: homes have doors and rooms, and are no single hall."""
     for seed in range(4):
         homes = [made(seed, kind) for kind in STYLES]
         assert sum(rooms_of(home, 0.5) for home in homes) >= 4
@@ -141,7 +139,6 @@ def test_kinds_differ_in_size_and_none_draws_one():
 
 
 def longest_run_along_x(free: np.ndarray) -> int:
-    """Length of the longest straight wall along the rows [cells]."""
     labels, _ = ndimage.label(free[1:] != free[:-1], structure=[[0, 0, 0], [1, 1, 1], [0, 0, 0]])
     return int(np.bincount(labels.ravel())[1:].max())
 

@@ -72,7 +72,6 @@ def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> N
 
 
 def export(folder: Path, image: str = "map.pgm") -> Path:
-    """Write what load_map needs of an exported scene."""
     save_map(SMALL, folder / "map.yaml", extra={"scene_offset": [1.0, 2.0]})
     (folder / "scene.xml").write_text("<scene/>")
     sheet = yaml.safe_load((folder / "map.yaml").read_text())
@@ -133,9 +132,8 @@ def test_refused(tmp_path: Path, spoil: Callable[[Path], object], name: str, mes
 
 
 def test_arguments_of_another_type(tmp_path: Path) -> None:
-    for path in (None, SMALL):
-        with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
-            load_map(path)  # type: ignore[arg-type]
+    with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
+        load_map(SMALL)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
         load_map(tmp_path, strict=1)  # type: ignore[arg-type]
 
@@ -235,14 +233,10 @@ DAMAGED = "is damaged or was not written by save_map"
         *(
             (npz_bytes(**WHOLE | changes), message)
             for changes, message in (
-                ({"resolution_m": [0.1, 0.2]}, DAMAGED),
                 ({"state": np.array([[None]])}, DAMAGED),
-                ({"interior_cells": "many"}, DAMAGED),
                 ({"material": "brick"}, DAMAGED),
                 ({"resolution_m": 50.0}, "resolution_m = 50.0 is not allowed"),
                 ({"origin_m": (np.nan, 0.0)}, "origin_m = nan is not allowed"),
-                ({"origin_m": (0.0, 0.0, 0.0)}, "origin_m = "),
-                ({"wall_height_m": -1.0}, "wall_height_m = -1.0 is not allowed"),
                 ({"state": np.array([[7]])}, "values 7 to 7"),
             )
         ),
@@ -301,9 +295,6 @@ def test_occupancy_grid() -> None:
     assert partial.origin_m == (1.0, 2.0)
     tight = map_from_occupancy(np.array(data, np.int16), 0.1, occupied_percent=50, free_percent=0)
     assert tight.state.tolist() == [[2, 0, 2], [2, 1, 1], [1, 1, 2]]
-    flat = np.array([-1, 0, 100], dtype=np.int8)
-    assert map_from_occupancy(flat.reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
-    assert map_from_occupancy(flat.view(np.uint8).reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
 
 
 def test_habitat_with_border() -> None:
@@ -331,7 +322,6 @@ def test_habitat_drawings() -> None:
 
 
 def test_slam_channels() -> None:
-    """An obstacle that was not explored is unknown; row 0 is the smallest y."""
     obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
     partial = map_from_slam(obstacle, explored, 0.05, origin_m=(-1.0, -2.0), wall_height_m=2.0)
     assert partial == PartialMap(np.array([[0, 1, 2], [1, 0, 2]]), 0.05, (-1.0, -2.0), 2.0)
@@ -344,22 +334,17 @@ def test_slam_channels() -> None:
     ("kind", "arrays", "options", "message"),
     [
         ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
-        ("array", ([[0, 1], [0]],), {}, "array = [[0, 1], [0]] is not numeric: give integers, in a two-dimensional"),
         ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
         ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
         ("array", ([[-1, 0, 100]],), {}, "UNKNOWN 2, or map_from_occupancy for -1 to 100 percent."),
         ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
-        ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
         ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
-        ("occupancy", ([[0]],), {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
         ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
         ("occupancy", ([[0]],), {"occupied_percent": 0.65, "free_percent": 0.25}, "such as 25 and 65"),
         ("slam", ([[0]], [[1]]), {"threshold": "0.5"}, "threshold = '0.5' is not allowed"),
         ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
         ("habitat", ([[1, -1]], [[1, 1]]), {}, "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
-        ("slam", ([[0, 1]], [[1]]), {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
         ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
-        ("slam", ([[0]], [[255]]), {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
         ("slam", ([[0]], [[1]]), {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
     ],
 )

@@ -39,7 +39,6 @@ TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 
 def written(folder: Path, suffix: str, scene: trimesh.Scene | None = None) -> Path:
-    """Write the room as a mesh file."""
     scene = scene or room()
     if suffix in ("glb", "gltf"):
         scene.apply_transform(TO_Y_UP)

@@ -28,7 +28,6 @@ def drawn(partial: PartialMap) -> str:
 
 
 def upright(ends: list[tuple[float, float]], height_m: float = 3.0) -> SceneMesh:
-    """A thin wall along a line."""
     low = np.array([(x, y, 0.0) for x, y in ends])
     vertices, count = np.concatenate([low, np.add(low, (0, 0, height_m))]), len(low)
     steps = [(i, i + 1) for i in range(count - 1)]

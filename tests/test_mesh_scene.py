@@ -20,7 +20,6 @@ CONCRETE = Material(itu="concrete")
 
 
 def scene(folder: Path, content: str) -> Path:
-    """Write a scene file, and a box beside it."""
     (folder / "meshes").mkdir(exist_ok=True)
     box((0, 0, 0), (5, 4, 3)).export(folder / "meshes" / "box.ply")
     path = folder / "any.xml"
@@ -128,7 +127,6 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
     [
         ("", "holds no shape: give a Mitsuba scene with meshes"),
         ('<include filename="/etc/passwd"/>' + shape("cube"), "has an <include>, which is not followed: put"),
-        ('<path value="/etc"/>' + shape("cube"), "has an <path>, which is not followed"),
         (shape("sphere") + shape("disk"), "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba"),
         (RADIO + shape("obj"), "shape 'it' has the filename '', which is not allowed: put it into"),
         (shape("cube"), "shape 'it' refers to 'wall', which is no bsdf of the scene: add it, or correct the id"),
@@ -145,7 +143,6 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
         (RADIO + shape("cube", moved('<translate X="1"/>')), "has a to_world with <translate {'X': '1'}>, which"),
         (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
         (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
-        (RADIO + shape("cube", moved('<matrix value="1 2"/>')), "has a to_world with <matrix {'value': '1 2'}>, which"),
         (RADIO + shape("cube", moved('<scale value="nan"/>')), "cannot be read (a transform is not finite): "),
         (RADIO + shape("cube", moved('<scale value="0"/>')), "which cannot be read (it flattens the shape): "),
         (
@@ -205,12 +202,9 @@ def test_other_shapes_than_exported(tmp_path: Path) -> None:
     ("record", "offset_m"),
     [
         (None, [0, 0, 0]),
-        ({}, [0, 0, 0]),
-        ({"height_range": [0, 1], "materials": ["concrete"]}, [0, 0, 0]),
         ({"height_range": [0, 1], "materials": [{"itu": "cheese"}]}, [0, 0, 0]),
         ({"height_range": [0], "materials": []}, [0, 0, 0]),
         ({"height_range": [0, 1], "materials": [None]}, [0, 0]),
-        ({"height_range": [0, 1], "materials": [None]}, None),
     ],
 )
 def test_damaged_entry_of_an_exported_mesh(tmp_path: Path, record: dict | None, offset_m: list[float] | None) -> None:  # type: ignore[type-arg]

@@ -27,7 +27,6 @@ def drawn(text: str, resolution_m: float = 0.05) -> PartialMap:
 
 
 def in_cells(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
-    """Segments (S, 2, 2) in cells."""
     return np.round(outlines.vertices_m / partial.resolution_m, 4)[outlines.segments]
 
 
@@ -37,12 +36,10 @@ def segment_set(partial: PartialMap, **options: float) -> set[tuple[tuple[float,
 
 
 def path(*points: tuple[float, float]) -> set[tuple[tuple[float, ...], ...]]:
-    """Segments of a polyline."""
     return {tuple(sorted(pair)) for pair in pairwise(points)}
 
 
 def ring(x0: float, y0: float, x1: float, y1: float) -> set[tuple[tuple[float, ...], ...]]:
-    """Segments of a rectangle."""
     return path((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))
 
 
@@ -73,7 +70,6 @@ def ragged_room(seed: int, thickness: int, fraction: float) -> PartialMap:
 
 
 def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
-    """Largest distance of an outline point from the next WALL cell centre [cells]."""
     row, column = np.nonzero(partial.state == CellState.WALL)
     pairs = in_cells(partial, outlines)
     fraction = np.linspace(0.0, 1.0, 401)[:, None, None]
@@ -82,7 +78,6 @@ def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
 
 
 def distances_from_outlines(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
-    """Distances of the WALL cells that touch FREE ones from the next outline [cells]."""
     wall = partial.state == CellState.WALL
     row, column = np.nonzero(wall & ndimage.binary_dilation(partial.state == CellState.FREE))
     lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, outlines)))
@@ -106,7 +101,6 @@ def kept_regions(partial: PartialMap, outlines: Outlines, scale: int = 5) -> int
 
 
 def lines_of(outlines: Outlines) -> int:
-    """Number of lines that the segments make where they meet."""
     lines = shapely.union_all(shapely.linestrings(outlines.vertices_m[outlines.segments]))
     return shapely.get_num_geometries(shapely.line_merge(lines))
 
@@ -255,7 +249,6 @@ def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None
 
 @pytest.mark.parametrize("cells", [1, 3, 5])
 def test_gap_around_a_corner_is_closed(cells: int) -> None:
-    """Both walls end before they meet: the line between their ends."""
     size = 16
     state = np.full((size, size), CellState.FREE, dtype=np.uint8)
     state[0], state[:, 0] = CellState.UNKNOWN, CellState.UNKNOWN
@@ -317,14 +310,6 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         assert distances_from_outlines(partial, outlines).max() < 0.8
 
 
-@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 4), (17, 6), (45, 4), (45, 6)])
-def test_thick_tilted_wall_has_few_segments(angle_deg: float, thickness: float) -> None:
-    partial = tilted(angle_deg, thickness, 0.2)
-    outlines = wall_outlines(partial)
-    assert 4 <= len(outlines.segments) <= 8
-    assert_sound(outlines)
-
-
 @pytest.mark.parametrize(
     ("thickness", "fraction"), [(1, 0.0), (1, 0.2), (2, 0.05), (3, 0.2), (5, 0.0), (5, 0.05), (5, 0.2)]
 )
@@ -381,7 +366,6 @@ def seen_from_inside(partial: PartialMap) -> PartialMap:
 
 
 def test_niche_of_a_clean_wall_stays() -> None:
-    """One recess is no raggedness: the outline keeps its corners and stays parallel to the axes."""
     wall = np.zeros((12, 70), dtype=bool)
     wall[2:7, 5:65] = True
     wall[5:7, 30:40] = False
@@ -451,7 +435,6 @@ def random_state(seed: int, kind: str) -> NDArray[np.uint8]:
 def test_outlines_turn_and_move_with_the_map(
     seed: int, kind: str, orientation: tuple[bool, int, int], origin: float, padding: tuple[int, int, int, int]
 ) -> None:
-    """A map that is turned, mirrored, moved and padded has the same outlines, turned, mirrored, moved."""
     state = random_state(seed, kind)
     assume(not any(np.array_equal(transformed(state, *other), state) for other in SYMMETRIES))
     here = wall_outlines(PartialMap(state, 0.05))
@@ -466,19 +449,13 @@ def test_outlines_turn_and_move_with_the_map(
 
 
 def test_map_that_is_its_own_mirror_image_has_sound_outlines() -> None:
-    """Of two equal choices one is taken; a plain room needs none."""
     partial = ragged_room(5, 3, 0.2)
     quarter = partial.state[:70, :70]
     quarter = np.where(quarter < quarter.T, quarter, quarter.T)
     half = np.concatenate([quarter, quarter[::-1]])
     whole = PartialMap(np.concatenate([half, half[:, ::-1]], axis=1), 0.05)
     assert_sound(wall_outlines(whole))
-    room = drawn("######## #......# #......# #......# #......# #......# #......# ########")
-    corners = in_cells(room, wall_outlines(room)).reshape(-1, 2)
-    for orientation in SYMMETRIES:
-        assert (transformed(whole.state, *orientation) == whole.state).all()
-        turned = transformed_points(corners, (8, 8), *orientation)
-        assert {tuple(p) for p in turned.tolist()} == {tuple(p) for p in corners.tolist()}
+    assert all((transformed(whole.state, *orientation) == whole.state).all() for orientation in SYMMETRIES)
 
 
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")

@@ -84,7 +84,6 @@ def test_a_corner_has_the_freest_state_around_it(block: list[list[int]], state: 
 
 @given(states)
 def test_is_complete(state: np.ndarray) -> None:
-    """No free cell shares an edge with an unknown one, as all those beyond the grid are."""
     padded = np.pad(state, 1, constant_values=UNKNOWN)
     free = np.argwhere(padded == FREE)
     steps = ((0, 1), (1, 0), (0, -1), (-1, 0))

@@ -140,7 +140,6 @@ def test_y_up() -> None:
 
 
 def test_two_storeys() -> None:
-    """The band selects the storey; by default it is the lowest."""
     upper = np.add(ROOM, (10.0, 0.0, 2.9))
     both = np.concatenate([ROOM, upper])
     require_room(map_from_points(both, observed=[(0, 0), (5.1, 0), (5.1, 3.1), (0, 3.1)]))
@@ -178,20 +177,16 @@ def test_text_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     [
         ({"points": np.zeros((3, 2))}, "points has shape (3, 2): give x, y, z in metres, (N, 3), or the path of a"),
         ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
-        ({"points": [["a"] * 3]}, "points = [['a', 'a', 'a']] is not numeric: give x, y, z in metres, (N, 3)"),
         ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: give unit_m, the length of its unit in metres"),
         ({"points": ROOM * 1000}, "give unit_m, the length of its unit in metres, 0.01 for centimetres"),
         ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
         ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
         ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
         ({"sensor_positions_m": (1.0, 2.0)}, "sensor_positions_m has shape (2,) or values that are not finite: give x"),
-        ({"sensor_positions_m": [(1.0, np.inf)]}, "sensor_positions_m has shape (1, 2) or values that are not finite"),
         ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
         ({"sensor_positions_m": [(1e7, 0.0)]}, "sensor_positions_m has [10000000.0, 0.0], more than 200 m from the"),
         ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
-        ({"up": "x"}, "up = 'x' is not allowed"),
         ({"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres, such as 0.3048 for feet"),
-        ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed"),
     ],
 )
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]

@@ -35,7 +35,6 @@ FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
 
 def write_sheet(folder: Path, *, without: str = "", **changes: object) -> Path:
-    """Write map.yaml: SHEET with changes."""
     sheet = {key: value for key, value in {**SHEET, **changes}.items() if key != without}
     path = folder / "map.yaml"
     path.write_text(yaml.safe_dump(sheet))
@@ -57,7 +56,6 @@ def load_state(folder: Path, shades: object, *, strict: bool = False, **changes:
 
 
 def test_orientation_and_place(tmp_path: Path) -> None:
-    """Image row 0 is the largest y; the origin is the lower-left corner."""
     partial = load_map(write_map(tmp_path, [[0, 205, 205], [254, 254, 205]]))
     assert partial.state.tolist() == [[FREE, FREE, UNKNOWN], [WALL, UNKNOWN, UNKNOWN]]
     assert partial.origin_m == (-1.0, 2.0)
@@ -157,18 +155,14 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
 
 
 def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
-    """In a map with another value for unknown, 205 may be free."""
     assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
 
-
-def test_one_stray_unknown_pixel_does_not_open_the_trap(tmp_path: Path) -> None:
     with pytest.warns(MapWarning, match="2 cells of shade 205"):
         assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
 
 
 @pytest.mark.parametrize("negate", [False, True])
 def test_dark_grey_walls(tmp_path: Path, negate: bool) -> None:
-    """Dark pixels between the thresholds are unknown; more of them than of walls get a warning."""
     shades = np.repeat(np.array([[90, 90, 254], [0, 205, 254]], dtype=np.uint8), 60, axis=0)
     path = write_map(tmp_path, 255 - shades if negate else shades, negate=int(negate))
     message = r"120 dark grey cells \(occupancy from 0\.65\) are read as unknown: if they are walls, set occupied_thr"
@@ -211,7 +205,6 @@ def test_numbers_as_people_write_them(tmp_path: Path) -> None:
 
 
 def test_image_beside_and_elsewhere(tmp_path: Path) -> None:
-    """The image is found relative to the YAML, or by an absolute path."""
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "a b.pgm").write_bytes(PGMS["binary"])
     for image in ("pictures/a b.pgm", str(tmp_path / "pictures" / "a b.pgm")):
@@ -257,7 +250,6 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
     ],
 )
 def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
-    """The error names the file, the field, the value and the remedy."""
     (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
     (tmp_path / "loop").symlink_to("loop")
     for value in values:
@@ -272,12 +264,8 @@ def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], messa
     ("text", "message"),
     [
         (b"", "holds None in place of keys such as image, resolution and origin"),
-        (b"- 1\n- 2\n", r"holds \[1, 2\] in place of keys"),
-        (b"just a text", "holds 'just a text' in place of keys"),
         (b"image: [unclosed", "is not valid YAML"),
-        (b"image: a\n\tresolution: 1", "is not valid YAML"),
         (b"\x00\x01\xff\xfe rubbish", "is not valid YAML"),
-        (bytes(range(128, 256)) * 10, "is not valid YAML"),
         (b"P5\n3 1\n255\n\x00\xcd\xfe", "is not valid YAML"),
         (b"image: a.pgm\nimage: b.pgm", r"is not valid YAML \(it has the key 'image' twice\)"),
         (b"a: 2020-99-99", r"is not valid YAML \(month must be"),
@@ -310,7 +298,6 @@ NO_IMAGE, TOO_MANY = "it is damaged or not a PGM, PNG or BMP", "it has more than
     [
         *((NO_IMAGE, b"P5" + end) for end in (b"", b"\n# only a comment")),
         *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"255\n\x00\xcd", b"100\n\x00\x32", b"65535\n\x00\x00\xcd")),
-        *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"0\n\x00\xcd\xfe", b"70000\n\x00\xcd\xfe")),
         *((NO_IMAGE, b"P5\n%s 1\n255\n\x00\xcd\xfe" % width) for width in (b"0", b"-3", b"three")),
         *((NO_IMAGE, b"P2\n3 1\n255\n0 205" + end) for end in (b"", b" 300", b" white")),
         *((NO_IMAGE, b"\x89PNG\r\n\x1a\n" + end) for end in (b"\x00\x00\x00\rIHDR", b"rubbish" * 20)),
@@ -407,7 +394,6 @@ grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elem
 
 @given(grids, st.integers(-4, 4))
 def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
-    """A world point has the state that the grid has at the point turned back about the corner."""
     yaw = turns * math.pi / 2
     partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw))[:1], 1.0, turn_grid(state, 1.0, (3.0, -2.0, yaw))[2])
     v, u = np.mgrid[: state.shape[0], : state.shape[1]] + 0.5

@@ -55,7 +55,6 @@ def test_a_material_that_is_not_used_is_named(caplog: pytest.LogCaptureFixture) 
 
 
 def covered(rectangles_m: NDArray[np.float64], partial: PartialMap) -> NDArray[np.int_]:
-    """How many rectangles cover each cell."""
     count = np.zeros(partial.shape, dtype=int)
     for x0, y0, x1, y1 in np.rint(rectangles_m / partial.resolution_m).astype(int):
         count[y0:y1, x0:x1] += 1
@@ -74,7 +73,6 @@ def load(folder: Path):  # type: ignore[no-untyped-def]
 
 
 def count_paths(scene, tx: tuple[float, ...], rx: tuple[float, ...]) -> int:  # type: ignore[no-untyped-def]
-    """Number of paths of at most two interactions."""
     import sionna.rt as rt
 
     scene.frequency = 28e9
@@ -260,8 +258,6 @@ def test_far_maps_are_moved_to_the_origin(origin_m: tuple[float, float], tmp_pat
 
 
 class TestMeshScene:
-    """A map with a mesh: its parts, one for each material."""
-
     WOOD = Material(itu="wood", thickness_m=0.05)
 
     def partial(self, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PartialMap:
