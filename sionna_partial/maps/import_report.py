@@ -217,18 +217,14 @@ class ImportNotes:
 
 
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
-    free, known = state == CellState.FREE, state != CellState.UNKNOWN
+    free = state == CellState.FREE
     rooms = rooms_of(free, resolution_m)
-    spans = [_span(known.any(axis=axis)) * resolution_m for axis in (0, 1)]
+    (y, x) = next(iter(ndimage.find_objects((state != CellState.UNKNOWN).astype(np.uint8))), (slice(0, 0),) * 2)
+    extent_m = (x.stop - x.start) * resolution_m, (y.stop - y.start) * resolution_m
     area_m2, doors_m = float(free.sum()) * resolution_m**2, tuple(rooms.openings_m.tolist())
     return ImportReport(
-        **vars(source), extent_m=(spans[0], spans[1]), rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
+        **vars(source), extent_m=extent_m, rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
     )
-
-
-def _span(known: Any) -> int:
-    cells = np.flatnonzero(known)
-    return int(cells[-1] - cells[0]) + 1 if len(cells) else 0
 
 
 def _listed(rows: tuple[Elements, ...]) -> list[str]:

@@ -396,30 +396,23 @@ def _later(reader: str) -> Callable[..., PartialMap]:
 
 _read_cloud = _later("mesh.points:map_from_points")
 
+_UNIT_SOURCES = {".xml": "Mitsuba scene", **dict.fromkeys((".glb", ".gltf"), "specification of glTF")}
+
 
 def _read_mesh(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-    from sionna_partial.maps.mesh.files import read_mesh
+    from sionna_partial.maps.mesh.files import read_mesh, read_mitsuba_scene
 
-    reading = MeshReading(**options)
-    is_gltf = source.suffix.lower() in (".glb", ".gltf")
-    notes = reading.notes(source, "specification of glTF") if is_gltf else reading.notes(source)
-    return reading.attached(notes, mesh_map(read_mesh(source, reading.up, notes), reading))
+    reading, suffix = MeshReading(**options), source.suffix.lower()
+    notes = reading.notes(source, _UNIT_SOURCES.get(suffix, "taken for metres"))
+    mesh = read_mitsuba_scene(source, notes) if suffix == ".xml" else read_mesh(source, reading.up, notes)
+    return reading.attached(notes, mesh_map(mesh, reading))
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.points import is_cloud
 
     return (_read_cloud if is_cloud(source) else _read_mesh)(source, **options)
-
-
-def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-    from sionna_partial.maps.mesh.files import read_mitsuba_scene
-
-    reading = MeshReading(**options)
-    notes = reading.notes(source, "Mitsuba scene")
-    return reading.attached(notes, mesh_map(read_mitsuba_scene(source, notes), reading))
 
 
 def _read_npz(source: Path) -> PartialMap:
@@ -466,7 +459,7 @@ _OPTIONS_OF = {
 
 _OF_SCANS = ("height_band_m", "observed", "resolution_m", "up", "unit_m")
 _BAG = _Reader("a rosbag", _later("bags:map_from_bag"))
-_MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
+_MITSUBA = _Reader("a Mitsuba scene", _read_mesh, _OF_SCANS)
 _CALIBRATED = _Reader("the map of a calibration", _read_npz)
 _EXPORTED = _Reader(
     "an exported map (remove its map.yaml to read the meshes of its scene alone)", bind(read_ros_map, confined=True)

@@ -219,11 +219,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         ['concrete']
         """
         material = Material.named(material) if isinstance(material, str) else material
-        materials = self.wall_materials if material in self.wall_materials else (*self.wall_materials, material)
-        cells = np.zeros(self.shape, np.uint8) if self.wall_material is None else self.wall_material.copy()
-        materials = _checked_materials(_values("wall_materials", materials))
-        cells[self.cells_within(where)] = materials.index(material) + 1
-        return replace(self, wall_material=cells, wall_materials=materials)
+        return self._with_layer("wall_material", material, self.cells_within(where))
 
     def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
         """Return the map with the walls of an area ending at a height, such as furniture that a low lidar sees.
@@ -253,11 +249,16 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         [False, True, False]
         """
         height_m = _number("height_m", height_m, 0.01, 100.0)
-        cells = np.zeros(self.shape, np.uint8) if self.obstacle is None else self.obstacle.copy()
         area = free_standing(self.state, self.resolution_m) if where is None else self.cells_within(where)
-        heights_m = tuple(dict.fromkeys((*self.obstacle_heights_m, height_m)))
-        cells[area] = heights_m.index(height_m) + 1 if height_m < self.wall_height_m else 0
-        return replace(self, obstacle=cells, obstacle_heights_m=heights_m)
+        return self._with_layer("obstacle", height_m, area, is_default=height_m >= self.wall_height_m)
+
+    def _with_layer(self, name: str, value: Any, area: Bools, *, is_default: bool = False) -> "PartialMap":
+        counted, _, checked = _LAYERS[name]
+        values, old = getattr(self, counted), getattr(self, name)
+        values = checked(_values(counted, values if value in values else (*values, value)))
+        cells = np.zeros(self.shape, np.uint8) if old is None else old.copy()
+        cells[area] = 0 if is_default else values.index(value) + 1
+        return replace(self, **{name: cells, counted: values})
 
     def cells_within(self, where: object) -> Bools:
         """Return the cells (ny, nx) of an area, as `where` of `with_wall_material`."""

@@ -21,7 +21,6 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
-from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.partial_map import (
     MAX_CELLS,
@@ -141,7 +140,11 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
-    mesh = _exported_mesh(path.parent, raw) if "mesh" in raw else None
+    mesh = None
+    if "mesh" in raw:
+        from sionna_partial.maps.mesh.files import read_exported_mesh  # few maps have a mesh, and trimesh is heavy
+
+        mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset"))
     layers: dict[str, Any] = {}
     for name, (listed, target, made) in _LAYERS.items():
         if name in raw:
@@ -185,12 +188,6 @@ def _layer(
     if abs(origin[2] - turns * math.pi / 2) * math.hypot(*cells.shape) > 0.5:
         raise _refuse(path, "origin", [*origin], f"with {name} its yaw must be a quarter turn, or 0.")
     return np.rot90(cells, -turns)
-
-
-def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
-    from sionna_partial.maps.mesh.files import read_exported_mesh  # few maps have a mesh, and trimesh is heavy
-
-    return read_exported_mesh(folder, raw["mesh"], raw.get("scene_offset"))
 
 
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
