@@ -217,13 +217,8 @@ def map_from_occupancy(
     data : OccupancyGrid or (height, width) integers
         A message (rclpy, rospy, rosbags; any object with its `info` and `data`), or an array: occupancy in percent,
         0 to 100, and -1 (or 255) for unknown. Row 0 holds the smallest y, as in ROS.
-    resolution_m : float or None
-        Edge of a cell [m]; None for a message.
-    origin_m : (float, float) or None
-        World x and y of the lower-left corner [m], (0, 0) by default; None for a message. The yaw of a message's
-        origin is applied: quarter turns are exact, any other yaw halves the size of the cells.
-    wall_height_m : float
-        Height of walls and ceiling [m].
+    resolution_m, origin_m, wall_height_m
+        As of `map_from_array`. A message has its own resolution and origin, whose yaw is applied as in `load_map`.
     occupied_percent, free_percent : float or None
         From the first value a cell is wall; up to the second it is free. By default 65 and 25, as in nav2's map_saver,
         or, for continuous values as of Cartographer, one fitted threshold, with a `MapWarning`.

@@ -315,7 +315,6 @@ def with_materials(
 def _with_heights(
     path: Path, partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], heights_m: dict[float, set[str]]
 ) -> PartialMap:
-    """Apply heights [m] to the walls on some layers, and warn of walls of partial height without one."""
     named = set().union(*heights_m.values())
     low = sorted(layer for layer in set(on_layer.tolist()) - named if PARTIAL_HEIGHT.search(layer))
     if low:

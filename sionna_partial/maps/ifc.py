@@ -166,7 +166,6 @@ def _given(path: Path, model: Any, given: Mapping[str, Material | str]) -> dict[
 
 
 def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: ImportNotes) -> list[_Piece]:
-    """Cut the walls at a height [m]; windows and doors come after the walls that contain them."""
     kinds = [kind for kind in TYPES if kind != DOOR or kind in given]
     owner_of = _bodies(model, kinds)
     cuts = _cuts(model, height_m, [model.by_id(body) for body in owner_of], notes)

@@ -283,9 +283,9 @@ def map_from_habitat(
 ) -> PartialMap:
     """Make a map from Habitat's top-down map and its fog-of-war mask.
 
-    Habitat's 0 means "not navigable", which is not free, and the mask reveals no such cell. Revealed navigable cells
-    are free. Revealed border cells, and cells that are not navigable but share an edge with a free one, are walls.
-    Cells under agent, path and start are navigable; cells under a target, and all others, are unknown.
+    Revealed navigable cells are free. Revealed border cells, and cells that are not navigable (0) but share an edge
+    with a free one, are walls: the mask reveals no such cell. Cells under agent, path and start are navigable. Cells
+    under a target, and all others, are unknown.
 
     Parameters
     ----------
@@ -338,25 +338,20 @@ def map_from_slam(
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
     threshold: float = 0.5,
 ) -> PartialMap:
-    """Make a map from the obstacle and explored channels of Active Neural SLAM.
+    """Make a map from the obstacle and explored channels of Active Neural SLAM: explored obstacles are walls.
 
     Parameters
     ----------
     obstacle, explored : (ny, nx) numbers in [0, 1]
         Probability of an obstacle, and of having been explored (`map[0]` and `map[1]`). Row 0 holds the smallest y.
-    resolution_m : float
-        Edge of a cell [m].
-    origin_m : (float, float)
-        World x and y of the lower-left corner of cell [0, 0] [m].
-    wall_height_m : float
-        Height of walls and ceiling [m].
+    resolution_m, origin_m, wall_height_m
+        As of `map_from_array`.
     threshold : float
         Smallest probability that counts.
 
     Returns
     -------
     PartialMap
-        Explored obstacles are walls, other explored cells are free.
 
     Raises
     ------

@@ -182,7 +182,6 @@ def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
 def _hall_layout(
     rng: Rng, area_m2: float, room_m2: float, *, hall_fraction: tuple[float, float], fill: Fill, columned: float
 ) -> Layout:
-    """Draw one or a few large rooms with columns and contents; most have a row of offices."""
     length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
     halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
     halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * log_uniform(rng, hall_fraction))]

@@ -99,7 +99,6 @@ class _Style:
 
     @property
     def walk(self) -> float:
-        """Width of passages before walls and furniture swell."""
         return WALK_M + 2 * self.swelling
 
 
@@ -320,7 +319,6 @@ def _divide(rng: Rng, part: Polygon, style: _Style) -> Iterator[Polygon]:
 
 
 def _cores(piece: Polygon) -> list[Polygon]:
-    """Return the parts of a piece that are wide enough for a room."""
     half_m = DOOR_M[0] / 2
     wide = piece.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
     return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]

@@ -100,7 +100,6 @@ def confined_path(folder: Path, name: str, what: str) -> Path:
 
 
 def _read_triangles(path: Path, kind: str, notes: ImportNotes) -> Triangles:
-    """Read the triangles of a mesh file in the axes of the file, with the transforms of nodes applied."""
     content = read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
     with decoding(path, f"no {kind.upper()} mesh", MapError):
         if kind == "gltf":
@@ -160,7 +159,6 @@ def _concatenated(parts: list[Triangles]) -> Triangles:
 def _joined(
     path: Path, parts: list[Triangles], index: list[int], materials: tuple[Material | None, ...], notes: ImportNotes
 ) -> SceneMesh:
-    """Build one mesh from the parts of a file, each with an index into the materials; a MapError names the file."""
     material = np.repeat(index, [len(triangles) for _, triangles in parts])
     try:
         mesh = merged_mesh(*_concatenated(parts), material, materials)

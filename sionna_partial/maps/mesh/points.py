@@ -107,16 +107,9 @@ def map_from_points(
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
         Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free.
     height_band_m : (float, float) or None
-        z of the cloud between which points are walls [m], which also selects a storey. By default `DEFAULT_BAND_M`
-        above the lowest floor.
-    observed : (M, 2) array-like, PartialMap or None
-        The observed area, as in `load_map`. By default the free and wall cells.
-    resolution_m : float or None
-        Edge of the cells [m], 0.05 by default.
-    up : {"z", "y"} or None
-        Axis of the cloud that points up, z by default.
-    unit_m : float or None
-        Length of a unit of the cloud [m], 1 by default. All other arguments are in metres.
+        z of the cloud between which points are walls [m], which also selects a storey.
+    observed, resolution_m, up, unit_m
+        As in `load_map`. By default the free and wall cells are observed. All other arguments are in metres.
     wall_height_m : float or None
         Height of walls and ceiling [m]; by default the height of the ceiling of the cloud, or 3.
 
