@@ -115,27 +115,6 @@ def exact_fraction(state, start, end):
 
 
 class TestWalls:
-    @pytest.mark.parametrize(
-        ("start", "end", "expected_m"),
-        [
-            ((1.5, 2.5, 1.5), (8.5, 2.5, 1.5), 0.0),
-            ((1.5, 2.5, 1.5), (9.5, 2.5, 1.5), 0.5),
-            ((-5.0, 2.5, 1.5), (12.0, 2.5, 1.5), 2.0),
-            ((0.5, 2.5, 0.5), (0.5, 2.5, 2.0), 1.5),
-            ((0.0, 2.0, 0.5), (2.0, 3.0, 2.5), 1.5),
-            ((1.0, 1.5, 1.5), (1.0, 3.5, 1.5), 0.0),
-            ((1.0, 0.5, 1.5), (9.0, 0.5, 1.5), 8.0),
-            ((1.0, 0.0, 1.5), (9.0, 0.0, 1.5), 0.0),
-            ((0.0, 0.5, 1.5), (-9.0, 0.5, 1.5), 0.0),
-            ((-9.0, -1.0, 1.5), (9.0, -1.0, 1.5), 0.0),
-            ((-1.0, -2.0, 1.5), (-1.0, -2.0, 2.5), 0.0),
-        ],
-        ids=str,
-    )
-    def test_by_hand(self, start, end, expected_m):
-        found_m = walled_lengths_m(HALF, np.array(start), np.array([end]))
-        assert found_m[0] == pytest.approx(expected_m, abs=1e-12)
-
     @given(st.data())
     def test_what_is_known_and_outside_is_no_wall(self, data):
         """Not a rounding of it: any length at all is a feature of the networks."""
