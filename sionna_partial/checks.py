@@ -64,7 +64,6 @@ def require_memory(memory_gb: object) -> None:
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:
-    """Raise a SettingsError unless `value` is a whole number in [low, high]."""
     inside = is_whole(value, low) and int(value) <= high  # type: ignore[call-overload]
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
@@ -80,7 +79,6 @@ def require_bool(name: str, value: object) -> None:
 
 
 def require_type(name: str, value: object, kind: type, remedy: str) -> None:
-    """Raise a SettingsError that names the type of `value` unless it is of a kind."""
     require(isinstance(value, kind), name, type(value).__name__, remedy)
 
 
@@ -90,7 +88,6 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def transmitter_names(count: int) -> list[str]:
-    """Return default names of transmitters: "tx1", "tx2" and so on."""
     return [f"tx{number}" for number in range(1, count + 1)]
 
 
@@ -136,7 +133,6 @@ def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy:
 
 
 def is_whole(value: object, low: int = 0) -> bool:
-    """Return whether `value` is a whole number of `low` or more."""
     number = plain(value)
     return isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= low
 

@@ -231,7 +231,6 @@ def _pairs(nodes, traced, boxes, needed, links):
 
 @njit(cache=True, nogil=True)
 def _write(nodes, rx, traced, links, room):
-    """Return kinds and faces (C, D) of candidates, vertices (C, D, 3), and marks of further faces of a wall."""
     met, entries, shape = scratch(), met_faces(room), (len(nodes), room)
     kind, face, same_wall = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32), np.zeros(shape, np.bool_)
     vertices, depth = np.zeros((len(nodes), room, 3)), max(1, links.limits.depth)
