@@ -176,7 +176,7 @@ class Checked:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
-    if NoneType in arguments and get_origin(arguments[0]) is Annotated:
+    if NoneType in arguments:
         return None if value is None else _checked(name, value, arguments[0])
     if get_origin(hint) is Annotated:
         number, allowed = arguments
@@ -187,12 +187,10 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         return number(value)
     if get_origin(hint) is Literal:
         require_choice(name, value, arguments)
-    elif hint is bool or arguments == (bool, NoneType):
-        require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
+    elif hint is bool:
+        require_bool(name, value)
     elif hint is str:
         require(isinstance(value, str), name, value, "give a text.")
-    elif NoneType in arguments and is_dataclass(arguments[0]):
-        return None if value is None else _checked(name, value, arguments[0])
     elif isinstance(hint, type) and is_dataclass(hint):
         if isinstance(value, str) and hasattr(hint, "named"):
             value = hint.named(value)

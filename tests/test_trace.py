@@ -106,20 +106,6 @@ def test_one_mirror_image_with_the_slab_reflection_coefficient() -> None:
     assert links.gain_db[0] == pytest.approx(10 * np.log10(total), abs=1e-6)
 
 
-def test_floor_and_ceiling_reflect_with_the_parallel_coefficient() -> None:
-    material = Material(relative_permittivity=5.0, conductivity_s_m=0.2, thickness_m=0.2)
-    tx, rx = np.array([2.0, 2.0, 1.5]), np.array([[5.0, 2.0, 1.5]])
-    partial, scene_settings = PartialMap(_map((60, 100)), 0.1), SceneSettings(material=material)
-    links = trace_links(partial, tx, rx, trace_settings=all_paths(max_depth=1), scene_settings=scene_settings)
-    length = np.hypot(3.0, 3.0)
-    cos_incidence = sin_zenith = 3.0 / length
-    expected = abs(_slab_reflection(cos_incidence, material, "tm")) * WAVELENGTH_M / (4 * np.pi * length)
-    _, floor, ceiling = _paths_of(links, 0)
-    np.testing.assert_allclose(abs(links.a[[floor, ceiling]]), expected, rtol=1e-3)
-    np.testing.assert_allclose(sorted(links.vertices_m[[floor, ceiling], 0, 2]), [0.0, 3.0], atol=1e-5)
-    assert np.sin(links.departure_rad[floor, 0]) == pytest.approx(sin_zenith, abs=1e-4)
-
-
 def test_corridor_of_two_walls_has_every_image() -> None:
     state = _map((41, 400))
     state[[0, 40], :] = CellState.WALL

@@ -1,6 +1,5 @@
 """Traces of plans in which beams or rays might go astray, against the textbook image method."""
 
-import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -155,16 +154,9 @@ class TestTransmitters:
             assert (links.path_tx == 0).all()
 
     def test_one_may_be_given_as_a_list(self) -> None:
-        rx = _grid(_room(), 1.0)
-        alone, listed = trace_links(_room(), self.TX[0], rx), trace_links(_room(), self.TX[:1], rx)
-        assert alone.tx.shape == (3,)
-        assert listed.tx.shape == (1, 3)
-        for field in dataclasses.fields(TracedLinks):
-            one, other = getattr(alone, field.name), getattr(listed, field.name)
-            if field.name in ("tx", "gain_db", "link_state"):
-                assert other.shape == (1, *one.shape)
-            if isinstance(one, np.ndarray):
-                assert one.tobytes() == other.tobytes()
+        alone, listed = (trace_links(_room(), tx, [(2.0, 1.0, 1.5)]) for tx in (self.TX[0], self.TX[:1]))
+        assert (alone.tx.shape, listed.tx.shape, listed.link_state.shape) == ((3,), (1, 3), (1, 1))
+        np.testing.assert_array_equal(listed.gain_db, alone.gain_db[None])
 
     def test_no_receivers_give_no_links(self) -> None:
         links = trace_links(_room(), self.TX, np.zeros((0, 3)))
