@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.errors import SettingsError
 from sionna_partial.exploration.explore import Exploration, explore_trajectory
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.exploration_plot import MAX_PANELS, animate_exploration, plot_exploration
@@ -50,11 +50,6 @@ def panels(figure: Figure) -> list:
 
 
 class TestPlotExploration:
-    def test_each_moment_has_a_panel_that_says_what_it_shows(self, exploration):
-        titles = [panel.get_title() for panel in panels(plot_exploration(exploration.at((10, 60))))]
-        fractions = exploration.at((10, 60)).observed_fractions
-        assert titles == [f"step 10: {fractions[0]:.0%} seen", f"step 60: {fractions[1]:.0%} seen"]
-
     def test_cells_have_their_colours(self, home, exploration):
         image = panels(plot_exploration(exploration.at((30,))))[0].images[0]
         state, picture = exploration.at((30,)).states[0], image.get_array()
@@ -80,8 +75,6 @@ class TestPlotExploration:
         corners = view.get_xy()
         assert tuple(corners[0]) == tuple(exploration.poses[-1, :2])
         assert (home.state_at(corners) != CellState.UNKNOWN).all()
-
-    def test_nothing_is_in_view_before_the_first_step(self, exploration):
         assert len(panels(plot_exploration(exploration.at((0,))))[0].patches) == 0
 
     def test_a_map_that_drifts_shows_both_ways(self, home):
@@ -99,11 +92,7 @@ class TestPlotExploration:
         many = explore_trajectory(home, range(0, 40), 2)
         titles = [panel.get_title() for panel in panels(plot_exploration(many))]
         assert len(titles) == MAX_PANELS
-        assert titles[-1].startswith("step 39:")
-
-    def test_it_needs_an_exploration(self, home):
-        with pytest.raises(SettingsError, match="exploration = 'PartialMap' is not allowed: give what explore_traj"):
-            plot_exploration(home)
+        assert titles[-1] == f"step 39: {many.observed_fractions[-1]:.0%} seen"
 
 
 class TestAnimateExploration:
@@ -129,26 +118,14 @@ class TestAnimateExploration:
         assert min(np.abs(np.array(list(found)) - 255 * view).max(axis=1)) <= 2
 
     def test_equal_explorations_give_equal_bytes(self, exploration, tmp_path):
-        names = [tmp_path / "first.gif", tmp_path / "again.gif"]
+        names = [tmp_path / "first.gif", tmp_path / "again.GIF"]
         for name in names:
-            animate_exploration(exploration.at((0, 60)), name)
+            animate_exploration(exploration.at((60,)), name)
         assert names[0].read_bytes() == names[1].read_bytes()
-
-    def test_one_frame(self, exploration, tmp_path):
-        animate_exploration(exploration.at((60,)), tmp_path / "way.GIF")
-        with Image.open(tmp_path / "way.GIF") as animation:
+        with Image.open(names[1]) as animation:
             assert (animation.format, animation.n_frames) == ("GIF", 1)
 
     def test_another_suffix(self, exploration, tmp_path):
         with pytest.raises(SettingsError, match=r"path = '.*way\.mp4' is not allowed: give a name that ends with"):
             animate_exploration(exploration, tmp_path / "way.mp4")
         assert list(tmp_path.iterdir()) == []
-
-    def test_a_folder_that_cannot_be(self, exploration, tmp_path):
-        (tmp_path / "file").touch()
-        with pytest.raises(OutputError, match="could not be written"):
-            animate_exploration(exploration.at((60,)), tmp_path / "file" / "way.gif")
-
-    def test_it_needs_an_exploration(self):
-        with pytest.raises(SettingsError, match="exploration = 'str' is not allowed: give what explore_trajectory"):
-            animate_exploration("exploration", Path("way.gif"))

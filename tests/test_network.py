@@ -161,7 +161,5 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     for other in others:
         with pytest.raises(SettingsError, match="give what network_map returned"):
             sp.plot_network(other)
-    with pytest.raises(SettingsError, match="place_transmitters"):
-        sp.plot_network_placement(network)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="count"):
         sp.place_transmitters(sp.map_from_array([[0]], 1.0), 0)
