@@ -425,6 +425,8 @@ class DatasetSettings(Checked):
         Conversion of maps to scenes; without a material the walls are of drywall.
     trace : TraceSettings
         Settings of the traces on the complete and on the partial maps.
+    cir_paths : int
+        Number of paths in the impulse responses of the complete map, the strongest of each link; 0 stores none.
 
     Raises
     ------
@@ -450,6 +452,7 @@ class DatasetSettings(Checked):
     short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
+    cir_paths: Annotated[int, Within(0, 1000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
