@@ -52,7 +52,6 @@ def read_only(cls: _Class) -> _Class:
 
 
 def cross(first: Floats, second: Floats) -> Floats:
-    """Return the cross products of vectors (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 

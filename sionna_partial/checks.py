@@ -64,7 +64,6 @@ def require_memory(memory_gb: object) -> None:
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:
-    """Raise a SettingsError unless `value` is a whole number in [low, high]."""
     inside = is_whole(value, low) and int(value) <= high  # type: ignore[call-overload]
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
@@ -80,7 +79,6 @@ def require_bool(name: str, value: object) -> None:
 
 
 def require_type(name: str, value: object, kind: type, remedy: str) -> None:
-    """Raise a SettingsError that names the type of `value` unless it is of a kind."""
     require(isinstance(value, kind), name, type(value).__name__, remedy)
 
 
@@ -90,7 +88,6 @@ def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
 
 
 def transmitter_names(count: int) -> list[str]:
-    """Return default names of transmitters: "tx1", "tx2" and so on."""
     return [f"tx{number}" for number in range(1, count + 1)]
 
 
@@ -136,7 +133,6 @@ def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy:
 
 
 def is_whole(value: object, low: int = 0) -> bool:
-    """Return whether `value` is a whole number of `low` or more."""
     number = plain(value)
     return isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= low
 
@@ -180,7 +176,7 @@ class Checked:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
-    if NoneType in arguments and get_origin(arguments[0]) is Annotated:
+    if NoneType in arguments:
         return None if value is None else _checked(name, value, arguments[0])
     if get_origin(hint) is Annotated:
         number, allowed = arguments
@@ -191,12 +187,10 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         return number(value)
     if get_origin(hint) is Literal:
         require_choice(name, value, arguments)
-    elif hint is bool or arguments == (bool, NoneType):
-        require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
+    elif hint is bool:
+        require_bool(name, value)
     elif hint is str:
         require(isinstance(value, str), name, value, "give a text.")
-    elif NoneType in arguments and is_dataclass(arguments[0]):
-        return None if value is None else _checked(name, value, arguments[0])
     elif isinstance(hint, type) and is_dataclass(hint):
         if isinstance(value, str) and hasattr(hint, "named"):
             value = hint.named(value)

@@ -234,7 +234,6 @@ class LinkModel:
         return phi, self.predict_features(phi, complete), complete
 
     def _windows_around(self, tx_m: Floats) -> NDArray[np.uint8]:
-        """Draw the map around a transmitter (3,) [m]; the latest windows are kept."""
         key = tx_m.tobytes()
         if key not in self._windows:
             self._windows[key] = map_windows(self.partial, tx_m[None, :2])

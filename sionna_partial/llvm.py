@@ -136,7 +136,6 @@ def _named_library(name: str) -> Path:
 
 
 def _pip_library() -> Path:
-    """Return the real file of the library that pip installed."""
     with suppress(metadata.PackageNotFoundError):
         for file in metadata.distribution(PIP_PACKAGE).files or []:
             if re.fullmatch(r"libLLVM(-\d[\d.]*)?\.so[\d.]*", file.name) and Path(str(file.locate())).exists():

@@ -138,7 +138,6 @@ class Antennas:
         return cls(positions_m, array.antenna_pattern.patterns, rotation)
 
     def __len__(self) -> int:
-        """Return the number of antennas, K A."""
         return len(self.patterns) * len(self.positions_m)
 
     def rotations(self, end: NDArray[np.integer[Any]]) -> Floats:
@@ -222,7 +221,6 @@ class AntennaPattern(Shown):
             _log.warning(message, self.name, self.gain_dbi)
 
     def _require_passive(self) -> "AntennaPattern":
-        """Raise a SettingsError if it radiates too much, otherwise return it."""
         radiated = self.radiated
         most_dbi = self.gain_dbi - 10.0 * math.log10(radiated)
         remedy = (
@@ -451,7 +449,6 @@ class Antenna(Checked):
         return value
 
     def __str__(self) -> str:
-        """Return a description, for titles and attributes."""
         pattern = self.pattern
         parts = [f"{pattern.name}, {pattern.gain_dbi:g} dBi" if isinstance(pattern, AntennaPattern) else pattern]
         parts += [f"{self.rows} x {self.columns}, beam {self.beam}"] if self.rows * self.columns > 1 else []

@@ -381,7 +381,6 @@ class SceneSolver:
 
     @contextmanager
     def _changed(self, variables: Variables) -> Iterator[None]:
-        """Give the scene another frequency and its materials other values for a while."""
         materials = self._scene.radio_materials.values()
         kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
         frequency = self._scene.frequency
@@ -464,7 +463,6 @@ def _points(positions_m: Floats) -> Any:
 
 
 def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
-    """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
     a = buffer.a[0][0]
     valid = np.flatnonzero(buffer.valid.numpy() & ((a.real.numpy() != 0.0) | (a.imag.numpy() != 0.0)))

@@ -68,7 +68,6 @@ class PlanScene:
         return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
-        """Return the kinds of candidates between a transmitter (3,) and receivers (N, 3)."""
         geometry, settings = self.geometry, self.settings
         room = Room.of(geometry, tx_m, rx_m, solver.material_of_face, gains)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
@@ -108,7 +107,6 @@ class MeshScene:
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:
-        """Return the faces that paths may cross, all planes, and the closed bodies."""
         crossed = self.triangles if self.settings.through_walls else self.triangles[:0]
         planes = group_planes(self.vertices_m, self.triangles)
         tree = face_tree(self.vertices_m[crossed], planes.plane)
@@ -154,7 +152,6 @@ class RayFinder:
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[Found]:
-        """Find paths as `ExactFinder.paths` does; none is left out for the antenna."""
         settings = self._written.settings
         set_antennas(self._scene, polarisations)
         for number, paths in enumerate(stock_paths(self._scene, settings, tx_m, rx_m), start=1):
@@ -177,7 +174,6 @@ class MeanFinder:
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[Found]:
-        """Find paths as `ExactFinder.paths` does, without candidates."""
         count = 1 + len(self.drawn)
         found = list(self.mapped.paths(tx_m, rx_m, polarisations, part_of(report, 0.0, 1.0 / count), antenna))
         amplitude = np.full(len(rx_m), count**-0.5)
@@ -216,7 +212,6 @@ def write_scene_of(
 def _verified(
     solver: SceneSolver, blocks: Iterator[Block], tx_m: Floats, rx_m: Floats, report: Progress
 ) -> Iterator[Found]:
-    """Verify candidates, many blocks of one kind at once."""
     waiting: list[Block] = []
     for block in itertools.chain(blocks, [None]):
         full = sum(len(stored.candidates.rx) for stored in waiting) >= CANDIDATES_AT_ONCE

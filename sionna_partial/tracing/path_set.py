@@ -101,7 +101,6 @@ class PathSet:
         self.is_direct = paths.is_direct
 
     def __len__(self) -> int:
-        """Return the number of paths P."""
         return len(self.path_rx)
 
     @property
@@ -211,7 +210,6 @@ class PathSet:
         return not np.array_equal(parameters.tx_m, self.base.tx_m)
 
     def _ends(self) -> tuple[Floats, Floats]:
-        """Return transmitters (T, 3) and receivers (N, 3) at `base`, in scene coordinates [m]."""
         return self._simulation.in_scene(self.base.tx_m.reshape(-1, 3)), self._simulation.in_scene(self.rx_m)
 
     def _held_paths(self, number: int) -> HeldPaths:
@@ -223,7 +221,6 @@ class PathSet:
     def _variables(
         self, parameters: PathParameters, names: Sequence[str] = (), *, together: bool = False
     ) -> tuple[dict[str, list[Any]], Variables]:
-        """Return the variables of the derivatives, by name, and all variables for the solver."""
         import drjit as dr
         import mitsuba as mi
 

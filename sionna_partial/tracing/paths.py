@@ -99,7 +99,6 @@ class PathColumns:
         }
 
     def append(self, parts: list[SolvedPaths]) -> None:
-        """Add paths, ordered among themselves by transmitter, receiver and delay."""
         order = path_order(parts)
         row, start = np.empty(len(order), np.int64), len(self._columns["path_rx"])
         row[order] = start + np.arange(len(order))
@@ -227,7 +226,6 @@ class Candidates:
     same_wall: Bools | None = None
 
     def is_like(self, other: "Candidates") -> bool:
-        """Return whether both can be verified together."""
         same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
         return same and (self.same_wall is None) == (other.same_wall is None)
 

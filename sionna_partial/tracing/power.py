@@ -230,7 +230,6 @@ def _coefficients(table, material, cosine):
 
 @njit(cache=True)
 def most_at_wall(largest, material, cosine):
-    """Return the largest factor of a field at a reflection, for this cosine of incidence or a larger one."""
     return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
 
 

@@ -123,7 +123,6 @@ class Selection:
         return LEVELS - (first - start[:-1])
 
     def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
-        """Write the candidates whose level is at least `first` (N,) and below `last` (N,)."""
         for number, (name, part, level) in enumerate(self.parts, start=1):
             rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
             for candidates in part.blocks(rows):
@@ -173,7 +172,6 @@ def _every_block(kinds: Sequence[Kind], receivers: int, high: float) -> Iterator
 
 
 def _strongest_blocks(kind: Kind, tolerance_db: float, high: float, found: Floats) -> Iterator[Block]:
-    """Write the candidates of a kind with exact bounds that links need."""
     for part in kind.listed(found):
         for candidates in part.blocks(strongest(part, found, tolerance_db)):
             yield Block(candidates, high, f"verifying {kind.name}")
@@ -215,13 +213,11 @@ class Limits(NamedTuple):
         return cls(depth, min(depth, 4), walls, 0.03, 5e-4)
 
     def min_power(self, found: Floats) -> Floats:
-        """Return the smallest power (N,) of paths to list where the others have the power `found` (N,)."""
         return self.weakest * np.maximum(found, _NO_POWER)
 
 
 @njit(cache=True)
 def discount_after(limits, reflections):
-    """Return the discount of power after so many reflections at walls."""
     return limits.discount ** max(0, reflections - _USUAL_REFLECTIONS)
 
 
@@ -279,7 +275,6 @@ def levels_of(bound: Floats) -> NDArray[np.uint8]:
 
 
 def expected_power(power: Floats) -> Floats:
-    """Return the expected power (N,) of indirect paths from the sums of their bounds (N, LEVELS)."""
     return np.asarray(_FOUND * power[:, 1:].sum(axis=1))
 
 

@@ -295,7 +295,6 @@ class Simulation:
 
     @cached_property
     def _mean_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Return the finder of paths whose powers are averaged over geometries."""
         draws = range(1, self.resolved.scene_settings.geometries or 1)
         return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
 

@@ -85,7 +85,6 @@ def _switches(settings: TraceSettings) -> dict[str, bool]:
 
 
 def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
-    """Copy the valid paths of one receiver out of Dr.Jit, without repetitions."""
     real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
     transfer = real + 1j * imaginary
     valid = np.flatnonzero(found.valid.numpy().ravel() & (transfer[:, 0, 0] != 0.0))

@@ -231,7 +231,6 @@ def _pairs(nodes, traced, boxes, needed, links):
 
 @njit(cache=True, nogil=True)
 def _write(nodes, rx, traced, links, room):
-    """Return kinds and faces (C, D) of candidates, vertices (C, D, 3), and marks of further faces of a wall."""
     met, entries, shape = scratch(), met_faces(room), (len(nodes), room)
     kind, face, same_wall = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32), np.zeros(shape, np.bool_)
     vertices, depth = np.zeros((len(nodes), room, 3)), max(1, links.limits.depth)
@@ -402,18 +401,13 @@ def _has_long_legs(entries, count, tx, target):
 
 
 @njit(cache=True)
-def _gain_to(point, links):
-    return gain_towards(links.gains, point[0] - links.tx_m[0], point[1] - links.tx_m[1], point[2] - links.tx_m[2])
-
-
-@njit(cache=True)
 def _power(entries, count, target, links):
     planes, materials, tx = links.mesh.planes, links.mesh.materials, links.tx_m
     first = entries.point_m[0] if count else target
     kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
     total = np.sqrt(kx * kx + ky * ky + kz * kz)
     k = kx / total, ky / total, kz / total
-    e, gain = vertical_field(k), _gain_to(first, links)
+    e, gain = vertical_field(k), gain_towards(links.gains, kx, ky, kz)
     for j in range(count):
         here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
         total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)

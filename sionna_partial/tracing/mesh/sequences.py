@@ -178,7 +178,6 @@ def _with_room(sequences, size, more):
 
 @njit(cache=True)
 def _add_rays(sequences, size, added, face, leg, direction, plane_of):
-    """Add the sequences of rays while there is room; return the numbers of rays added and of sequences."""
     parent, plane, low, high, reach, _, table, _, _ = sequences  # attributes cost time in a loop
     depth = face.shape[1]
     while added < len(face) and size + depth <= len(parent):
@@ -196,7 +195,6 @@ def _add_rays(sequences, size, added, face, leg, direction, plane_of):
 
 @njit(cache=True)
 def _slot(table, parent, plane, node, last):
-    """Return the slot in the hash table of the sequence that adds the plane `last` to the sequence `node`."""
     mask = np.uint64(len(table) - 1)
     slot = mix(node + 1, last) & mask
     while table[slot] >= 0 and (parent[table[slot]] != node or plane[table[slot]] != last):

@@ -71,7 +71,6 @@ class BeamTree(NamedTuple):
         return cls(beams.parent, beams.piece, beams.window[:, :2].copy())
 
     def extended(self, beams: "Beams") -> "BeamTree":
-        """Add beams whose parents are in the tree."""
         columns: Any = zip(self, BeamTree.of(beams), strict=True)
         return BeamTree(*map(np.concatenate, columns))
 
@@ -385,7 +384,6 @@ def _sort_by_distance(layers, count, t):
 
 @njit(cache=True)
 def _lay_one(beam, i, active, task, layers, windows):
-    """Put the walls between two edges into layers."""
     scratch, plan_line, low = layers.clipped, task.building.plan.line, task.building.plan.low
     pieces = task.building.plan.pieces_m
     of_piece, solid, depth_m = task.building.material, task.building.interior.solid, task.building.interior.depth_m
@@ -475,7 +473,6 @@ def _piece_of(layers, c, span):
 
 @njit(cache=True)
 def _is_needed(beam, task):
-    """Return whether a beam may matter, now or after more reflections."""
     limits = task.building.limits
     order = limits.reflections - beam.more
     total = beam.reflected * beam.left * (task.most_transmitted if beam.crossed == 0 else 1.0)

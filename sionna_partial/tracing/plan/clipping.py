@@ -199,7 +199,6 @@ def sort_edges(found, edge, count):
 
 @njit(cache=True)
 def move_to(t, found, order, active, count, begun, number):
-    """Update the walls that are active at a larger t; return the numbers of walls begun and active."""
     while begun < count and found[order[begun], 0] <= t:
         active[number] = order[begun]
         begun, number = begun + 1, number + 1

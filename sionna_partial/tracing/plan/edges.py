@@ -452,7 +452,6 @@ def _list_joined(task, negligible, trail):
 
 @njit(cache=True)
 def _heights(room, size):
-    """Return the heights [m] that variants of paths to each receiver cover (N, V), -1 where there is none."""
     heights = np.full((len(room.rx_m), 2 * size), -1.0)
     for rx in range(len(room.rx_m)):
         for variant in range(2 * size):

@@ -108,7 +108,6 @@ class Rise(NamedTuple):
 
 @njit(cache=True)
 def has_variant(variant, room):
-    """Return whether a room allows a variant."""
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
         return first == FLOOR
@@ -334,7 +333,6 @@ def _is_reflected_inside(plan, interior, leg, n, trail):
 
 @njit(cache=True)
 def has_long_legs(trail, count, length):
-    """Return whether no leg of a path is so short that Sionna RT drops the path."""
     previous = 0.0
     for k in range(count):
         if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:
@@ -496,7 +494,6 @@ def _add_lids(here, there, lids, kind, face, vertices, count):
 
 @njit(cache=True)
 def _group(face, vertices, same, span, ends, walls_m, interior):
-    """Mark further faces of a wall on a leg; return the number of walls."""
     (begin, end), (here, there) = span, ends
     dx, dy = there[0] - here[0], there[1] - here[1]
     length, cosine, found = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin), np.empty(end - begin)
