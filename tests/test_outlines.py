@@ -310,19 +310,6 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         assert distances_from_outlines(partial, outlines).max() < 0.8
 
 
-@pytest.mark.parametrize(
-    ("thickness", "fraction"), [(1, 0.0), (1, 0.2), (2, 0.05), (3, 0.2), (5, 0.0), (5, 0.05), (5, 0.2)]
-)
-def test_ragged_rooms_keep_their_regions(thickness: int, fraction: float) -> None:
-    partial = ragged_room(7, thickness, fraction)
-    outlines = wall_outlines(partial)
-    assert_sound(outlines)
-    assert kept_regions(partial, outlines) == 2
-    assert farthest_from_walls(partial, outlines) < 1.6
-    assert distances_from_outlines(partial, outlines).max() < 2.3
-    assert len(outlines.segments) < 70 + 900 * fraction
-
-
 def noisy_plan(thickness: int, fraction: float, around: float) -> PartialMap:
     """A hall with three stubs; `fraction` of its face cells are lost, `around` of the cells beside are walls."""
     rng = np.random.default_rng(0)

@@ -159,17 +159,13 @@ def test_walls_alone() -> None:
     assert states(around, (4.5, 1.25)) == [FREE]
 
 
-def test_parts_and_order_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = map_from_points(ROOM)
-    monkeypatch.setattr(points_module, "PART", 700)
-    assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
-
-
-def test_text_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_and_order_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "room.xyz", ROOM)
-    whole = load_map(path)
+    whole, text = map_from_points(ROOM), load_map(path)
+    monkeypatch.setattr(points_module, "PART", 700)
     monkeypatch.setattr(points_module, "PART_BYTES", 5000)
-    assert load_map(path) == whole
+    assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
+    assert load_map(path) == text
 
 
 @pytest.mark.parametrize(

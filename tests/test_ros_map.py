@@ -323,13 +323,6 @@ def test_truncated_png(tmp_path: Path) -> None:
             load_map(path)
 
 
-def test_yaw_turns_about_the_lower_left_corner(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0, 205, 205], [254, 254, 205]], origin=[-1.0, 2.0, 1.5708])
-    partial = load_map(path)
-    assert partial.state.tolist() == [[WALL, FREE], [UNKNOWN, FREE], [UNKNOWN, UNKNOWN]]
-    assert partial.origin_m == (-1.1, 2.0)
-
-
 def test_interior_cells_follow_the_cell_size(tmp_path: Path) -> None:
     path = write_map(tmp_path, np.full((9, 9), 254), origin=[0, 0, 0.5], interior_cells=81)
     partial = load_map(path)
