@@ -197,10 +197,10 @@ def test_observed_fractions_on_real_homes(homes, expected):
 
 class TestFractions:
     def test_each_is_reached_and_not_long_before(self, home):
-        exploration = explore_trajectory(home, (0, 0.25, 0.5, 0.75), 3)
+        exploration = explore_trajectory(home, (0, 0.25, 0.5), 3)
         assert exploration.steps[0] == 0
         for fraction, step, observed in zip(
-            (0.25, 0.5, 0.75), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
+            (0.25, 0.5), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
         ):
             assert observed >= fraction
             assert explore(home, (step - 1,), 3)[0].observed_fraction < fraction
@@ -270,14 +270,14 @@ class TestSensor:
         assert not ((first != CellState.UNKNOWN) & (later == CellState.UNKNOWN)).any()
 
     def test_wall_noise_grows_with_range_noise(self, home):
-        noises_m = (0.0, 0.01, 0.02, 0.03, 0.05)
+        noises_m = (0.0, 0.02, 0.05)
         for drift in (0.0, 0.002):
             lidars = (SensorSettings(noise_m, drift, field_of_view_deg=360.0, range_m=12.0) for noise_m in noises_m)
             found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
             assert found == sorted(found), drift
             assert drift > 0.0 or found[0] <= LEAST_NOISE
-            assert found[2] > 0.5
-            assert found[-1] > found[2] + 0.02
+            assert found[1] > 0.5
+            assert found[2] > found[1] + 0.02
         assert home.wall_noise == 0.0
 
     @pytest.mark.parametrize("fusion", get_args(Fusion))
