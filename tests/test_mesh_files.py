@@ -169,6 +169,7 @@ def test_wrong_vertices(tmp_path: Path, z: str, last: int, message: str) -> None
     ("suffix", "old", "new", "message"),
     [
         ("ply", "3 0 2 3\n", "", "it announces 6 vertices, faces and others, and has 5"),
+        ("ply", "3 0 2 3\n", "2 0 2\n", "it announces 2 faces, and has 1"),
         ("ply", "face 2", "face 4", "it announces 8 vertices, faces and others, and has 6"),
         ("stl", "endsolid", "", "it ends before its endsolid"),
     ],
