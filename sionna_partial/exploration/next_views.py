@@ -272,7 +272,7 @@ def next_views(
         frontiers = _frontiers(partial, cell)
         gains = _gains(partial, frontiers, tx_m, uncertainty, sensor, part_of(report, 0.7, 1.0))
         report(1.0, "done")
-    views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
+    views = [_view(partial, *row) for row in zip(frontiers, *gains, strict=True)]
     views.sort(key=lambda view: -view.gain_per_m)
     start_m = cell_centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal, sensor)
@@ -298,7 +298,7 @@ def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | N
         partial = replace(area, state=robot.seen.copy(), interior_cells=None)
         tx_m = _transmitters(partial, tx, None)
         gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(LinkModel(partial), tx_m, None, None), sensor)
-        return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))
+        return int(np.argmax(np.array(gains) / [robot.steps_to(goal) + LOOK_M / FORWARD_M for goal in frontiers]))
 
     return choose
 

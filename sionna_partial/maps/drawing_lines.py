@@ -159,7 +159,7 @@ class DrawnLines:
         found = self._lines(self._drawing.modelspace(), layers, MAX_NESTING)
         kept = {layer: found[layer] for layer in sorted(found) if layer in layers}
         pieces = [segments[..., :2].reshape(-1, 2, 2) for segments in kept.values()]
-        names = np.repeat(np.array([*kept] or [""]), [len(each) for each in pieces] or [0])
+        names = np.repeat(np.array([*kept] or [""]), [len(part) for part in pieces] or [0])
         return np.concatenate([np.zeros((0, 2, 2)), *pieces]), names
 
     def _count(self, entities: Iterable[Any], nesting: int) -> Counter[tuple[str, str]]:

@@ -342,7 +342,7 @@ def _owners(
 
 def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
     plain = not isinstance(wall_layers, str) and isinstance(wall_layers, Sequence)
-    if wall_layers is not None and not (plain and wall_layers and all(isinstance(each, str) for each in wall_layers)):
+    if wall_layers is not None and not (plain and wall_layers and all(isinstance(name, str) for name in wall_layers)):
         raise MapError(f"wall_layers = {shown(wall_layers)} is not allowed: give names of layers, such as ['WALLS'].")
     return wall_layers
 
@@ -431,7 +431,7 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
     longest = MARK_M / pixel_m
     small = [max(part.stop - part.start for part in extent) <= longest for extent in ndimage.find_objects(pieces)]
     notes.skip("separate marks", sum(small), f"text or symbols up to {MARK_M:g} m")
-    wall = np.array([False, *(not each for each in small)])[pieces]
+    wall = np.array([False, *(not is_small for is_small in small)])[pieces]
     notes.use("connected walls", len(small) - sum(small))
     if not wall.any():
         what = f"path = '{path}' has no connected walls longer than {MARK_M:g} m with resolution_m = {pixel_m:g}"

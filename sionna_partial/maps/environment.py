@@ -227,7 +227,7 @@ def _indices(name: str, values: ArrayLike, row: tuple[int, ...], count: int, tar
 
 
 def _materials(values: tuple[Material | None, ...]) -> tuple[Material | None, ...]:
-    if not isinstance(values, list | tuple) or not all(isinstance(each, Material | None) for each in values):
+    if not isinstance(values, list | tuple) or not all(isinstance(material, Material | None) for material in values):
         raise MapError(f"materials = {shown(values)} is not allowed: give Material(...) or None for each.")
     materials = tuple(values)
     if len(materials) > MAX_MATERIALS:

@@ -117,15 +117,16 @@ def map_from_ifc(
 
 
 def _map_of(path: Path, pieces: list[_Piece], resolution_m: float, height_m: float) -> PartialMap:
-    segments = np.concatenate([each.segments for each in pieces])
+    segments = np.concatenate([piece.segments for piece in pieces])
     empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
-    state = states_of_lines(segments, empty, _covered([each.area for each in pieces], empty))
+    state = states_of_lines(segments, empty, _covered([piece.area for piece in pieces], empty))
     if not (state == CellState.FREE).any():
         raise MapError(f"path = '{path}' has walls that enclose nothing on this storey: give another storey.")
     partial = PartialMap(state, empty.resolution_m, empty.origin_m, height_m)
-    materials = list(dict.fromkeys(each.material for each in pieces))
-    owner = np.repeat([str(materials.index(each.material)) for each in pieces], [len(each.segments) for each in pieces])
-    named = {each: {str(number)} for number, each in enumerate(materials) if each is not None}
+    materials = list(dict.fromkeys(piece.material for piece in pieces))
+    numbers = [str(materials.index(piece.material)) for piece in pieces]
+    owner = np.repeat(numbers, [len(piece.segments) for piece in pieces])
+    named = {material: {str(number)} for number, material in enumerate(materials) if material is not None}
     return with_materials(partial, segments, owner, named) if named else partial
 
 
@@ -136,16 +137,17 @@ def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tup
 
     unit_m = notes.unit_m
     every = model.by_type("IfcBuildingStorey")
-    level_m = {each: float(get_local_placement(each.ObjectPlacement)[2, 3]) * unit_m for each in every}
+    level_m = {storey: float(get_local_placement(storey.ObjectPlacement)[2, 3]) * unit_m for storey in every}
     walls = model.by_type("IfcWall")
     if not walls or not every:
         raise MapError(f"path = '{path}' has {len(walls)} walls on {len(every)} storeys: export a building with both.")
     used = {get_container(wall, ifc_class="IfcBuildingStorey") for wall in walls}
-    chosen = [each for each in every if each in used or not used & {*every}]
+    chosen = [storey for storey in every if storey in used or not used & {*every}]
     if name is not None:
-        chosen = [each for each in every if (each.Name or "").casefold() == str(name).casefold()]
+        chosen = [storey for storey in every if (storey.Name or "").casefold() == str(name).casefold()]
     if len(chosen) != 1:
-        named = ", ".join(f"'{each.Name}' at {level_m[each]:.2f} m" for each in sorted(every, key=level_m.__getitem__))
+        by_level = sorted(every, key=level_m.__getitem__)
+        named = ", ".join(f"'{storey.Name}' at {level_m[storey]:.2f} m" for storey in by_level)
         what = f"storey = {shown(name)} is one of {len(chosen)} of path = '{path}'"
         raise MapError(f"{what}: give the name of one as storey; it has {named[:1000]}.")
     floor_m = level_m[chosen[0]]
@@ -212,7 +214,7 @@ def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) 
 
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
-    products = [each for each in products if each.Representation]
+    products = [product for product in products if product.Representation]
     cuts, triangles = dict[int, _Cut](), 0
     shapes: Any = ifcopenshell.geom.iterator(settings, model, core_count(), include=products) if products else ()
     for shape in shapes:

@@ -424,7 +424,7 @@ def _read_npz(source: Path) -> PartialMap:
             origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
-            layers = layers_of(content, np.asarray, lambda each: each.tolist() if each.ndim else json.loads(str(each)))
+            layers = layers_of(content, np.asarray, lambda data: data.tolist() if data.ndim else json.loads(str(data)))
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]

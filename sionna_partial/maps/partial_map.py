@@ -172,7 +172,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         found = {}
         for name, (counted, _, _) in _LAYERS.items():
             if (cells := getattr(self, name)) is not None:
-                values = [asdict(each) if isinstance(each, Material) else each for each in getattr(self, counted)]
+                values = [asdict(value) if isinstance(value, Material) else value for value in getattr(self, counted)]
                 found[name] = cells, counted, values
         return found
 
@@ -662,11 +662,11 @@ def _values(name: str, given: object) -> tuple[Any, ...]:
 
 
 def _checked_heights(heights: tuple[Any, ...]) -> tuple[float, ...]:
-    return tuple(_number("obstacle_heights_m", each, 0.01, 100.0) for each in heights)
+    return tuple(_number("obstacle_heights_m", height_m, 0.01, 100.0) for height_m in heights)
 
 
 def _checked_materials(materials: tuple[Any, ...]) -> tuple[Material, ...]:
-    other = next((type(each).__name__ for each in materials if not isinstance(each, Material)), None)
+    other = next((type(material).__name__ for material in materials if not isinstance(material, Material)), None)
     if other is not None:
         raise MapError(f"wall_materials holds a {other}: give a tuple of Material, such as Material.named returns.")
     return materials
@@ -691,7 +691,7 @@ def layers_of(found: Mapping[str, Any], cells: Callable[[Any], Any], values: Cal
     layers = {name: cells(found[name]) for name in _LAYERS if name in found}
     counted = {_LAYERS[name][0]: values(found[_LAYERS[name][0]]) for name in layers}
     return layers | {
-        name: tuple(Material(**each) if isinstance(each, dict) else each for each in plain)
+        name: tuple(Material(**value) if isinstance(value, dict) else value for value in plain)
         for name, plain in counted.items()
     }
 

@@ -151,7 +151,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
             given = raw[name]
             image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
             cells = _decode(sheet._replace(image=image))
-            layers[target] = tuple(made(path, name, each) for each in _listed(path, name, given, listed))
+            layers[target] = tuple(made(path, name, value) for value in _listed(path, name, given, listed))
             layers[name] = _layer(path, name, cells, (listed, layers[target]), pixels.level.shape, origin)
     partial = PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, **layers)
     return notes.attached_to(partial)
@@ -346,7 +346,7 @@ def _split(percent: Floats, count: Indices, allowed: Bools) -> float | None:
     good &= high_mean - low_mean >= SEPARATION * np.sqrt((low_var + high_var) / 2)
     middle = (value[:-1] + value[1:]) / 2
     around, around_low, around_high = (
-        (np.abs(value - each[:, None]) < VALLEY_PERCENT) @ weight for each in (middle, low_mean, high_mean)
+        (np.abs(value - place[:, None]) < VALLEY_PERCENT) @ weight for place in (middle, low_mean, high_mean)
     )
     good &= around < VALLEY_FRACTION * np.minimum(around_low, around_high)
     if not good.any():
@@ -380,7 +380,7 @@ def _material(path: Path, field: str, value: object) -> Material | None:
             return Material.named(value)
         return None if value is None else Material(**value)  # type: ignore[arg-type]
     except (TypeError, SettingsError) as error:
-        names = ", ".join(each.name for each in fields(Material))
+        names = ", ".join(field.name for field in fields(Material))
         raise _refuse(path, field, value, f"give a name, or {names} ({error}).") from error
 
 

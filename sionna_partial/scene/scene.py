@@ -125,7 +125,7 @@ class SceneGeometry:
     @property
     def lid_faces(self) -> list[int]:
         flats = len(self.floor_mesh[1]) * (1 + self.ceiling) if len(self.floor_m) else 0
-        return np.cumsum([2 * len(self.segments) + flats, *(len(each.triangles) for each in self.lids)])[:-1].tolist()
+        return np.cumsum([2 * len(self.segments) + flats, *(len(lid.triangles) for lid in self.lids)])[:-1].tolist()
 
     @cached_property
     def floor_mesh(self) -> tuple[Floats, NDArray[np.int64]]:
@@ -190,10 +190,10 @@ def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
         height_m = np.full(len(material), min(top_m, partial.wall_height_m))
         parts.append(_Walls(replace(outlines, segments=outlines.segments + count), material, height_m))
         count += len(outlines.vertices_m)
-    material = np.concatenate([each.material for each in parts])
+    material = np.concatenate([part.material for part in parts])
     order = np.argsort(material, kind="stable")
-    vertices_m = np.concatenate([each.outlines.vertices_m for each in parts])
-    segments = np.concatenate([each.outlines.segments for each in parts])[order]
+    vertices_m = np.concatenate([part.outlines.vertices_m for part in parts])
+    segments = np.concatenate([part.outlines.segments for part in parts])[order]
     return _Walls(
         Outlines(vertices_m, segments), material[order], np.concatenate([each.top_m for each in parts])[order]
     )
@@ -248,8 +248,8 @@ def export_scene(
     require_map("partial", partial)
     settings, environment = scene_settings_of(partial, scene_settings), partial.environment
     offset_m = environment.scene_offset_m(partial.bounds_m)
-    for each in environment.known_materials(settings.traced_material):
-        each.require_frequency(frequency_hz)
+    for material in environment.known_materials(settings.traced_material):
+        material.require_frequency(frequency_hz)
     with atomic_folder(folder) as target:
         write_map(partial, target, settings, offset_m=offset_m, frequency_hz=frequency_hz)
         write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})

@@ -159,7 +159,7 @@ def make_home(
     if resolution_m is not None:
         require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)
-    style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.frequency for each in STYLES.values()]))]
+    style = STYLES[kind or str(rng.choice(list(STYLES), p=[style.frequency for style in STYLES.values()]))]
     resolution_m = resolution_m or (LARGE_RESOLUTION_M if style.layout else RESOLUTION_M)
     while (plan := _draw(rng, style, locked_rooms=locked_rooms)) is None:
         pass

@@ -178,7 +178,7 @@ class Robot:
         return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
 
     def _draw(self, frontiers: list[Frontier]) -> int:
-        promises = [math.sqrt(len(each.cells)) / (self.steps_to(each) + _DECISION_STEPS) for each in frontiers]
+        promises = [math.sqrt(len(goal.cells)) / (self.steps_to(goal) + _DECISION_STEPS) for goal in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
         return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
 
@@ -275,7 +275,7 @@ def find_frontiers(
 
 
 def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
-    return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
+    return [frontier for frontier in frontiers if len(frontier.cells) * cell_m >= WIDE_M] or frontiers
 
 
 def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:

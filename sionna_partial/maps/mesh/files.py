@@ -204,7 +204,7 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
     """
     path = folder / "scene.xml"
     try:
-        materials = tuple(None if each is None else Material(**each) for each in record["materials"])
+        materials = tuple(None if fields is None else Material(**fields) for fields in record["materials"])
         low, high = (float(value) for value in record["height_range"])
         shift = np.array(offset_m, dtype=np.float64).reshape(3)
     except (KeyError, TypeError, ValueError) as error:
@@ -305,9 +305,9 @@ def _property(element: ET.Element, name: str) -> str | None:
 
 def _require_known(path: Path, element: ET.Element, names: Collection[str]) -> None:
     """Raise a MapError for a property that Mitsuba 3 and Sionna RT do not have, such as toWorld."""
-    for each in element:
-        if each.tag not in ("bsdf", "ref", "emitter") and each.get("name") not in names:
-            what = f"<{element.tag}> {_name(element)!r} has the property {each.get('name')!r}, which is not read"
+    for part in element:
+        if part.tag not in ("bsdf", "ref", "emitter") and part.get("name") not in names:
+            what = f"<{element.tag}> {_name(element)!r} has the property {part.get('name')!r}, which is not read"
             raise MapError(f"path = '{path}': {what}: give the names of Mitsuba 3 ({', '.join(names)}).")
 
 

@@ -412,7 +412,7 @@ def _floor_and_ceiling(
     for run in runs:
         if len(run) * LAYER_M <= SLAB_M:
             lower = int(run[np.argmax(pairs[run])]) + first
-            counts, sums_m = zip(*(heights_m.get(each, (0, 0.0)) for each in (lower, lower + 1)), strict=True)
+            counts, sums_m = zip(*(heights_m.get(number, (0, 0.0)) for number in (lower, lower + 1)), strict=True)
             slabs_m.append(round(sum(sums_m) / sum(counts), 3))
     low = math.inf if band_m is None else height_pair("height_band_m", band_m)[0]
     below = [slab for slab in slabs_m if slab < low] or [first * LAYER_M]
