@@ -258,7 +258,8 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         values = checked(_values(counted, values if value in values else (*values, value)))
         cells = np.zeros(self.shape, np.uint8) if old is None else old.copy()
         cells[area] = 0 if is_default else values.index(value) + 1
-        return replace(self, **{name: cells, counted: values})
+        changes: dict[str, Any] = {name: cells, counted: values}
+        return replace(self, **changes)
 
     def cells_within(self, where: object) -> Bools:
         """Return the cells (ny, nx) of an area, as `where` of `with_wall_material`."""
