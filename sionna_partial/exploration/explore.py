@@ -117,9 +117,9 @@ def explore(
     home : PartialMap
         The complete home. Unknown cells stop the robot and its view.
     steps : sequence of int or float
-        Increasing numbers of actions [1], at most `MAX_STEPS`, after which the map is returned; empty after 0. Or
+        Increasing numbers of actions [1], at most 100,000, after which the map is returned; empty after 0. Or
         increasing fractions of the free area in [0, 1): the first map with that fraction, or the last map if nothing is
-        left to see or after `VAIN_STEPS` actions without progress.
+        left to see or after 1000 actions without progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None

@@ -87,7 +87,7 @@ class NextView(Shown):
         Expected information gain, summed over receivers, one per square metre [bit], mean over transmitters; for the
         goal "area" the unknown area in view [m^2].
     gain_per_m : float
-        `gain` per metre driven, with `LOOK_M` added to the path. Views are ranked by it.
+        `gain` per metre driven, with 1.25 m added to the path. Views are ranked by it.
     path_m : (K, 2) float64 array
         The path, from the start to the pose [m].
     frontier_m : (F, 2) float64 array

@@ -113,7 +113,7 @@ def load_map(
     wall_height_m : float or None
         Wall height [m] instead of the file's. For a mesh, the height above its lowest point up to which radios may be.
     height_band_m : (float, float) or None
-        World z between which surfaces of a mesh, or points of a cloud, are walls [m]. By default `DEFAULT_BAND_M`
+        World z between which surfaces of a mesh, or points of a cloud, are walls [m]. By default 1.0 to 1.8 m
         above the lowest point of a mesh, or the lowest floor of a cloud.
     observed : (M, 2) array-like, PartialMap or None
         Observed part of a mesh: corners of a polygon in world x and y [m], or a map with known cells. By default all

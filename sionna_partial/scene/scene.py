@@ -211,7 +211,7 @@ def export_scene(
     The folder holds `scene.xml`, the non-empty ones of `meshes/walls.ply`, `meshes/walls1.ply` (and so on, for
     `wall_materials`), `meshes/floor.ply` and `meshes/ceiling.ply`, or `meshes/part0.ply` and so on for the materials
     of a mesh, and the map as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates
-    minus `scene_offset` in `map.yaml`: zero for maps within `FAR_M` of the origin, else the lower-left corner of the
+    minus `scene_offset` in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the
     map, or whole metres on the far axes of a mesh.
 
     Parameters

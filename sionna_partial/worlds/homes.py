@@ -130,7 +130,7 @@ def make_home(
         Kind of home; None draws one of the first three. The others are large, up to 100 x 60 m: an office floor with
         corridors, a production hall with machines, a warehouse with shelves.
     resolution_m : float or None
-        Edge of a cell [m], 0.01 to 0.2; by default 0.05, or `LARGE_RESOLUTION_M` for the large kinds.
+        Edge of a cell [m], 0.01 to 0.2; by default 0.05, or 0.1 for the large kinds.
     locked_rooms : bool
         True if the home may have free rooms that cannot be reached, also behind closed doors.
 
