@@ -216,9 +216,11 @@ class AntennaPattern(Shown):
             require_number("frequency_hz", self.frequency_hz, 0.0, 1e12, open_low=True)
         if self.uniform_gain_dbi is None:
             self._require_passive()
-        elif self.radiated > NOTED_RADIATED:
-            message = "antenna %r: a gain of %g dBi in all directions is no antenna, unless an amplifier is part of it"
-            _log.warning(message, self.name, self.gain_dbi)
+            fault = f"it radiates {self.radiated:.2f} times the power that it is fed: its gain or cuts are too large"
+        else:
+            fault = f"a gain of {self.gain_dbi:g} dBi in all directions is no antenna, unless it has an amplifier"
+        if self.radiated > NOTED_RADIATED:
+            _log.warning("antenna %r: %s", self.name, fault)
 
     def _require_passive(self) -> "AntennaPattern":
         radiated = self.radiated
@@ -228,11 +230,6 @@ class AntennaPattern(Shown):
             f"narrower cuts, or at most {most_dbi:.1f} dBi."
         )
         require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
-        if radiated > NOTED_RADIATED:
-            message = (
-                "antenna %r radiates %.2f times the power that it is fed: its gain is too high, or its cuts too wide"
-            )
-            _log.warning(message, self.name, radiated)
         return self
 
     @property
