@@ -327,7 +327,7 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     require(
         unit.lower() in ("dbd", "dbi") and _is_finite(gain), "GAIN", header["GAIN"], "give a number and dBd or dBi."
     )
-    name = "".join(each for each in header.get("NAME", Path(path).stem) if each.isprintable())[:100] or "antenna"
+    name = "".join(filter(str.isprintable, header.get("NAME", Path(path).stem)))[:100] or "antenna"
     _require_vertical(name, header.get("POLARIZATION", ""))
     left, gain_dbi = np.roll(cuts["HORIZONTAL"][::-1], 1), float(gain) + _DIPOLE_DBI * (unit.lower() == "dbd")
     frequency_hz = _frequency_hz(header.get("FREQUENCY", ""))
