@@ -11,8 +11,7 @@ Limits of the gradients:
   unknown cells and in walls are the traced lengths times the ratio of `SmoothLengths`; a length of 0 remains 0.
 - The outputs of the map networks are linear between positions 15 cm to each side of the transmitter. Their derivative
   jumps where a receiver passes the centre of one of their cells.
-- On a complete map probabilities are constant.
-- TensorFlow refuses second derivatives.
+- On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
 
 from __future__ import annotations
@@ -101,11 +100,9 @@ class SmoothLengths:
     (1 in the kind, 0 elsewhere) is interpolated bilinearly between cell centres before it is integrated along the
     segment, so that edges become ramps of one cell.
 
-    Segments that cross a straight edge have the same length. The difference is a fraction of a cell at corners and ends
-    near an edge, and up to half of the length along an edge. First derivatives are continuous and exact; on lines
-    through cell centres, and for upright segments on one, they are the mean of both sides.
-
-    Everything outside the grid is unknown.
+    Across a straight edge lengths remain equal. They differ by a fraction of a cell at corners and ends near an edge,
+    and by up to half of the length along an edge. First derivatives are continuous and exact; on lines through cell
+    centres they are the mean of both sides. Everything outside the grid is unknown.
     """
 
     def __init__(self, partial: PartialMap, kind: CellState) -> None:
@@ -299,12 +296,10 @@ class DifferentiableScene:
         self.partial = self.simulation.partial
         if self.partial.obstacle is not None:
             raise MapError(
-                "scene has obstacles below the ceiling, which smooth lengths in walls do not know: give "
-                "dataclasses.replace(partial, obstacle=None)."
+                "scene has obstacles below the ceiling, which have no gradients: give it with obstacle=None."
             )
         remedy = (
-            "the default prediction through walls has no gradients on a map that is not complete: give "
-            "TraceSettings(refraction=False), or a predictor that was trained on paths through walls."
+            "on incomplete maps give TraceSettings(refraction=False), or a predictor trained on paths through walls."
         )
         require(self.partial.is_complete or not model.by_mean_losses, "refraction", True, remedy)
         self.predictor = Predictor.load(model.asked)
@@ -344,14 +339,8 @@ class DifferentiableScene:
         return DifferentiableLinks(self, self.simulation.paths(one_transmitter(tx), rx, progress=progress))
 
     @cached_property
-    def smooth_unknown(self) -> SmoothLengths:
-        """Lengths in unknown cells."""
-        return SmoothLengths(self.partial, CellState.UNKNOWN)
-
-    @cached_property
-    def smooth_walls(self) -> SmoothLengths:
-        """Lengths in cells of known walls."""
-        return SmoothLengths(self.partial, CellState.WALL)
+    def _smooth(self) -> dict[CellState, SmoothLengths]:
+        return {kind: SmoothLengths(self.partial, kind) for kind in (CellState.UNKNOWN, CellState.WALL)}
 
 
 class DifferentiableLinks:
@@ -389,10 +378,6 @@ class DifferentiableLinks:
         frequency_hz : () tensor, optional
             Carrier frequency of the trace [Hz]; ITU materials follow it.
 
-        Returns
-        -------
-        LinkDistribution
-
         Raises
         ------
         SettingsError
@@ -425,16 +410,13 @@ class DifferentiableLinks:
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
 
     def _tensor(self, name: str, value: Any) -> Any:
-        """Check an argument, and return it as a float64 tensor."""
         require(tf.executing_eagerly(), name, value, "call links eagerly, not within tf.function.")
         tensor = tf.cast(tf.convert_to_tensor(value, dtype_hint=tf.float64), tf.float64)
         shape = getattr(self.base, name).shape
         require(tensor.shape == shape, name, value, f"give a tensor of shape {shape}.")
         low, high = _LIMITS[name]
-        numbers = tensor.numpy()
-        require(
-            bool(((numbers >= low) & (numbers <= high)).all()), name, value, f"give numbers in [{low:g}, {high:g}]."
-        )
+        inside = bool(((tensor >= low) & (tensor <= high)).numpy().all())
+        require(inside, name, value, f"give numbers in [{low:g}, {high:g}].")
         return tensor
 
     @cached_property
@@ -468,11 +450,11 @@ class DifferentiableLinks:
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(scene.smooth_unknown, numeric["unobserved_distance_m"], base, ends)
+        unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
         return numeric | {
             "distance_m": distance_m,
             "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
-            "walled_m": moved_lengths_m(scene.smooth_walls, numeric["walled_m"], base, ends),
+            "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
         }
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
@@ -480,7 +462,7 @@ class DifferentiableLinks:
         legs = self._legs
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
-            unobserved_m = legs.moved_m(self._scene.smooth_unknown, tx_m, vertices_m)
+            unobserved_m = legs.moved_m(self._scene._smooth[CellState.UNKNOWN], tx_m, vertices_m)
         indirect, gains_db = tf.gather(power, legs.paths), []
         for length_m in ATTENUATION_LENGTHS_M:
             kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else attenuation(legs.unobserved_m, 0.0)
@@ -555,8 +537,7 @@ class _Legs:
 
 def _gain_db(power: Any) -> Any:
     """Return the gain (N,) of a power, at least -150 dB, where its derivative is 0."""
-    floor = 10.0 ** (GAIN_FLOOR_DB / 10.0)
-    return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, floor))
+    return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0)))
 
 
 def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -587,8 +568,7 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
 
     if not given:
         return tf.constant(paths.power), tf.constant(np.nan_to_num(paths.vertices_m))
-    power, vertices_m = evaluate(*given.values())
-    return power, vertices_m
+    return evaluate(*given.values())
 
 
 def _pulled(slopes: Floats, upstream: Any) -> Any:

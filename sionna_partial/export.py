@@ -33,20 +33,19 @@ LINK_STATES = ("link_state", "partial_link_state")
 def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a coverage map in the format of the suffix. Equal maps give equal files.
 
-    ======== ========================================================================================== `.nc`    NetCDF
-    4 (CF conventions) of the whole Dataset. `.tif`   GeoTIFF, one float32 band for each variable, named by its
-    description, NaN where no receiver stands;
-             local metres, no coordinate reference system; the settings as tags. Bands of several transmitters are named
+    ======== ==========================================================================================
+    `.nc`    NetCDF 4 (CF conventions) of the whole Dataset.
+    `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN without receiver; local
+             metres, no coordinate reference system; settings as tags. Bands of several transmitters are named
              "transmitter:variable".
-    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands. Several
+    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty without receiver. Several
              transmitters have a first column tx.
-    `.png`   The picture of `plot_coverage`. `.html`  A page for the browser, which needs no network: the layers, the
-    values under the pointer, and
-             P(gain > threshold) with a slider; of several transmitters a choice, and the best server.
-    `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 98,
-             is the probability of outage in percent; unknown (-1) where no receiver stands and in cells that the map
-             does not know. A static layer of nav2 keeps a robot where it has a link (parameters: `docs/live.md`). One
-             transmitter; for several, save `network_map`.
+    `.png`   The picture of `plot_coverage`.
+    `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold)
+             with a slider, and for several transmitters a choice and the best server.
+    `.yaml`  ROS map_server map in `raw` mode with a `.pgm`: occupancy 0 to 98 is the probability of outage in
+             percent; unknown (-1) without receiver and in unknown cells. A static layer of nav2 keeps a robot where
+             it has a link (`docs/live.md`). One transmitter; for several, save `network_map`.
     ======== ==========================================================================================
 
     Parameters

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 SCENE_FILES = ("scene.xml", "map.yaml")
 
 CALIBRATED_FILE = "calibrated.npz"
-"""File with the map in a folder that `sionna-partial calibrate` wrote."""
 
 MAX_CSV_BYTES = 100_000_000
 
@@ -79,7 +78,6 @@ def read_bytes(
     most: int,
     remedy: str = "give a smaller file.",
 ) -> bytes:
-    """Return the content of a regular file; see `open_regular`."""
     with open_regular(path, field, error, most, remedy) as stream:
         try:
             return stream.read(os.fstat(stream.fileno()).st_size + 1)
@@ -288,7 +286,6 @@ def is_path(path: object) -> bool:
 
 
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
-    """Return a path to read from, or raise an `error`."""
     if not is_path(path):
         given = os.fspath(path) if isinstance(path, os.PathLike) else path
         raise error(f"{field} = {shown(given)} is not a path: {remedy}")
@@ -296,7 +293,6 @@ def input_path(path: object, field: str, error: type[SionnaPartialError], remedy
 
 
 def output_path(path: object) -> Path:
-    """Return a path to write to, or raise an OutputError."""
     if not is_path(path):
         raise OutputError(f"path = {path!r} is not a path: give the name of a file or folder.")
     return Path(path)  # type: ignore[arg-type]
@@ -431,7 +427,6 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Raise an OutputError before long work if no file can be made in a folder, which may not exist yet."""
     target = output_path(folder)
     with _hidden_folder(target, target):
         pass

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.app.answer import LEVELS, Answer
-from sionna_partial.app.drawing import LENGTH, STRAIGHT, Plan
+from sionna_partial.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
 from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
@@ -31,12 +31,13 @@ _UNSELECT = "points.selection_manager.clear()"
 """Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _STROKE = """
-if (mode.value == "") return
-const {x, y} = cb_obj, data = name == "tap" || name == "panstart" ? {x: [], y: []} : live.data
+const is_area = mode.value == encloses
+if (mode.value == "" || name == "doubletap" && !is_area) return
+const {x, y} = cb_obj, data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
 const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
 xs.push(x); ys.push(y)
-const drawn = {x: xs, y: ys, r: xs.map(() => mode.value == measures ? 0 : brush.value / 2)}
-const is_done = name == "tap" || name == "panend"
+const drawn = {x: xs, y: ys, r: xs.map(() => wide.includes(mode.value) ? brush.value / 2 : 0)}
+const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
@@ -135,6 +136,8 @@ class Picture:
         for source in (self.stroke, self._live):
             plot.circle("x", "y", radius="r", source=source, fill_color=_PEN, line_color=None, alpha=0.4)
             plot.line("x", "y", source=source, line_color=_PEN, line_width=3)
+            plot.scatter("x", "y", source=source, fill_color=_PEN, line_color=None)
+        self._area = plot.patch("x", "y", source=self._live, fill_color=_PEN, fill_alpha=0.3, line_color=None)
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
@@ -159,11 +162,13 @@ class Picture:
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
-        given |= {"straight": [*STRAIGHT], "measures": LENGTH}
-        for name in ("panstart", "pan", "panend", "tap"):
+        given |= {"straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
+        for name in ("panstart", "pan", "panend", "tap", "doubletap"):
             self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
-        code = "for (const tool of tools) tool.active = !mode.value"
-        mode.js_on_change("value", CustomJS(args={"tools": [*self._tools], "mode": mode}, code=code))
+        code = f"area.visible = mode.value == '{AREA}'; live.data = {{x: [], y: [], r: []}}"
+        code += "; for (const tool of tools) tool.active = !mode.value"
+        args = {"tools": [*self._tools], "mode": mode, "live": self._live, "area": self._area}
+        mode.js_on_change("value", CustomJS(args=args, code=code))
         shown = {"walls": self.wall_shades, "plan": self.plan, "slider": threshold}
         code = "walls.low = slider.value + 1; plan.visible = true"
         threshold.js_on_change("value", CustomJS(args=shown, code=code))

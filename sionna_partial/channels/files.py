@@ -69,8 +69,8 @@ def save_channels(
 
     ============ =================================================================================================
     `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
-                     where there is no path: as from a generator of Sionna's `CIRDataset`. Responses have `h` (rx,
-                     rx_ant, tx, tx_ant, time, frequency or tap).
+                 where there is no path: as from a generator of Sionna's `CIRDataset`. Responses have `h` (rx,
+                 rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
                  no path, of one transmitter.
     ============ =================================================================================================

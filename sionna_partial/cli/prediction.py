@@ -378,7 +378,7 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     """Return positions (N, 3) in free cells [m]."""
     import numpy as np
 
-    from sionna_partial.coverage.dataset import grid_axes
+    from sionna_partial.coverage.job import grid_axes
 
     x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
     grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])

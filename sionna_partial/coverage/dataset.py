@@ -1,10 +1,9 @@
 """Variables of the coverage maps of `predict_map`, and the accessor ``coverage.radio``."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -14,19 +13,18 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, number_of, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.antennas import MAX_GAIN_DBI
-from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.tracing.stock import MapPlane, planar_radio_map, stock_gain_db
 
 WALL_PARTS = 6
@@ -34,9 +32,6 @@ WALL_PARTS = 6
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
-
-MAX_RECEIVERS = 2_000_000
-"""Largest number of receivers of a coverage map."""
 
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 """Positions [m] along the dimension "tx" of the maps of several transmitters."""
@@ -50,8 +45,6 @@ ANTENNA = "tx_antenna"
 _OF_ALL = ("observed", "cell_state", "wall_parts", ROOM)
 """Variables that do not depend on the transmitter."""
 
-_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
-
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Required attributes and their lower limits."""
 
@@ -62,13 +55,14 @@ _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (
 _PLOT = "plots.coverage_plot:plot_coverage"
 
 
-def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+def flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+    """Return the CF attributes of a variable with flags."""
     return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
 
 
-_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
-_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
-_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
+_LINK_FLAGS = flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
+_CELL_FLAGS = flags({state.name.lower(): state for state in CellState})
+_YES_NO = flags({"no": 0, "yes": 1}, np.int8)
 
 ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "p_los": {"long_name": "probability of line of sight", "units": "1"},
@@ -96,58 +90,6 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     },
 }
 """Variables on (y, x) and their CF attributes."""
-
-
-@dataclass(frozen=True)
-class Receivers:
-    """Receivers on a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
-
-    x_m: Floats
-    y_m: Floats
-    cell_state: States
-    valid: Bools
-    rx_m: Floats
-
-
-def grid_receivers(
-    partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
-) -> Receivers:
-    """Return the receivers; receivers too near a wall or a transmitter (T, 3) [m] are masked."""
-    require_height(partial, "rx_height_m", rx_height_m)
-    x_m, y_m = grid_axes(partial, spacing_m)
-    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
-    limit_m = nearest_m(frequency_hz)
-    cell_state = partial.state_at(points)
-    far = np.ones(cell_state.shape, dtype=bool)
-    for each_m in tx_m:
-        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
-    valid = far & clear_of_walls(partial, points)
-    if not far.any() and limit_m > SHORTEST_M:
-        raise PositionError(
-            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
-            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
-        )
-    if not valid.any():
-        raise PositionError(
-            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
-            f"spacing_m = {spacing_m:g}, give a smaller one."
-        )
-    return Receivers(x_m, y_m, cell_state, valid, points[valid])
-
-
-def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
-    """Return x (nx,) and y (ny,) [m] of the cell centres on the map."""
-    low = partial.resolution_m / 10
-    require_number("spacing_m", spacing_m, low, 1e6)
-    x0, y0, x1, y1 = partial.bounds_m
-    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
-    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
-    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
-    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
-    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
-    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
-    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
-    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
 
 
 def link_columns(
@@ -197,41 +139,6 @@ def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, 
         "predictor": "none: the map is complete, the trace is the prediction" if model is None else model.name,
         "predictor_sha256": "" if model is None else model.fingerprint,
     }
-
-
-def coverage_map(
-    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
-) -> xr.Dataset:
-    """Put the values (N,) of the valid receivers on their grid, and add the layers of the map."""
-    layers: dict[str, NDArray[Any]] = {
-        "observed": receivers.cell_state != CellState.UNKNOWN,
-        "valid": receivers.valid,
-        "cell_state": receivers.cell_state,
-        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
-    }
-    for name, values in columns.items():
-        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
-        layers[name][receivers.valid] = values
-    axes = {
-        name: (
-            name,
-            values,
-            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
-            {"_FillValue": None},
-        )
-        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
-    }
-    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
-    if partial.room is not None:
-        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
-        names = {"none": 0}
-        for number, name in enumerate(partial.room_names, 1):
-            word = "_".join(name.split())
-            names[word if word and word not in names else f"{word}_{number}"] = number
-        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **_flags(names)}
-    for name in (*DISTRIBUTION, "link_state"):
-        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
-    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
 
 
 def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
@@ -522,8 +429,8 @@ class CoverageAccessor:
         if ROOM not in self._coverage:
             return {}
         room = self._coverage[ROOM]
-        flags = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
-        return {name: room.to_numpy() == number for name, number in flags if number}
+        numbers = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
+        return {name: room.to_numpy() == number for name, number in numbers if number}
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
         maps = transmitters_of(self._coverage)
@@ -649,33 +556,3 @@ def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
     else:
         position = f"at ({position}) m"
     return f"transmitter {position}" + (f", {antenna}" if antenna != "iso" else "")
-
-
-def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
-    """Return (ny, nx) bits: the parts of the cell that contain a wall."""
-    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
-    walls = walls.cumsum(axis=1, dtype=np.int32)
-    ny, nx = partial.shape
-    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
-    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    for row, (bottom, top) in enumerate(rows):
-        strip = walls[top] - walls[bottom]
-        for column, (left, right) in enumerate(columns):
-            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
-    return bits
-
-
-def _part_spans(
-    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
-) -> list[tuple[Indices, Indices]]:
-    """Return the first map cell, and one after the last, that each part of the receivers' cells overlaps."""
-    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
-    step = spacing_m / resolution_m / WALL_PARTS
-    return [
-        (
-            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
-            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
-        )
-        for part in range(WALL_PARTS)
-    ]

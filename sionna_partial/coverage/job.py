@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,10 +11,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import (
     Progress,
     float_array,
@@ -22,14 +23,17 @@ from sionna_partial.checks import (
     require_choice,
     require_memory,
     require_names,
+    require_number,
     transmitter_names,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB
+from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage.dataset import (
     ANTENNA,
-    Receivers,
-    coverage_map,
-    grid_receivers,
+    ATTRIBUTES,
+    DISTRIBUTION,
+    ROOM,
+    WALL_PARTS,
+    flags,
     join_transmitters,
     link_columns,
     provenance,
@@ -38,7 +42,7 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, with_height
+from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
@@ -50,7 +54,7 @@ from sionna_partial.measurements.measurements import (
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
-from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 RECEIVERS = ("indoor", "anywhere")
 """Receivers that probabilities and gains refer to: indoors (default), or anywhere."""
@@ -77,6 +81,11 @@ LIBRARIES_GB, CELL_BYTES, RECEIVER_BYTES, WORK_BYTES = 1.0, 40, 400, 120_000
 
 BLOCK_RECEIVERS = (500, 8_000)
 """Smallest and largest size of a block."""
+
+MAX_RECEIVERS = 2_000_000
+"""Largest number of receivers of a coverage map."""
+
+_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _log = logging.getLogger(__name__)
 
@@ -202,6 +211,17 @@ def predict_map(
 
 
 @dataclass(frozen=True)
+class Receivers:
+    """Receivers on a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
+
+    x_m: Floats
+    y_m: Floats
+    cell_state: States
+    valid: Bools
+    rx_m: Floats
+
+
+@dataclass(frozen=True)
 class Transmitter:
     """A transmitter to predict; `position_m` (3,) is None if measurements locate it."""
 
@@ -242,7 +262,7 @@ class CoverageJob:
         if transmitter.position_m is None:
             posterior = self._located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
-            grid = receivers_of(model, source.tx_m, self.rx_height_m, self.spacing_m)
+            grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m)
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
@@ -397,18 +417,12 @@ def _transmitters(
     for antenna in {*antennas}:
         antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
-    grids = [receivers_of(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
+    grids = [grid_receivers(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)
     if measurements is not None:
         measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
     rows = zip(names or [""], positions_m, antennas, grids, measured, strict=True)
     return names, [Transmitter(*row) for row in rows]
-
-
-def receivers_of(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
-    """Return the receivers for transmitters (K, 3) [m]."""
-    frequency_hz = model.simulation.trace_settings.frequency_hz
-    return grid_receivers(model.partial, tx_m, rx_height_m, spacing_m, frequency_hz)
 
 
 def transmitter_positions(
@@ -466,3 +480,108 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
         "measured_offset_db": float(offset_db),
         "measured_shadow_scale": float(shadow_scale),
     }
+
+
+def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
+    """Return the receivers; receivers too near a wall or a transmitter (T, 3) [m] are masked."""
+    partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
+    require_height(partial, "rx_height_m", rx_height_m)
+    x_m, y_m = grid_axes(partial, spacing_m)
+    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
+    limit_m = nearest_m(frequency_hz)
+    cell_state = partial.state_at(points)
+    far = np.ones(cell_state.shape, dtype=bool)
+    for each_m in tx_m:
+        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
+    valid = far & clear_of_walls(partial, points)
+    if not far.any() and limit_m > SHORTEST_M:
+        raise PositionError(
+            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
+            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
+        )
+    if not valid.any():
+        raise PositionError(
+            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
+            f"spacing_m = {spacing_m:g}, give a smaller one."
+        )
+    return Receivers(x_m, y_m, cell_state, valid, points[valid])
+
+
+def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
+    """Return x (nx,) and y (ny,) [m] of the cell centres on the map."""
+    low = partial.resolution_m / 10
+    require_number("spacing_m", spacing_m, low, 1e6)
+    x0, y0, x1, y1 = partial.bounds_m
+    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
+    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
+    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
+    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
+    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
+    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
+    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
+    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
+
+
+def coverage_map(
+    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> xr.Dataset:
+    """Put the values (N,) of the valid receivers on their grid, and add the layers of the map."""
+    layers: dict[str, NDArray[Any]] = {
+        "observed": receivers.cell_state != CellState.UNKNOWN,
+        "valid": receivers.valid,
+        "cell_state": receivers.cell_state,
+        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
+    }
+    for name, values in columns.items():
+        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
+        layers[name][receivers.valid] = values
+    axes = {
+        name: (
+            name,
+            values,
+            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
+            {"_FillValue": None},
+        )
+        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
+    }
+    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    if partial.room is not None:
+        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
+        names = {"none": 0}
+        for number, name in enumerate(partial.room_names, 1):
+            word = "_".join(name.split())
+            names[word if word and word not in names else f"{word}_{number}"] = number
+        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **flags(names)}
+    for name in (*DISTRIBUTION, "link_state"):
+        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
+    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
+
+
+def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
+    """Return (ny, nx) bits: the parts of the cell that contain a wall."""
+    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
+    walls = walls.cumsum(axis=1, dtype=np.int32)
+    ny, nx = partial.shape
+    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
+    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
+    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    for row, (bottom, top) in enumerate(rows):
+        strip = walls[top] - walls[bottom]
+        for column, (left, right) in enumerate(columns):
+            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
+    return bits
+
+
+def _part_spans(
+    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
+) -> list[tuple[Indices, Indices]]:
+    """Return the first map cell, and one after the last, that each part of the receivers' cells overlaps."""
+    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
+    step = spacing_m / resolution_m / WALL_PARTS
+    return [
+        (
+            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
+            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
+        )
+        for part in range(WALL_PARTS)
+    ]

@@ -28,7 +28,6 @@ VAIN_STEPS = 1000
 """Number of actions without progress after which a robot stops; errors of its map may block every route."""
 
 PROGRESS = 0.005
-"""Fraction of the free area that counts as progress."""
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 _MARGIN_M = 2.0

@@ -54,7 +54,6 @@ from sionna_partial.worlds.robot import (
 )
 
 GOALS = ("coverage", "state", "area")
-"""Goals of a view; the first is the default."""
 
 MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 """Largest numbers of returned poses and of predicted transmitters."""
@@ -132,15 +131,6 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         transmitter, the relative probability of its position.
     goal : {"coverage", "state", "area"}
     sensor : SensorSettings
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
-    >>> partial = sp.map_from_array(cells, resolution_m=0.5)
-    >>> views = sp.next_views(partial, goal="area")
-    >>> [round(view.path_length_m, 1) for view in views]
-    [0.5]
     """
 
     views: tuple[NextView, ...]

@@ -33,7 +33,6 @@ MAX_CHUNK_BYTES = 2 * 10**9
 _MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 
 MAX_TILT_RAD = 0.01
-"""Largest roll and pitch of a level origin [rad]."""
 
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 25
 """Occupancy from which a cell is wall, and up to which it is free (defaults of nav2's map_saver) [percent]."""
@@ -58,12 +57,10 @@ class Recording:
 
     @property
     def kinds(self) -> dict[str, str]:
-        """Message type of every topic, without its package."""
         return {link.topic: link.msgtype.rpartition("/")[2] for link in self._reader.connections}
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last message [s]."""
         return self._reader.duration / 1e9 if self._reader.message_count else 0.0
 
     def topic_of(self, given: str | None, kinds: tuple[str, ...], usual: str = "") -> str:
@@ -79,7 +76,6 @@ class Recording:
         raise self.error(f"path = '{self.path}' {what}: name one of its topics: {found}.")
 
     def messages(self, *topics: str, until_s: float = math.inf) -> Iterator[Message]:
-        """Decode the messages of some topics, in recorded order."""
         for each in self.raw(*topics, until_s=until_s):
             yield self.decoded(*each)
 
@@ -92,7 +88,6 @@ class Recording:
             yield (time_ns - start) / 1e9, raw, link.msgtype, link.topic
 
     def decoded(self, time_s: float, raw: bytes, kind: str, topic: str) -> Message:
-        """Decode a message."""
         if len(raw) > MAX_MESSAGE_BYTES:
             size = f"a {kind} of {len(raw):,} bytes, more than {MAX_MESSAGE_BYTES:,}"
             raise self.error(f"path = '{self.path}' holds {size}: record a coarser map.")

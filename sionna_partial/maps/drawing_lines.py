@@ -27,7 +27,6 @@ FLAT_FRACTION = 0.001
 LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "MLINE"}
 
 XREF = "external reference"
-"""Type of elements that refer to a block in another file."""
 
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
@@ -58,7 +57,6 @@ AIA_STATUS = {"D": "to be demolished", "F": "future work", "M": "to be moved", "
 """Status fields of AIA/NCS names of walls that are not part of the finished building."""
 
 AIA_DEMOLITION = {"AD", "ID", "SD"}
-"""Disciplines of demolition: architecture, interiors and structure."""
 
 PARTIAL_HEIGHT = re.compile(r"(?<![a-z])prht(?![a-z])|partial.?height|halbhoch|brüstung", re.IGNORECASE)
 """Words in the names of layers with walls that end below the ceiling."""
@@ -76,7 +74,6 @@ UNITS_M = {
     "inches": 0.0254,
     "feet": 0.3048,
 }
-"""Units of plans [m]."""
 
 RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
 """Additional misfit of rare units, unless the header has them."""
@@ -151,7 +148,6 @@ class DrawnLines:
             raise self._too_large()
 
     def line_counts(self) -> Counter[str]:
-        """Return the number of entities with lines on each layer."""
         found = Counter[str]()
         for (layer, kind), count in self.counts.items():
             found[layer] += count * (kind in LINE_TYPES)
@@ -334,7 +330,6 @@ def misfit(lengths: dict[str, float], unit_m: float) -> float:
 
 
 def lengths_of(segments: Floats, texts: Floats) -> dict[str, float]:
-    """Return the lengths for checking a unit, in units of the drawing."""
     low = segments.min(axis=(0, 1))
     extent = float(np.ptp(segments.reshape(-1, 2), axis=0).max())
     found = {"an extent": extent}

@@ -183,7 +183,6 @@ class _Plan(NamedTuple):
         return f"{len(names)} layers: {', '.join(texts)}"
 
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
-        """Return the reason for which each layer is not a wall, "" for walls."""
         if names is not None:
             found = {
                 layer: "" if any(fnmatch(layer, name.lower()) for name in names) else "not in wall_layers"
@@ -290,7 +289,6 @@ def _by_layer(name: str, plan: _Plan, layers: set[str], given: Any, checked: Any
 
 
 def material_given(name: str, value: object) -> Material:
-    """Return a material of `layer_materials`."""
     material = Material.named(value) if isinstance(value, str) else value
     if not isinstance(material, Material):
         raise MapError(f"layer_materials[{shown(name)}] = {shown(value)} is no material: give one, or its name.")

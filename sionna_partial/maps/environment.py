@@ -25,7 +25,6 @@ MAX_TRIANGLES = 5_000_000
 MAX_MESH_BYTES = 2_000_000_000
 
 MAX_MATERIALS = 256
-"""Largest number of materials of a mesh, with one byte for each triangle."""
 
 MAX_COORDINATE_M = 1e8
 """Largest coordinate of a mesh [m]; more is a unit error."""
@@ -141,16 +140,13 @@ class SceneMesh(Shown):
         return replace(self, vertices_m=vertices, triangles=triangles, material=self.material[source[order][split]])
 
     def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials of the triangles, as `FloorPlan.known_materials`."""
         return set(self.scene_materials(default).values())
 
     def scene_materials(self, default: Material) -> dict[str, Material]:
-        """Return the materials of the triangles by their names in the scene."""
         used = np.unique(self.material).tolist()
         return {f"material{index}": self.materials[index] or default for index in used}
 
     def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
-        """Return the fields of a map with other materials, by their names in the scene."""
         named = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.materials))
         return {"mesh": replace(self, materials=named)}
 
@@ -160,16 +156,13 @@ class SceneMesh(Shown):
         return {"mesh": replace(self, height_range_m=(low_m, low_m + height_m))}
 
     def scene_offset_m(self, bounds_m: tuple[float, float, float, float]) -> list[float]:
-        """Return the world position [m] of the scene's origin in whole metres."""
         (x0, y0, x1, y1), heights_m = bounds_m, self._heights_m
         return [_whole_offset_m(low, high) for low, high in ((x0, x1), (y0, y1), heights_m)]
 
     def sheet(self) -> dict[str, object]:
-        """Return the keys of the mesh in the YAML of an exported scene."""
         return {"mesh": {"height_range": [*self._heights_m], "materials": material_records(self.materials)}}
 
     def arrays(self) -> dict[str, Any]:
-        """Return the arrays of the mesh in a map's `.npz`."""
         return {
             "mesh_vertices_m": self.vertices_m,
             "mesh_triangles": self.triangles,
@@ -196,7 +189,6 @@ def merged_mesh(
 
 
 def material_records(materials: Iterable[Material | None]) -> list[dict[str, Any] | None]:
-    """Return materials as plain data for files."""
     return [None if material is None else asdict(material) for material in materials]
 
 
@@ -261,7 +253,6 @@ def _height_range(given: tuple[float, float] | None, vertices_m: Floats) -> tupl
 
 
 def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
-    """Return two heights as numbers, or raise a MapError."""
     remedy = "give (low, high), z in metres, low < high."
     pair = float_array(name, given, MapError, remedy)
     if pair.shape != (2,) or not -MAX_COORDINATE_M <= pair[0] < pair[1] <= MAX_COORDINATE_M:
@@ -271,7 +262,7 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class FloorPlan:
-    """Walls from floor to ceiling in all wall cells of a map; the class attributes are as of `SceneMesh`.
+    """Walls from floor to ceiling in all wall cells of a map.
 
     `is_extruded`: the cells show the walls at any height. `suffixes`: possible suffixes of map files, the usual one
     first. `receivers_at_once`: number of receivers whose paths are found at once, which bounds the memory.

@@ -61,7 +61,7 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
 
 
 @njit(cache=True)
-def _join(clearance, order, nx, ratio, smallest):  # type: ignore[no-untyped-def]
+def _join(clearance, order, nx, ratio, smallest):
     parent = np.full(len(clearance), -1)
     openings, count, areas = np.zeros(len(order)), 0, 0
     for cell in order:
@@ -117,9 +117,7 @@ class ImportSource:
 
 @dataclass(frozen=True)
 class ImportReport(ImportSource, Shown):
-    """Report of a map that was read from a file.
-
-    Size, rooms and doors are computed from the cells of the map, and so check the import.
+    """Report of a map that was read from a file; size, rooms and doors are computed from the cells of the map.
 
     Parameters
     ----------
@@ -196,18 +194,15 @@ class ImportNotes:
     _counts: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def use(self, name: str, count: int = 1) -> None:
-        """Count used elements."""
         self.skip(name, count, "")
 
     def skip(self, name: str, count: int, reason: str) -> None:
-        """Count skipped elements."""
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
         """Return a PartialMap with its report, and warn of implausible results.
 
-        `size`, `doors` and `area` are remedies for an implausible extent, implausible doors, or hardly any enclosed
-        area. A check without a remedy is skipped.
+        `size`, `doors` and `area` are remedies; a check without a remedy is skipped.
         """
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
@@ -222,7 +217,6 @@ class ImportNotes:
 
 
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
-    """Return the report of a map with the cells (ny, nx)."""
     free, known = state == CellState.FREE, state != CellState.UNKNOWN
     rooms = rooms_of(free, resolution_m)
     spans = [_span(known.any(axis=axis)) * resolution_m for axis in (0, 1)]

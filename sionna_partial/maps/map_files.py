@@ -62,7 +62,6 @@ ACCEPTED = (
 )
 
 _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
-"""Size of the largest array of a mesh [bytes]."""
 
 COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
 

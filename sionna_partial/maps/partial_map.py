@@ -318,7 +318,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         """True if no unknown room can be entered; only pockets in furniture or thick walls are unknown.
 
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
-        can enter it from free cells without touching a wall. Meshes are never nearly complete.
+        can enter it from free cells. Meshes are never nearly complete.
         """
         if self.is_complete or not self.environment.is_extruded:
             return self.is_complete

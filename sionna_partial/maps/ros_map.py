@@ -38,7 +38,6 @@ logger = logging.getLogger(__name__)
 MODES = ("trinary", "scale", "raw")
 
 UNKNOWN_SHADE = 205
-"""Shade of unknown cells in saved maps [of 255]."""
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
 """Thresholds of written maps (map_server's; the shade 205 stays unknown)."""
@@ -231,7 +230,6 @@ def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[flo
 
 
 def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint8]]) -> None:
-    """Write a YAML, and PGM images from pixels (ny, nx) with the smallest y first, all or none."""
     with atomic_write(path, "w") as sheet, ExitStack() as together:
         sheet.write(text)
         sheet.flush()  # a full disk fails here, not after the pictures are there
@@ -266,8 +264,8 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
     """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
 
     Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is ignored. Any other yaw
-    samples the grid at cells of half the size: a wall of one cell stays at least two cells thick, more than a diagonal
-    step needs (sqrt 2). Gaps where walls meet only at a corner are closed, so that a complete map stays complete.
+    samples the grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs
+    (sqrt 2). Gaps where walls meet only at a corner are closed.
 
     Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
     """
@@ -314,9 +312,9 @@ def fitted_threshold(
 ) -> float | None:
     """Return the occupancy that separates free cells and walls in a map of continuous values, else None.
 
-    Such a map, as of Cartographer, has many seen cells of many values between the thresholds. The threshold is in the
-    valley of the histogram (V,), between two well separated distributions with means below and above 50 percent. An
-    empty remedy keeps the thresholds, which the caller chose.
+    Such a map, as of Cartographer, has many different values between the thresholds. The result is in the valley of the
+    histogram (V,), between two well separated distributions with means below and above 50 percent. An empty remedy
+    keeps the thresholds, which the caller chose.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
     inside = int(count[between].sum())
@@ -513,7 +511,6 @@ def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Imag
 
 
 def bare_image(path: Path) -> MapError:
-    """Return the error for an image without resolution."""
     remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
     if path.suffix.lower() != ".pgm":
         remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"

@@ -79,10 +79,10 @@ class CleanWalls(NamedTuple):
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
     """Clean the wall cells of a map with states (ny, nx).
 
-    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps in
-    seen walls are closed, of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to
-    `MAX_FREE_GAP_M`. Of walls seen from FREE cells only the cells beside these, and inner corners of deep walls, are
-    kept. Walls two cells thick are thinned.
+    Enclosed pinholes are filled, notches and bumps of one by at most two cells are levelled, and gaps in seen walls are
+    closed: of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to `MAX_FREE_GAP_M`. Of walls seen
+    from FREE cells only the cells beside these, and inner corners of deep walls, are kept. Walls two cells thick are
+    thinned.
     """
     wall = _fill_pinholes(state == CellState.WALL)
     free = ~_fill_pinholes((state != CellState.FREE) | wall)
@@ -106,8 +106,8 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
-    Both touch a FREE cell only by a corner. The faces end at an inner corner; behind an outer one, and behind a step of
-    a tilted face, another FREE cell is beside one of them. Walls without FREE cells within `DEEP_CELLS` are deep.
+    Both touch a FREE cell only by a corner. Behind an outer corner, and behind a step of a tilted face, another FREE
+    cell is beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
@@ -128,8 +128,8 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     """Return the noise of `CleanWalls`.
 
-    Rays mark one layer of cells with smooth faces; with noise they mark several, with rough faces. Walls of plans are
-    thick, but smooth.
+    Exact rays mark one layer of cells with smooth faces, noisy ones several with rough faces. Walls of plans are thick,
+    but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
@@ -169,8 +169,8 @@ def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
-    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones, between two pieces. The shortest line between
-    them closes it, or the row itself where rays passed that line.
+    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones. The shortest line between the pieces closes it,
+    or the row itself where rays passed that line.
     """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
     label, _ = ndimage.label(gap, structure=_SQUARE)
@@ -286,11 +286,11 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along x or y
-    (whichever the line is steeper against). A polyline that turns back four times or more, and at least once in 10
-    cells, is ragged: `RAGGED_FACTOR` times the tolerance is allowed. The split minimises the number of runs plus three
-    times their residual variances, in squared tolerances. The line is the least-squares one if it keeps the tolerance;
-    a ragged one is parallel to an axis if that moves its ends by at most half a cell.
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
+    the line is steeper against. Ragged polylines, which turn back four times or more and at least once in 10 cells, get
+    `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
+    variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
+    ragged runs if that moves their ends by at most half a cell.
 
     Returns the index of the first corner of every run (r,), and a point x, y on and the direction x, y of its line (r,
     4).
@@ -309,7 +309,7 @@ def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Float
 
 
 @njit(cache=True)
-def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
+def _find_runs(points, swapped, tolerance, cost, previous, along_y):
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
@@ -320,7 +320,7 @@ def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ig
 
 
 @njit(cache=True)
-def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: ignore[no-untyped-def]
+def _extend(points, tolerance, start, swap, cost, previous, along_y):
     """Lengthen the run from `start` while a line fits, and note where that makes a split cheaper."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
@@ -347,7 +347,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 
 
 @njit(cache=True)
-def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
+def _line(points, start, end, tolerance):
     """Return a point on and the direction of the line that fits a run; a ragged one may be parallel to an axis."""
     for factor in (1.0, RAGGED_FACTOR):
         limit, moments = factor * tolerance, np.zeros(6)
@@ -379,7 +379,7 @@ def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
+def _clip_element(polygon, size, element, tolerance):
     x0, y0, x1, y1, steps = element
     if size > 0:
         size = _clip(polygon, size, x0, y0, tolerance)
@@ -389,7 +389,7 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _middles(points, origin, k):  # type: ignore[no-untyped-def]
+def _middles(points, origin, k):
     x, y = points[k, 0] - points[origin, 0], points[k, 1] - points[origin, 1]
     dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
     a, b = abs(round(dx)), abs(round(dy))
@@ -401,7 +401,7 @@ def _middles(points, origin, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _accumulate(moments, element):  # type: ignore[no-untyped-def]
+def _accumulate(moments, element):
     """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
     x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
@@ -416,7 +416,7 @@ def _accumulate(moments, element):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _residual_variance(moments):  # type: ignore[no-untyped-def]
+def _residual_variance(moments):
     mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
     xx = moments[3] / moments[0] - mean_x * mean_x
     xy = moments[4] / moments[0] - mean_x * mean_y
@@ -425,7 +425,7 @@ def _residual_variance(moments):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _all_lines():  # type: ignore[no-untyped-def]
+def _all_lines():
     polygon = np.empty((_CORNERS, 2))
     for k in range(len(_ALL_LINES)):
         polygon[k, 0], polygon[k, 1] = _ALL_LINES[k, 0], _ALL_LINES[k, 1]
@@ -433,7 +433,7 @@ def _all_lines():  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
+def _clip(polygon, size, x, y, tolerance):
     """Keep the lines that pass (x, y) within the tolerance along y; return the number of corners left."""
     kept = np.empty((_CORNERS, 2))
     for side in (1.0, -1.0):

@@ -411,9 +411,7 @@ class _Compared(NamedTuple):
         return self._hypothesis(k, p)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
-        """Return averages (P,) of the prior above free space, the measured gain above the prior, and the prior's spread
-        [dB].
-        """
+        """Return averages (P,) of prior above free space, measurement above prior, and the prior's deviation [dB]."""
         averaged, free_db = self.sample.averaged, self.links.free_space_db(self.sample.measured.rx)
         below_db, above_db = prior.gain_mean_db - free_db, self.sample.level_db - prior.gain_mean_db
         return averaged(below_db), averaged(above_db), averaged(prior.gain_std_db)

@@ -100,13 +100,12 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     """Outline the walls of a map by few straight segments, which meet only at shared vertices.
 
     A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Walls seen from
-    one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. A map that is
-    turned, mirrored, moved or padded with UNKNOWN cells has the same outlines, transformed, unless it equals its own
-    mirror image.
+    one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. Outlines turn,
+    mirror and move with the map, unless it equals its own mirror image.
 
-    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres. From 0.5 on,
-    the staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice as much
-    for ragged faces (`fit_runs`).
+    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres; from 0.5 on,
+    the staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
+    ragged faces (`fit_runs`).
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
@@ -164,8 +163,8 @@ def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
 def _wall_graph(wall: Bools, *, cut_spurs: bool) -> _Graph:
     """Connect the centres of boundary wall cells (ny, nx).
 
-    Edges join wall cells by a side, unless both blocks of two by two cells beside it are full, and by a corner of a
-    block with only these two. Spurs of one cell are cut off. Single cells become squares.
+    Edges join cells by a side, unless both blocks of two by two cells beside it are full, and by a corner of a block
+    with only these two. Spurs of one cell are cut off. Single cells become squares.
     """
     w = np.pad(wall, 1)
     block = w[:-1, :-1] & w[:-1, 1:] & w[1:, :-1] & w[1:, 1:]
@@ -499,7 +498,7 @@ def bin_points(points_m: Floats) -> PointBins:
 
 
 @njit(cache=True)
-def grow(array, size):  # type: ignore[no-untyped-def]
+def grow(array, size):
     """Return the array, enlarged if it has fewer than `size` rows."""
     if size <= array.shape[0]:
         return array
@@ -563,7 +562,7 @@ def _index(walls: Floats) -> WallIndex:
 
 
 @njit(cache=True)
-def _cells_of(walls, grid):  # type: ignore[no-untyped-def]
+def _cells_of(walls, grid):
     x0, y0, edge, columns, rows = grid[0], grid[1], grid[2], int(grid[3]), int(grid[4])
     cell, piece, count = np.empty(1024, np.int64), np.empty(1024, np.int32), np.int64(0)
     for i in range(len(walls)):

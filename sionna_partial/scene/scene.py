@@ -59,7 +59,6 @@ class Lid(NamedTuple):
 
 
 _NO_MATERIAL = Material(itu="vacuum")
-"""Placeholder for the default material."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +74,7 @@ class SceneGeometry:
     open_end : (V,) bool array
         True where a wall ends because observation ended.
     wall_material : (S,) int64 array
-        Index into `materials` of each wall.
-    materials : tuple of Material
-        The first is the material of floor and ceiling.
+        Index into `materials`; the first of these is also the material of floor and ceiling.
     top_m : (S,) float64 array
         Height of each wall [m]; less than `height_m` for obstacles.
     lids : tuple of Lid
@@ -114,7 +111,6 @@ class SceneGeometry:
 
     @cached_property
     def plan(self) -> Plan:
-        """The walls, cut where they cross."""
         return prepare_plan(self.walls_m, self.top_m < self.height_m)
 
     @property
@@ -124,12 +120,10 @@ class SceneGeometry:
 
     @property
     def ceiling_face(self) -> int:
-        """First face of the ceiling, -1 without a ceiling."""
         return self.floor_face + len(self.floor_mesh[1]) if len(self.floor_m) and self.ceiling else -1
 
     @property
     def lid_faces(self) -> list[int]:
-        """First face of each lid."""
         flats = len(self.floor_mesh[1]) * (1 + self.ceiling) if len(self.floor_m) else 0
         return np.cumsum([2 * len(self.segments) + flats, *(len(each.triangles) for each in self.lids)])[:-1].tolist()
 
@@ -469,7 +463,6 @@ def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
 
 
 def floor_cells(partial: PartialMap, extent: str) -> Bools:
-    """Return the cells (ny, nx) that floor and ceiling cover."""
     if extent == "none":
         return np.zeros(partial.shape, dtype=bool)
     free = partial.wall_levels[0][1].state == CellState.FREE

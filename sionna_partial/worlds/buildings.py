@@ -48,7 +48,6 @@ Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
 
 
 def union_of(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
-    """Return the union of shapes on a grid of `GRID_M`."""
     return shapely.union_all(list(shapes), grid_size=GRID_M)
 
 
@@ -59,7 +58,6 @@ def parts_of(shape: shapely.Geometry) -> list[Polygon]:
 
 
 def log_uniform(rng: Rng, between: tuple[float, float]) -> float:
-    """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(*np.log(between))))
 
 
@@ -75,8 +73,8 @@ def furnish(
 ) -> Iterator[Polygon]:
     """Yield furniture and pillars (they may overlap) that leave a room and its doors passable.
 
-    `room` is the outline through the middle of its walls, `walls` includes door leaves, `openings` are of the whole
-    home. `clutter` is the mean number of trials for every 4 m2, `pillars` the probability of pillars in a large room.
+    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number of
+    trials for every 4 m2, `pillars` the probability of pillars in a large room.
     """
     near = [opening for opening in openings if opening.distance(room) < NEAR_M]
     doorsteps = union_of([opening.buffer(walk_m, cap_style="flat") for opening in near])

@@ -25,22 +25,12 @@ RAY_DEG = 0.5
 
 
 class Fusion(NamedTuple):
-    """Rule of a mapper that classifies cells by the rays that end in them (hits) and cross them (passes).
+    """Rule of a mapper that classifies cells by rays that end in them (hits) and cross them (passes).
 
-    Parameters
-    ----------
-    by_scan : bool
-        True if each picture counts once in a cell, as a hit if any of its rays ends there.
-    passes_of_hit : int
-        Number of passes that a hit adds.
-    min_passes : int
-        Number of passes from which a cell is known.
-    max_free : float
-        Ratio of hits to passes above which a cell is wall.
-    travel_m, turn_deg : float
-        Distance [m] or turn [degree] since the last picture that triggers another.
-    cleared_m : float
-        Largest range up to which rays without a wall in range mark free cells [m].
+    `by_scan` counts each picture once in a cell, as a hit if any of its rays ends there. A hit adds `passes_of_hit`
+    passes. From `min_passes` a cell is known, and wall if hits / passes exceeds `max_free`. A distance of `travel_m`
+    [m] or a turn of `turn_deg` [degree] triggers the next picture. Rays without a wall in range clear up to `cleared_m`
+    [m].
     """
 
     by_scan: bool
@@ -70,13 +60,11 @@ FUSIONS = {
 """Rules of mappers, with their default parameters.
 
 - slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from more
-  than two passes. A ray adds a pass to its last cell, and one more with its hit. `minimum_travel_distance` and
-  `minimum_travel_heading` are 0.5.
+  than two passes; a hit adds two passes. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
 - gmapping (`slam_gmapping.cpp`): wall where hits / (hits + passes) > `occ_thresh`, 0.25. `linearUpdate` is 1 m,
   `angularUpdate` 0.5.
-- Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55 and `miss_probability` 0.49 for each picture; wall
-  where the log odds are positive, here without limits. `motion_filter` has 0.2 m and 1 degree. Returns from beyond the
-  range clear `missing_data_ray_length`, 5 m.
+- Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55, `miss_probability` 0.49; wall where the log odds
+  are positive, here without limits. `motion_filter` has 0.2 m and 1 degree, `missing_data_ray_length` is 5 m.
 - vacuum: as gmapping, with thinned walls (`Camera.map`). The rules of firmware are not published.
 
 Rays that return from beyond the range clear it, as with `max_laser_range` and `maxUrange` below the sensor's limit.
@@ -192,9 +180,8 @@ def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_d
 class _Rays(NamedTuple):
     """Rays of one picture: start, believed minus true position, and angles [radian].
 
-    `noise` are the errors of readings, NaN without a reading, `range_cells` and `cleared_cells` the ranges of readings
-    and of rays without a wall [cells], `turn` is the error of the heading [radian], and `grazing` the sine of the
-    smallest angle to a face with a reading.
+    `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall [cells],
+    `turn` is the error of the heading [radian], `grazing` the sine of the smallest angle to a face with a reading.
     """
 
     start: tuple[float, float]
@@ -210,8 +197,8 @@ class _Rays(NamedTuple):
 class _Walk(NamedTuple):
     """A ray in one of its cells, and where it enters and leaves the cell [cells].
 
-    A ray through a corner crosses one of the two cells beside it and never passes between two walls. It is at least a
-    billionth of a cell long in each cell, so that a distance belongs to one cell.
+    A ray through a corner crosses one of the two cells beside it, so that it never passes between two walls. Its part
+    of each cell is at least 1e-9 cells long, so that a distance belongs to one cell.
     """
 
     row: int
@@ -227,7 +214,7 @@ class _Walk(NamedTuple):
 
 
 @njit(cache=True)
-def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-untyped-def]
+def _cast_rays(truth, missed, hits, passes, corner, rays):
     """Count the rays of one picture that end in walls and that cross cells, from the cell `corner` on."""
     (x, y), shift, angles, noise, range_cells, cleared_cells, turn, grazing = rays
     for ray in range(len(angles)):
@@ -249,7 +236,7 @@ def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-untyped-def]
+def _fuse(all_hits, all_passes, hits, passes, fusion, seen):
     for row in range(seen.shape[0]):
         for column in range(seen.shape[1]):
             hit, passed = hits[row, column], passes[row, column]
@@ -265,7 +252,7 @@ def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
+def _ranges(truth, x, y, angles, range_cells):
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
         ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells, 0.0)[1]
@@ -273,7 +260,7 @@ def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-untyped-def]
+def _read(truth, missed, x, y, angle, range_cells, grazing):
     """Return what ends a ray (wall, unknown cell, nothing), and a distance within that cell.
 
     The distance is NaN where a wall is missed, or met at a sine of less than `grazing` to its face.
@@ -292,7 +279,7 @@ def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _start(x, y, angle):  # type: ignore[no-untyped-def]
+def _start(x, y, angle):
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
     step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
@@ -304,7 +291,7 @@ def _start(x, y, angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next(walk):  # type: ignore[no-untyped-def]
+def _next(walk):
     row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
     if next_x < next_y:
         column, next_x = column + walk.step_x, next_x + walk.pace_x

@@ -1,8 +1,8 @@
 """Procedural homes: complete floor plans from a seed.
 
-A plan consists of polygons in metres: an outline, rooms, openings along a spanning tree of the rooms and a few more,
-and furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
-robots and scanners. `docs/researchers.md` compares the plans with real homes.
+A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
+furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
+robots. `docs/researchers.md` compares the plans with real homes.
 """
 
 import math
@@ -39,10 +39,8 @@ from sionna_partial.worlds.buildings import (
 )
 
 RESOLUTION_M = 0.05
-"""Default edge of a cell [m]."""
 
 LARGE_RESOLUTION_M = 0.1
-"""Default edge of a cell of the large kinds (floor, hall, warehouse) [m]."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""

@@ -1,8 +1,7 @@
-"""The exploring robot: frontiers, goals and routes.
+"""The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-It follows Active Neural SLAM (Chaplot et al., ICLR 2020): each action is a quarter of a metre forward or a turn of ten
-degrees, with a long-term goal every 25 steps. Frontiers drawn at random, as Active Neural SLAM draws its goals, and
-shortest paths over seen cells replace the learnt policies.
+Each action is a quarter of a metre forward or a turn of ten degrees, with a long-term goal every 25 steps. Frontiers
+drawn at random and shortest paths over seen cells replace the learnt policies.
 """
 
 import math
@@ -114,12 +113,10 @@ class Robot:
 
     @property
     def seen(self) -> States:
-        """Map (ny, nx) for planning."""
         return self._camera.seen
 
     @property
     def map(self) -> States:
-        """Map (ny, nx) for users: see `Camera.map`."""
         return self._camera.map
 
     @property
@@ -175,11 +172,9 @@ class Robot:
         return (bearing_deg - self.heading_deg + 180.0) % 360.0 - 180.0
 
     def frontiers(self) -> list[Frontier]:
-        """Find the frontiers that can be reached."""
         return find_frontiers(self.seen, self._cell(), self._cell_m, self._radius, self._bumps, self._given_up)
 
     def steps_to(self, frontier: Frontier) -> float:
-        """Return the approximate number of actions to drive to a frontier."""
         return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
 
     def _draw(self, frontiers: list[Frontier]) -> int:
@@ -280,7 +275,6 @@ def find_frontiers(
 
 
 def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
-    """Return the frontiers of at least a robot's width, or all if none is."""
     return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
 
 

@@ -26,7 +26,6 @@ DEFAULT_BAND_M = (1.0, 1.8)
 """Height band of walls above the lowest point of a mesh [m]: above tables, below lintels of doors."""
 
 DEFAULT_RESOLUTION_M = 0.05
-"""Edge of the cells of a mesh's map [m]."""
 
 SMALLEST_M, HIGHEST_M = 0.1, 100.0
 """Smallest extent along x or y, and largest height, of a mesh in metres [m]."""
@@ -65,7 +64,6 @@ class MeshReading:
         require_unit(self.unit_m)
 
     def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
-        """Return the notes of a file."""
         return ImportNotes(file, self.unit_m or 1.0, unit_source if self.unit_m is None else "unit_m")
 
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
@@ -74,7 +72,6 @@ class MeshReading:
 
 
 def require_unit(unit_m: object) -> None:
-    """Raise a MapError unless a length of a unit [m] is None or plausible."""
     if unit_m is not None and not 1e-6 <= number_of(unit_m) <= 1e6:
         remedy = "give the length of a unit in metres, such as 0.3048 for feet or 0.001 for millimetres."
         raise MapError(f"unit_m = {shown(unit_m)} is not allowed: {remedy}")
@@ -107,7 +104,6 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
 
 
 def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
-    """Raise a MapError for lowest and highest x, y, z (2, 3) that are not in metres."""
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
@@ -251,7 +247,7 @@ def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools
 
 
 @njit(cache=True)
-def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
+def mark_cells(polygons, sizes, cells, margin, upper):
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
     A surface within the margin of a lattice line is in the cells above (or right of) it, or below it.
@@ -274,7 +270,7 @@ def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _reached(low, high, margin, upper):  # type: ignore[no-untyped-def]
+def _reached(low, high, margin, upper):
     first, last = int(np.floor(low + margin)), int(np.ceil(high - margin)) - 1
     if last < first:
         return (first, first) if upper else (last, last)

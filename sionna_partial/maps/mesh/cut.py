@@ -54,7 +54,7 @@ def cut_triangles(corners_m: Triangles, area: Any) -> tuple[Bools, Triangles, In
 
 
 @njit(cache=True)
-def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
+def clip_slab(corners_m, values, low, high):
     """Clip triangles to the slab in which a linear function with `values` (F, 3) at the corners is within limits (F,).
 
     Returns polygons (F, 5, 3) [m] with the winding of the triangles, and their numbers of corners (F,), 0 for none.

@@ -42,7 +42,6 @@ DEFAULT_THICKNESS_M = 0.1
 """Default thickness of a radio material in Sionna RT [m]."""
 
 SHAPE_TYPES = ("ply", "obj", "rectangle", "cube")
-"""Supported types of shapes of a Mitsuba scene."""
 
 SHAPE_PROPERTIES = ("filename", "to_world", "face_normals", "flip_normals", "flip_tex_coords")
 MATERIAL_PROPERTIES = (

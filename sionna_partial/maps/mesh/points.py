@@ -165,7 +165,6 @@ def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None
 
 
 def is_cloud(path: Path) -> bool:
-    """Return whether a PLY file has no faces."""
     with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
         header, end, _ = stream.read(100_000).partition(b"end_header")
     return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
@@ -469,7 +468,7 @@ def _beside(cells: Bools) -> Bools:
 
 
 @njit(cache=True)
-def _see_through(wall, targets, sensors, free):  # type: ignore[no-untyped-def]
+def _see_through(wall, targets, sensors, free):
     """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):
