@@ -256,11 +256,6 @@ def test_odd_antennas_are_refused_by_name(values: dict[str, Any]) -> None:
         sp.predict_map(_room(), TX, tx_antenna=3)
 
 
-def test_a_tilted_isotropic_antenna_is_polarised_otherwise() -> None:
-    assert sp.Antenna("iso", azimuth_deg=30.0).uniform_gain_dbi == 0.0
-    assert replace(sp.Antenna(), downtilt_deg=30.0).uniform_gain_dbi is None
-
-
 def test_the_commands_take_antennas(tmp_path: Path) -> None:
     (tmp_path / "made.msi").write_text(MSI, encoding="ascii")
     sp.save_map(_room(), tmp_path / "room.npz")

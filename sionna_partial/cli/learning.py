@@ -1,4 +1,4 @@
-"""Subcommands of learning: dataset, train, evaluate."""
+"""Subcommands dataset, train and evaluate."""
 
 import itertools
 import shlex
@@ -23,10 +23,10 @@ from sionna_partial.settings import (
 )
 
 DEFAULT_HOMES = 100
-"""Number of procedural homes where no map is given."""
+"""Default number of procedural homes."""
 
 FIRST_SEED = 20_000
-"""Seed of the first of them: not one of those that the shipped predictor was trained on (`make predictor`)."""
+"""Seed of the first procedural home, outside the training seeds of the shipped predictor (`make predictor`)."""
 
 _DATASET_HELP = "Folder that `dataset` wrote, or several; homes may be in more than one."
 _STAGE_HELP = "Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."

@@ -1,4 +1,4 @@
-"""Figures of coverage maps, of networks of several transmitters, and a report of one page."""
+"""Figures of coverage maps and of networks, and a one-page report."""
 
 import io
 import itertools
@@ -53,10 +53,7 @@ _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc"
 
 @dataclass(frozen=True)
 class Layer:
-    """One quantity of a panel: its picture (ny, nx) or (ny, nx, 3), and the colour scale of the former.
-
-    A layer without label has no colour bar.
-    """
+    """A quantity of a panel: picture (ny, nx) with its colour scale, or (ny, nx, 3); no label, no colour bar."""
 
     title: str
     picture: Callable[[xr.Dataset], NDArray[Any]]
@@ -66,13 +63,13 @@ class Layer:
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> Floats:
-    """Mix the colours of the three link states by their probabilities (paper, Section IV-C): (..., 3) in [0, 1]."""
+    """Return the colours (..., 3) of link states, mixed by their probabilities (paper, Section IV-C)."""
     colours = np.array([to_rgb(STATE_COLOURS[state]) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)])
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
 def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> dict[str, Layer]:
-    """Return every layer that a panel can show, by name; gains of a coverage through walls are less spread."""
+    """Return all layers by name; gains of a coverage through walls are less spread."""
     through_walls = coverage is not None and coverage.attrs.get("walls") == "through walls"
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
@@ -110,29 +107,28 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
-    Several transmitters have a row each, with the same colour scales.
-    Walls are black, the unobserved area is hatched, the transmitter is a star; a line encloses 90 % of where it may be,
-    if that is not known. On a complete map the outside is left blank.
+    Each transmitter has a row. Walls are black, the unobserved area is hatched, the transmitter is a star; a line
+    encloses 90 % of the posterior of an unknown position. On a complete map the outside is blank.
 
     Parameters
     ----------
     coverage : xarray.Dataset
-        From `predict_map`, or read from its NetCDF file.
+        From `predict_map` or `load_coverage`.
     layers : sequence of str
-        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
-        three states mixed by their probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by the
+        probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
+        Not registered with pyplot.
 
     Raises
     ------
     SettingsError
-        For a Dataset that is no coverage map, another layer, or a threshold out of range.
+        For anything but a coverage map, another layer, or a threshold out of range.
 
     Examples
     --------
@@ -167,7 +163,7 @@ def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
 
 
 def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figure:
-    """Draw a row for each transmitter, a column for each layer, and under it the colour bar."""
+    """Draw a row for each transmitter, a column for each layer, and colour bars below."""
     sizes = next(iter(maps.values())).sizes
     figure, axes = _panels(len(maps), len(layers), sizes["x"] / sizes["y"], keys_in=0.3)
     for row, (name, coverage) in zip(axes, maps.items(), strict=True):
@@ -183,9 +179,9 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
 def plot_comparison(
     coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
 ) -> Figure:
-    """Draw coverage maps of one area by title, a column each, and a row for each layer (paper, Fig. 5).
+    """Draw coverage maps of one area, a column for each title and a row for each layer (paper, Fig. 5).
 
-    The walls of the first are drawn grey in the others where these do not contain them.
+    Walls that only the first map contains are grey in the others.
     """
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     coverages = {title: require_coverage(coverage) for title, coverage in coverages.items()}
@@ -215,10 +211,7 @@ def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) ->
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
-
-    For a partial map it states whether gains refer to receivers indoors or anywhere.
-    """
+    """Return a title: transmitters, frequency, walls, and for a partial map the receivers that gains refer to."""
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
         what = f"{what} for receivers that are indoors"
@@ -227,14 +220,14 @@ def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
-    """Title of a map; of a partial one with its observed fraction."""
+    """Return a title; for a partial map with its observed fraction."""
     observed = float(coverage.attrs["map_observed_fraction"])
     partial = observed > 0.0 and not coverage.attrs["map_complete"]
     return f"{title}, {observed:.0%} observed" if partial else title
 
 
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
+    """Make a page-wide figure with panels (rows, columns) of one scale; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
     highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
     height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
@@ -247,10 +240,7 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend.
-
-    They are to the right of the panels, or that fraction of the figure below them.
-    """
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend."""
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         where: dict[str, Any] = {"location": "right", "pad": 0.05}
@@ -270,7 +260,7 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
 
 
 def _draw_triangle(key: Axes) -> None:
-    """Draw every mixture of the three states: LOS at the left, NLOS at the right, outage at the top."""
+    """Draw all mixtures of the three states: LOS at the left, NLOS at the right, outage at the top."""
     height = 3**0.5 / 2
     x, y = np.meshgrid(np.linspace(0.0, 1.0, 200), np.linspace(0.0, 1.0, 200))
     p_nlos = x - y / 2
@@ -311,14 +301,14 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
 
 
 def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, float]:
-    """Limits x0, x1, y0, y1 of a map with the attribute `spacing_m` [m]."""
+    """Return the limits x0, x1, y0, y1 of a map with the attribute `spacing_m` [m]."""
     half = coverage.attrs["spacing_m"] / 2
     x, y = coverage["x"].to_numpy(), coverage["y"].to_numpy()
     return x[0] - half, x[-1] + half, y[0] - half, y[-1] + half
 
 
 def wall_cells(coverage: xr.Dataset) -> Bools:
-    """Return the walls, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
+    """Return the walls in up to 6 x 6 parts of a cell, as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
     merge = WALL_PARTS // fine
@@ -336,7 +326,7 @@ def outside(coverage: xr.Dataset) -> Bools:
 def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
     """Refine a picture to the size of `wall`, and fill cells without receiver from their nearest neighbour.
 
-    A wall thinner than a cell leaves a strip of cells without receiver bare; this is for the eye alone.
+    Walls thinner than a cell would have a white border otherwise.
     """
     fine = wall.shape[0] // valid.shape[0]
     bare = ~valid.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -347,12 +337,12 @@ def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
 
 
 def _hatched(coverage: xr.Dataset) -> Bools:
-    """Unobserved cells that a receiver may be in."""
+    """Return the unobserved cells that may contain receivers."""
     return ~coverage["observed"].to_numpy() & ~outside(coverage)
 
 
 def unobserved_area(coverage: xr.Dataset) -> tuple[Floats, Floats, Floats]:
-    """Cell centres x (nx + 2,) and y (ny + 2,) with one cell around the map, and 1 where to hatch (ny + 2, nx + 2)."""
+    """Return cell centres x (nx + 2,) and y (ny + 2,) with a border of one cell, and the hatched cells as 1."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
     return x, y, np.pad(_hatched(coverage), 1, mode="edge").astype(float)
@@ -369,7 +359,7 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
 
 
 def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
-    """As `unobserved_area`, the cells with 90 % of an unknown transmitter's posterior; nothing if it is known."""
+    """Return as `unobserved_area` the cells with 90 % of an unknown transmitter's posterior, or nothing."""
     if "p_transmitter" not in coverage:
         return []
     x, y = (coverage[f"tx_{name}"].to_numpy() for name in "xy")
@@ -379,7 +369,7 @@ def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
-    """Return the legend of the map; walls that only the first of several maps has are not observed in the others."""
+    """Return the legend; walls that only the first of several maps contains are "not observed" in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
     located = any("p_transmitter" in coverage for coverage in coverages)
     if located:
@@ -401,7 +391,7 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
 
 
 def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()) -> bytes:
-    """Return `report_figure` as a PDF; equal maps give equal bytes."""
+    """Return `report_figure` as PDF; equal maps give equal bytes."""
     figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading), io.BytesIO()
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
@@ -410,10 +400,7 @@ def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, 
 def report_figure(
     coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
 ) -> Figure:
-    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty.
-
-    `heading` is the name of the map and the date.
-    """
+    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty."""
     maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
     notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
@@ -491,14 +478,14 @@ def _draw_report(
 
 
 def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
-    """Take one of (T, ny, nx) for each (ny, nx)."""
+    """Return the selected element of (T, ny, nx) for each (ny, nx)."""
     return np.take_along_axis(values, index[None], axis=0)[0]
 
 
 def _report_table(
     coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
 ) -> str:
-    """Return the covered area by received power, a row for each transmitter, and one for any of several."""
+    """Return the covered area by received power: rows of transmitters, and one for any of several."""
     rows = [f"Observed floor / all floor above, with P = {_LIKELY:g}"]
     for (name, one), power_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]
@@ -561,12 +548,12 @@ def plot_network(network: xr.Dataset) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
+        Not registered with pyplot.
 
     Raises
     ------
     SettingsError
-        For something else than a network map.
+        For anything but a network map.
 
     Examples
     --------
