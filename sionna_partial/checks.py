@@ -70,7 +70,7 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
 
 def require_names(name: str, values: Sequence[str]) -> None:
     """Raise a SettingsError unless `values` are different texts, at least one, that can be names of files."""
-    good = len(values) == len({*values}) > 0 and all(each and each.isprintable() for each in values)
+    good = len(values) == len({*values}) > 0 and all(text and text.isprintable() for text in values)
     require(good, name, values, "give each a name of its own, of printable characters.")
 
 
@@ -140,7 +140,7 @@ def is_whole(value: object, low: int = 0) -> bool:
 def are_stages(value: Any) -> bool:
     """Return whether `value` has increasing whole numbers (of steps) or increasing fractions in [0, 1)."""
     stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
-    numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
+    numbers = all(isinstance(stage, Real) and not isinstance(stage, bool) for stage in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
 

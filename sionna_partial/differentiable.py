@@ -424,7 +424,6 @@ class DifferentiableLinks:
         return _Legs(self._scene.partial, self._paths)
 
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
-        """Sum (N,) over the paths to each receiver."""
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -458,7 +457,6 @@ class DifferentiableLinks:
         }
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
-        """Return the features of indirect paths with power (P,) and vertices (P, D, 3)."""
         legs = self._legs
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
@@ -472,7 +470,6 @@ class DifferentiableLinks:
         return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
     def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
-        """Evaluate the networks that read maps and paths; see `distribution`."""
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
         columns = link_inputs(numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)

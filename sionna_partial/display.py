@@ -42,7 +42,6 @@ def _one_line(value: Any) -> str:
 
 
 def _brief(value: Any) -> str:
-    """Return small values unchanged, and others by type with shape or length."""
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         return f"{value.dtype} {value.shape}" if value.size > _FEW else _brief(value.tolist())
     if isinstance(value, float):

@@ -65,8 +65,7 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
-    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> coverage = sp.predict_map(sp.make_home(3), (2.0, 3.0, 1.5), spacing_m=0.5)
     >>> sp.save_coverage(coverage, "coverage.nc")
     >>> sp.save_coverage(coverage, "coverage.csv")
     """
@@ -103,8 +102,8 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     --------
     >>> import sionna_partial as sp
     >>> coverage = sp.load_coverage("coverage.nc")  # that save_coverage wrote
-    >>> coverage.sizes["x"]
-    8
+    >>> coverage.attrs["spacing_m"]
+    0.5
     """
     content = read_bytes(path, "path", SettingsError, MAX_BYTES)
     try:
@@ -160,7 +159,6 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Path, str]:
-    """Return a writable path and its suffix, which must be one of `formats`."""
     target = output_path(path)
     if target.suffix.lower() not in formats:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(formats)}.")

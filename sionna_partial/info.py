@@ -68,7 +68,6 @@ def _llvm() -> Iterator[Finding]:
 
 
 def _fast_engine() -> Finding:
-    """Return whether the fast engine runs, which uses internals of Sionna RT."""
     try:
         fault = engine_fault()
     except (ImportError, SionnaPartialError) as error:

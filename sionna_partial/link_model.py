@@ -202,7 +202,7 @@ class LinkModel:
 
     def _checked(self, tx: ArrayLike, rx: ArrayLike) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.simulation.trace_settings.frequency_hz)
-        return self.predict_each([(each_m, rx_m) for each_m in tx_m])
+        return self.predict_each([(position_m, rx_m) for position_m in tx_m])
 
     def predict_each(
         self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress
@@ -217,12 +217,12 @@ class LinkModel:
         return self._predict_paths(ends_m, paths)
 
     def _predict_paths(
-        self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
+        self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
+        complete = np.concatenate([self._complete(*link_m) for link_m in ends_m])
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
-        for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
+        for (tx_m, rx_m), paths in zip(ends_m, found_paths, strict=True):
             windows = self._windows_around(tx_m) if context else None
             ends, unknown = (tx_m, rx_m), self.simulation.material_unknown
             found.append(
@@ -328,11 +328,11 @@ def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settin
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
     if trained.through_walls != settings.through_walls:
-        then, now = (f"{'through' if each.through_walls else 'on opaque'} walls" for each in (trained, settings))
+        then, now = (f"{'through' if kind.through_walls else 'on opaque'} walls" for kind in (trained, settings))
     elif not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
-        then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
+        then, now = (f"at {kind.frequency_hz / 1e9:g} GHz" for kind in (trained, settings))
     elif trained.diffraction != settings.diffraction:
-        then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
+        then, now = (f"with{'' if kind.diffraction else 'out'} diffraction" for kind in (trained, settings))
     elif settings.max_depth < _LEAST_DEPTH:
         then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
     elif scene_settings.traced_material.itu == "metal":

@@ -201,7 +201,6 @@ def _outdated_by_others(compiled: Any) -> Any:
 
 @cache
 def _compiled_sources() -> str:
-    """Return a hash of all modules with compiled functions."""
     package, total = Path(__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()

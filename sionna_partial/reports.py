@@ -110,7 +110,6 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, name
 
 
 def _differences(evaluation: Evaluation) -> Iterable[str]:
-    """Return sections on paired differences."""
     for receivers, where, first in (("indoor", "indoors", "predictor"), ("anywhere", "anywhere", "with indoor model")):
         rows = [each for each in evaluation.differences if each.receivers == receivers]
         if rows:
@@ -120,7 +119,6 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
 
 
 def _by_stage(rows: Sequence[Row]) -> str:
-    """Tabulate accuracy and gain error, a line per model and a column per stage."""
     stages, models = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "model"))
     found = {(row.model, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
     header = ["accuracy, RMSE", *(stage_name(stage) for stage in stages)]

@@ -223,7 +223,7 @@ def test_antennas_radiate_no_more_than_they_are_fed(caplog: pytest.LogCaptureFix
     sp.AntennaPattern("amplified", 7.0, np.zeros(360), np.zeros(360))
     assert "a gain of 7 dBi in all directions is no antenna" in caplog.text
     assert sp.AntennaPattern.sector(9.0, 90.0, 90.0).radiated > 1.25
-    assert "radiates 1.43 times the power" in caplog.text
+    assert caplog.text.count("radiates 1.43 times the power") == 1
 
 
 def test_arrays_of_antennas_that_overlap_are_refused() -> None:

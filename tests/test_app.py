@@ -341,7 +341,7 @@ class TestPresets:
         page.session.answer = replace(answer, coverage=answer.coverage.assign_attrs(wall_material="brick .69"))
         page.session.status = Status("Ready.")
         page.show()
-        assert "Ready. Walls: brick .69." in page.message.text
+        assert "Ready. Probability of wall materials: brick .69." in page.message.text
         assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
         assert page.links.text.count("<a ") == len(FILES)
         page.session.close()

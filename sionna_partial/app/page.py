@@ -34,7 +34,7 @@ _FILE_NAMES = {
     "tif": "GeoTIFF",
     "yaml": "ROS map",
     "pdf": "Report (PDF)",
-    "project": "Project",
+    "project": "Save the project",
 }
 
 _AREA_HINT = "Drag around the area, or click on its corners and double-click on the last one."
@@ -371,7 +371,7 @@ class Page:
             text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'
         answer = self.session.answer
         if answer is not None and status.fraction is None and "wall_material" in answer.coverage.attrs:
-            text += f" Walls: {html.escape(str(answer.coverage.attrs['wall_material']))}."
+            text += f" Probability of wall materials: {html.escape(str(answer.coverage.attrs['wall_material']))}."
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None

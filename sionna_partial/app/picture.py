@@ -47,6 +47,12 @@ _COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#
 _OTHER, _PEN = "#004488", "#0066ff"
 """Colours of walls of `WALL_MATERIALS`, of other ones, and of strokes."""
 
+_BELOW_PIXELS = 130
+"""Height of axis and colour bar, which is the same for all layers."""
+
+_HANDLE_PIXELS = 44
+"""Diameter around a transmitter in which a finger takes hold of it."""
+
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
 _STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
@@ -103,6 +109,7 @@ class Picture:
             tools="pan,wheel_zoom,box_zoom,reset",
             active_drag=None,
             active_scroll=None,
+            min_border_bottom=_BELOW_PIXELS,
             background_fill_color="#d9dce0",
         )
         self.plot = plot
@@ -144,9 +151,10 @@ class Picture:
         plot.text("x", "y", text="rank", source=self.poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self.aims, line_color="black", line_width=4)
         look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
-        points = plot.scatter("x", "y", source=self.points, marker="star", **look)
+        plot.scatter("x", "y", source=self.points, marker="star", **look)
         plot.text("x", "y", text="name", source=self.points, x_offset=13, **_LABEL)
-        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
+        handles = plot.scatter("x", "y", source=self.points, size=_HANDLE_PIXELS, alpha=0.0, nonselection_alpha=0.0)
+        tool = PointDrawTool(renderers=[handles], empty_value="", description="Put and move transmitters")
         hover = HoverTool(
             renderers=[parts[0] for parts in self.parts.values()],
             tooltips=[*_TOOLTIPS],

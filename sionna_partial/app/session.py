@@ -107,8 +107,8 @@ class Session:
 
     def close(self) -> None:
         """Cancel the job, and accept no other."""
+        self._call, self._show = lambda function: None, lambda: None
         self.cancel()
-        self._call = lambda function: None
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     @property

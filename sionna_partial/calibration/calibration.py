@@ -106,8 +106,9 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -238,8 +239,9 @@ def calibrate_materials(
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -363,7 +365,6 @@ def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats
 
 
 def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
-    """Return the parameters that the measurements hardly determine, with a message for each."""
     prior, undetermined = prior_posterior(), {}
     for which, (posterior, material) in enumerate(zip(fit.posteriors, start, strict=True)):
         offsets = {"permittivity": 0.0, "conductivity": 0.1 * lossless_scale_s_m(2.0, material.thickness_m)}

@@ -140,7 +140,6 @@ def link_gains_db(power: Floats, link: NDArray[np.int64], links: int) -> Floats:
 
 
 def _strongest(link: NDArray[np.int64], power: Floats, fraction: float) -> Bools:
-    """Return the strongest paths (P,) of each link that together have a fraction of its power."""
     order = np.lexsort((-power, link))
     total = np.bincount(link, weights=power)
     before = np.cumsum(power[order]) - power[order] - (np.cumsum(total) - total)[link[order]]
@@ -401,11 +400,9 @@ class _Plane:
         return cells
 
     def points(self, cells: Floats) -> list[Point]:
-        """Return the points at the centres of evaluated cells."""
         return [self._points[centre] for centre in map(tuple, cells[:2].T)]
 
     def losses(self, cells: Floats) -> Floats:
-        """Return the losses (K,) of evaluated cells."""
         return np.array([each.loss for each in self.points(cells)])
 
     def fractions(self, cells: Floats) -> Floats:
@@ -471,7 +468,6 @@ def _coarser_neighbours(cells: Floats, chosen: Bools) -> Bools:
 
 
 def _divided(cells: Floats, index_parts: int, log_parts: int) -> Floats:
-    """Cut each cell into parts."""
     along, across = (np.arange(parts) - 0.5 * (parts - 1) for parts in (index_parts, log_parts))
     index, log, width, height = cells[:, :, None, None] / np.array([1, 1, index_parts, log_parts])[:, None, None, None]
     parts = np.broadcast_arrays(index + width * along[:, None], log + height * across, width, height)

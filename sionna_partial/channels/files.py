@@ -142,7 +142,6 @@ def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
 
 
 def _require_zarr(path: Path) -> None:
-    """Raise an error if `.zarr` folders need a package that is missing."""
     if path.suffix == ".zarr":
         with optional_packages():
             import_module("zarr")
@@ -260,7 +259,6 @@ def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
 
 
 def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
-    """Return the axes of the variables of `cir`, `cfr` or `taps`, or raise a SettingsError."""
     axes = {}
     for name in (*_OF_LINKS, *(_OF_PATHS if "a" in channels else ("h",))):
         kinds, choices = _AXES[name]
@@ -273,7 +271,6 @@ def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
 
 
 def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:
-    """Name and order the arrays for a layout."""
     table = table.assign_attrs(layout=layout)
     last = next(name for name in ("path", "frequency", "tap") if name in table.dims)
     if layout == "deepmimo":

@@ -78,7 +78,6 @@ class JointLatents:
 
     @cached_property
     def _weight(self) -> Floats:
-        """Return the weights of the cells of the field (ny nx,)."""
         (ny, nx), step = self._shape, self._step
         padding = [(0, -count % step) for count in self.partial.shape]
         unknown = np.pad(self.partial.state == CellState.UNKNOWN, padding, constant_values=True)

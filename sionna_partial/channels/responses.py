@@ -214,7 +214,6 @@ def with_every_path(links: "TracedLinks") -> "TracedLinks":
 
 @cache
 def _log_tolerance(tolerance_db: float) -> None:
-    """Log once that channels lack paths."""
     message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: trace with 0 for all"
     _log.info(message, tolerance_db)
 

@@ -126,9 +126,7 @@ class ChannelSamples(Shown):
         Examples
         --------
         >>> import sionna_partial as sp
-        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-        >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-        >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(4.5, 1.5, 1.5)], n=20)
+        >>> samples = sp.sample_channels(sp.make_home(3), (2.0, 3.0, 1.5), [(3.0, 3.0, 1.5)], n=20)
         >>> samples.spreads().delay_spread_s.sizes["draw"]
         20
         """
@@ -141,7 +139,6 @@ class ChannelSamples(Shown):
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
     def _by_draw(self, found: xr.Dataset) -> xr.Dataset:
-        """Split the axis of links or transmitters into draws and the links of a draw."""
         along = "link" if "link" in found.dims else "tx"
         if found.sizes[along]:
             folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
@@ -300,7 +297,6 @@ class _Draws:
 
     @staticmethod
     def _with_vertices(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Add columns of vertices, which are not drawn."""
         return {**columns, "vertices_m": np.broadcast_to(math.nan, (*columns["interactions"].shape, 3))}
 
     def _ordered(self, draws: Indices) -> dict[str, NDArray[Any]]:

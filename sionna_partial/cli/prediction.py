@@ -375,7 +375,6 @@ def _parse_shape(name: str, text: str) -> tuple[int, int]:
 
 
 def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
-    """Return positions (N, 3) in free cells [m]."""
     import numpy as np
 
     from sionna_partial.coverage.job import grid_axes
@@ -386,7 +385,6 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
 
 
 def _read_positions(path: Path) -> list[tuple[float, ...]]:
-    """Read positions [m] from a CSV."""
     remedy = "give a CSV with the columns x,y,z in metres."
     found, _ = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
     names = next((names for names in COLUMNS if found.keys() >= {*names}), None)

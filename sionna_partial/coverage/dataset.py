@@ -199,7 +199,6 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
 
 
 def _require_values(coverage: xr.Dataset) -> None:
-    """Raise a SettingsError for a grid or values that no coverage map has."""
     for name in ("x", "y"):
         steps_m = np.diff(np.asarray(coverage[name], dtype=np.float64))
         regular = bool((np.abs(steps_m - coverage.attrs["spacing_m"]) < 1e-3 * coverage.attrs["spacing_m"]).all())
@@ -425,7 +424,6 @@ class CoverageAccessor:
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
 
     def _rooms(self) -> dict[str, Bools]:
-        """Return the receivers (ny, nx) of each room by name."""
         if ROOM not in self._coverage:
             return {}
         room = self._coverage[ROOM]
@@ -509,7 +507,6 @@ class CoverageAccessor:
         return found.rename("stock_gain_db").assign_attrs(attributes)
 
     def _plane(self, scene_offset_m: Sequence[float]) -> tuple[MapPlane, dict[str, Floats], list[xr.Dataset]]:
-        """Return the plane of the receivers, the transmitters by their names in the scene, and their maps."""
         maps, offset_m = transmitters_of(self._coverage), np.array([*scene_offset_m, 0.0])[:3]
         x_m, y_m = (self._coverage[name].to_numpy() - offset_m[axis] for axis, name in enumerate("xy"))
         attributes = self._coverage.attrs

@@ -320,7 +320,6 @@ class CoverageJob:
         p_powers: Sequence[float | None],
         position_m: Floats,
     ) -> _Source:
-        """Assimilate the measurements for each possible position (K, 3) [m]."""
         p_any = float(weights @ [p or 0.0 for p in p_powers])
         if min(p_any, 1.0 - p_any) > UNSURE_P:
             _log.warning(
@@ -337,7 +336,6 @@ class CoverageJob:
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
     def _averaged(self, source: _Source, rx_m: Floats, report: Progress) -> Iterator[PredictedLinks]:
-        """Yield blocks of the links to receivers (N, 3) [m], averaged over the positions."""
         tx_m, begin = source.tx_m, LOCATING_FRACTION * (len(source.tx_m) > 1)
         nearest = int(np.linalg.norm(tx_m - source.position_m, axis=1).argmin())
         for start in range(0, len(rx_m), self.block):
@@ -387,7 +385,6 @@ class CoverageJob:
         return locate_transmitter(partial, measured, allowed, predict, part, through_walls=through_walls)
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
-        """Fit the process to the measured links of a transmitter at (3,) [m]."""
         prior, antenna_db, _ = self._prior(tx_m, measured.rx, antenna)
         settings = self.model.simulation.trace_settings
         options |= {
@@ -465,7 +462,6 @@ def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: floa
 
 
 def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
-    """Return attributes of the measurements; log a large offset."""
     of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
     noise_db, offset_db, shadow_scale = source.weights @ of_each
     if abs(offset_db) > LARGE_OFFSET_DB:

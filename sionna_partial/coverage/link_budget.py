@@ -112,7 +112,6 @@ def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Sch
 
 
 def _require_band(standard: str, bandwidth_hz: float, frequency_hz: float) -> None:
-    """Raise a SettingsError unless the standard has such channels at this frequency."""
     bands = BANDS[standard]
     ends = sorted({band.low_hz for band in bands} ^ {band.high_hz for band in bands})  # without ends that two share
     spans = " and ".join(f"{low / 1e9:g} to {high / 1e9:g}" for low, high in zip(ends[::2], ends[1::2], strict=True))

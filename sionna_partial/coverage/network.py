@@ -145,7 +145,6 @@ def require_network(network: xr.Dataset) -> None:
 
 
 def _map_of(coverage: xr.Dataset) -> PartialMap:
-    """Return the part of the map that the coverage shows, at its receivers."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = (float(coverage["x"][0]) - spacing_m / 2, float(coverage["y"][0]) - spacing_m / 2)
     return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)

@@ -395,7 +395,6 @@ class LiveCoverage:
     def _take(
         self, message: Any, values: NDArray[Any], resolution_m: float, origin: tuple[float, float, float]
     ) -> None:
-        """Check a map, and let it replace the waiting one unless it equals the newest."""
         frame, stamp = _frame_and_stamp(message)
         if self.frame and frame != self.frame:
             raise MapError(f"frame_id = {shown(frame)}: the transmitters are given in {shown(self.frame)}.")
@@ -436,7 +435,6 @@ class LiveCoverage:
             self._gave_way = True
 
     def _clear_removed(self) -> None:
-        """Publish a grid without known cells for each removed transmitter."""
         for name in self._published.keys() - self.tx_m.keys():
             last = self._published.pop(name)
             nothing = np.full_like(last.cost, -1)
@@ -469,7 +467,6 @@ class LiveCoverage:
             self._publish(answer)
 
     def _measured(self, name: str, tx_m: Floats) -> Measurements | None:
-        """Return the measured powers of a transmitter that can be used on the current map."""
         with self._changed:
             rows = np.array([*self._powers.get(name, {}).values()]).reshape(-1, 3)
         if not len(rows):

@@ -249,9 +249,7 @@ class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> found = sp.place_transmitter(partial)
+    >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
     >>> found.position_m.shape, found.values.shape == found.weight.shape
     ((3,), True)
     """
@@ -336,16 +334,12 @@ def place_transmitter(
 
     Raises
     ------
-    MapError
-        If the map cannot be read.
+    MapError, PredictorError, BackendError
+        As `predict_map`.
     PositionError
         If there is no position for a transmitter or a receiver.
     SettingsError
         For another objective, or a threshold, height, seed or frequency out of range.
-    PredictorError
-        If the predictor cannot be read.
-    BackendError
-        If LLVM or Sionna RT cannot be used.
 
     Examples
     --------
@@ -479,7 +473,6 @@ def _counted(fraction: Floats) -> Floats:
 def _refined(
     search: Search, area: PlacementArea, starts_m: Floats, start_scores: Floats, report: Progress
 ) -> list[tuple[Floats, Floats]]:
-    """Move the best starts to better neighbours; return positions (K, 3) [m] and scores (K,) of each route."""
     best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
     routes = [([starts_m[index]], [start_scores[index]]) for index in best]
     for number, step_m in enumerate(STEPS_M):

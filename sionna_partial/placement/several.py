@@ -63,9 +63,7 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> found = sp.place_transmitters(partial, count=2)
+    >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
     >>> found.positions_m.shape, 0.0 <= found.score <= 1.0
     ((2, 3), True)
     """
@@ -200,7 +198,6 @@ def _score(covered: Bools, weight: Floats, chosen: list[int]) -> float:
 
 
 def _greedy(covered: Bools, weight: Floats, count: int) -> tuple[list[int], list[float]]:
-    """Choose the candidate that adds most, one after the other."""
     chosen: list[int] = []
     scores = []
     for _ in range(min(count, covered.shape[1])):
@@ -214,7 +211,6 @@ def _greedy(covered: Bools, weight: Floats, count: int) -> tuple[list[int], list
 
 
 def _swapped(covered: Bools, weight: Floats, chosen: list[int]) -> list[int]:
-    """Swap a transmitter for another candidate while the score rises."""
     best = _score(covered, weight, chosen)
     for _ in range(_SWAPS):
         others = [

@@ -148,7 +148,6 @@ def plot_coverage(
 
 
 def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
-    """Draw a panel for each layer."""
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
     columns = sheet_columns(len(layers), aspect)
     figure, axes = _panels(math.ceil(len(layers) / columns), columns, aspect, keys_in=_KEY_IN * columns)
@@ -163,7 +162,6 @@ def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
 
 
 def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figure:
-    """Draw a row for each transmitter, a column for each layer, and colour bars below."""
     sizes = next(iter(maps.values())).sizes
     figure, axes = _panels(len(maps), len(layers), sizes["x"] / sizes["y"], keys_in=0.3)
     for row, (name, coverage) in zip(axes, maps.items(), strict=True):
@@ -220,7 +218,6 @@ def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
-    """Return a title; for a partial map with its observed fraction."""
     observed = float(coverage.attrs["map_observed_fraction"])
     partial = observed > 0.0 and not coverage.attrs["map_complete"]
     return f"{title}, {observed:.0%} observed" if partial else title
@@ -260,7 +257,6 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
 
 
 def _draw_triangle(key: Axes) -> None:
-    """Draw all mixtures of the three states: LOS at the left, NLOS at the right, outage at the top."""
     height = 3**0.5 / 2
     x, y = np.meshgrid(np.linspace(0.0, 1.0, 200), np.linspace(0.0, 1.0, 200))
     p_nlos = x - y / 2
@@ -280,7 +276,6 @@ def _draw_triangle(key: Axes) -> None:
 
 
 def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset | None = None) -> None:
-    """Draw one layer, the unknown area, the walls and the transmitter."""
     extent = extent_m(coverage)
     wall = wall_cells(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
@@ -337,7 +332,6 @@ def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
 
 
 def _hatched(coverage: xr.Dataset) -> Bools:
-    """Return the unobserved cells that may contain receivers."""
     return ~coverage["observed"].to_numpy() & ~outside(coverage)
 
 
@@ -478,14 +472,12 @@ def _draw_report(
 
 
 def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
-    """Return the selected element of (T, ny, nx) for each (ny, nx)."""
     return np.take_along_axis(values, index[None], axis=0)[0]
 
 
 def _report_table(
     coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
 ) -> str:
-    """Return the covered area by received power: rows of transmitters, and one for any of several."""
     rows = [f"Observed floor / all floor above, with P = {_LIKELY:g}"]
     for (name, one), power_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]
@@ -502,7 +494,6 @@ def _report_table(
 
 
 def _report_notes(coverage: xr.Dataset) -> list[str]:
-    """Return paragraphs on the receivers, the map, the uncertainty and the material of the walls."""
     attributes = coverage.attrs
     notes = [
         f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. Axes are in m. "
@@ -548,7 +539,6 @@ def plot_network(network: xr.Dataset) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -598,7 +588,6 @@ def plot_network(network: xr.Dataset) -> Figure:
 def _draw_network(
     axis: Axes, network: xr.Dataset, picture: Floats, cmap: str | ListedColormap, norm: Normalize
 ) -> None:
-    """Draw a layer, the walls and the transmitters."""
     extent = extent_m(network)
     shown = np.ma.masked_invalid(picture)
     axis.imshow(shown, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)

@@ -258,7 +258,6 @@ def _add_hover(plot: Any, images: list[Any], words: Mapping[str, Sequence[str]])
 
 
 def _add_map(plot: Any, maps: Mapping[str, xr.Dataset]) -> None:
-    """Draw the unobserved area hatched, the walls black, and the transmitters with their names."""
     from bokeh.models import LinearColorMapper
 
     coverage = next(iter(maps.values()))

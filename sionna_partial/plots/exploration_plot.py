@@ -74,7 +74,6 @@ def plot_exploration(exploration: Exploration) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -166,7 +165,6 @@ def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> I
 def _predicted(
     partial: PartialMap, tx: ArrayLike, window: tuple[float, float, float, float], size: tuple[float, float]
 ) -> Image.Image:
-    """Draw predicted path gain and standard deviation, paler where receivers are less probably indoors."""
     coverage = predict_map(partial, tx, spacing_m=_SPACING_M, progress=False)
     width, height, wide = size[0] - 0.6, size[1] - 0.7, 2 * size[0] + 1.0
     figure = Figure(figsize=(wide, size[1]), dpi=_FRAME_DPI)
@@ -204,7 +202,6 @@ def _palette(frame: Image.Image) -> Image.Image:
 
 
 def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
-    """Draw map, trajectory and field of view at a step."""
     home, step = exploration.home, exploration.steps[index]
     x0, y0, x1, y1 = home.bounds_m
     picture = _picture(exploration.states[index], home.state)
@@ -225,7 +222,6 @@ def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
 
 
 def _arrow(heading_deg: float) -> MarkerPath:
-    """Return a slender triangle in the heading of the robot."""
     angles = np.radians(heading_deg + np.array([0.0, 140.0, 220.0, 0.0]))
     return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
 
@@ -274,7 +270,6 @@ def plot_next_views(views: NextViews) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------

@@ -79,7 +79,6 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -89,9 +88,8 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> figure = sp.plot_placement(sp.place_transmitter(partial))
+    >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
+    >>> figure = sp.plot_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
@@ -127,7 +125,6 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -137,9 +134,8 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> figure = sp.plot_network_placement(sp.place_transmitters(partial, count=2))
+    >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
+    >>> figure = sp.plot_network_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
@@ -170,7 +166,6 @@ def _headline(placement: TransmitterPlacement) -> str:
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
-    """Return the limits x0, x1, y0, y1 of known cells and weighted receivers [m]."""
     partial, half = placement.partial, 0.5 * placement.spacing_m
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
@@ -180,7 +175,6 @@ def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, flo
 def _draw_receivers(
     figure: Figure, axis: Axes, placement: TransmitterPlacement | NetworkPlacement, probability: str
 ) -> None:
-    """Draw a square for each receiver, and the colour scale."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.settings.objective == "coverage"
@@ -217,7 +211,6 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -226,8 +219,9 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -305,7 +299,6 @@ def plot_stages(evaluation: "Evaluation") -> Figure:
 
 
 def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
-    """Draw one figure of merit."""
     models = list(dict.fromkeys(row.model for row in rows))
     for model, colour in zip(models, itertools.cycle(_COLOURS), strict=False):
         for homes, style in _STYLES.items():

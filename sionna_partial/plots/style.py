@@ -122,7 +122,6 @@ def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -170,7 +169,6 @@ def draw_map(axis: Axes, partial: PartialMap) -> None:
 
 
 def _positions(name: str, values: ArrayLike | None) -> Floats:
-    """Return x and y (N, 2) of positions [m]."""
     if values is None:
         return np.zeros((0, 2))
     remedy = "give x and y, or x, y and z, in metres: (3,) or (N, 3)."

@@ -216,9 +216,11 @@ class AntennaPattern(Shown):
             require_number("frequency_hz", self.frequency_hz, 0.0, 1e12, open_low=True)
         if self.uniform_gain_dbi is None:
             self._require_passive()
-        elif self.radiated > NOTED_RADIATED:
-            message = "antenna %r: a gain of %g dBi in all directions is no antenna, unless an amplifier is part of it"
-            _log.warning(message, self.name, self.gain_dbi)
+            fault = f"it radiates {self.radiated:.2f} times the power that it is fed: its gain or cuts are too large"
+        else:
+            fault = f"a gain of {self.gain_dbi:g} dBi in all directions is no antenna, unless it has an amplifier"
+        if self.radiated > NOTED_RADIATED:
+            _log.warning("antenna %r: %s", self.name, fault)
 
     def _require_passive(self) -> "AntennaPattern":
         radiated = self.radiated
@@ -228,11 +230,6 @@ class AntennaPattern(Shown):
             f"narrower cuts, or at most {most_dbi:.1f} dBi."
         )
         require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
-        if radiated > NOTED_RADIATED:
-            message = (
-                "antenna %r radiates %.2f times the power that it is fed: its gain is too high, or its cuts too wide"
-            )
-            _log.warning(message, self.name, radiated)
         return self
 
     @property
@@ -330,7 +327,7 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     require(
         unit.lower() in ("dbd", "dbi") and _is_finite(gain), "GAIN", header["GAIN"], "give a number and dBd or dBi."
     )
-    name = "".join(each for each in header.get("NAME", Path(path).stem) if each.isprintable())[:100] or "antenna"
+    name = "".join(filter(str.isprintable, header.get("NAME", Path(path).stem)))[:100] or "antenna"
     _require_vertical(name, header.get("POLARIZATION", ""))
     left, gain_dbi = np.roll(cuts["HORIZONTAL"][::-1], 1), float(gain) + _DIPOLE_DBI * (unit.lower() == "dbd")
     frequency_hz = _frequency_hz(header.get("FREQUENCY", ""))

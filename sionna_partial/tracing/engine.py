@@ -283,8 +283,8 @@ class SceneSolver:
         """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
         constants = ("relative_permittivity", "conductivity", "thickness")
         return {
-            name: np.ravel([getattr(each, constant) for constant in constants]).astype(np.float64)
-            for name, each in self._scene.radio_materials.items()
+            name: np.ravel([getattr(material, constant) for constant in constants]).astype(np.float64)
+            for name, material in self._scene.radio_materials.items()
         }
 
     @property
@@ -382,15 +382,15 @@ class SceneSolver:
     @contextmanager
     def _changed(self, variables: Variables) -> Iterator[None]:
         materials = self._scene.radio_materials.values()
-        kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
+        kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
         frequency = self._scene.frequency
         try:
             self._scene.frequency = frequency + variables.frequency_hz  # ITU materials follow
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
-            for (each, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
-                each.relative_permittivity = new[0] + (each.relative_permittivity - permittivity)
-                each.conductivity = new[1] + (each.conductivity - conductivity)
-                each.thickness = new[2]
+            for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
+                material.relative_permittivity = new[0] + (material.relative_permittivity - permittivity)
+                material.conductivity = new[1] + (material.conductivity - conductivity)
+                material.thickness = new[2]
             yield
         finally:
             self._scene.frequency = frequency
@@ -473,7 +473,7 @@ def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, 
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
         vertices_m=np.stack(
-            [each.numpy()[valid] for each in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
+            [axis.numpy()[valid] for axis in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
         ),
         tx_m=tx_m,
         rx_m=rx_m,

@@ -155,7 +155,7 @@ def gain_gradients(
             columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
             for total, values in zip(slopes, columns.T, strict=True):
                 total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
-    link_state, gain_db = (each[0] for each in sums.states_and_gains())
+    link_state, gain_db = (values[0] for values in sums.states_and_gains())
     above = gain_db > GAIN_FLOOR_DB
     slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, sums.power, 1.0), 0.0)
     return GainGradients(

@@ -402,7 +402,7 @@ class TracedLinks(Shown):
 
     def _path_columns(self) -> dict[str, NDArray[Any]]:
         angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
-        types = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
+        types = ["-".join(str(kind) for kind in row if kind) for row in self.interactions.tolist()]
         return {
             **{"tx": self.path_tx, "rx": self.path_rx},
             **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},

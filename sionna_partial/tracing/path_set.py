@@ -94,7 +94,7 @@ class PathSet:
         self._simulation = simulation
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
-        self._rows = [slice(*each) for each in itertools.pairwise(ends)]
+        self._rows = [slice(*rows) for rows in itertools.pairwise(ends)]
         paths = SolvedPaths.concatenate(self.solved, simulation.trace_settings.most_interactions)
         self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
         self.power, self.vertices_m = paths.power, paths.vertices_m
@@ -112,7 +112,7 @@ class PathSet:
     def joined(cls, sets: Sequence["PathSet"]) -> "PathSet":
         """Join paths between the same transmitters and receivers; at least one set."""
         first = sets[0]
-        return cls(first._simulation, first.base.tx_m, first.rx_m, [part for each in sets for part in each._parts])
+        return cls(first._simulation, first.base.tx_m, first.rx_m, [part for paths in sets for part in paths._parts])
 
     def kept(self, mask: Bools) -> "PathSet":
         """Return the paths of a mask (P,)."""
@@ -126,10 +126,10 @@ class PathSet:
         """Return the links as `trace_links` does."""
         paths = join_paths(self.solved, self._simulation.trace_settings.most_interactions)
         sums = LinkSums(math.prod(self.base.tx_m.shape[:-1]), len(self.rx_m))
-        for each in self.solved:
-            sums.add(each)
+        for solved in self.solved:
+            sums.add(solved)
         shape = (*self.base.tx_m.shape[:-1], len(self.rx_m))
-        link_state, gain_db = (each.reshape(shape) for each in sums.states_and_gains())
+        link_state, gain_db = (values.reshape(shape) for values in sums.states_and_gains())
         return TracedLinks(
             tx=self.base.tx_m,
             rx=self.rx_m,
@@ -257,7 +257,7 @@ def _merged(parts: list[Part]) -> list[Part]:
             continue
         faces = max(candidates.face.shape[1] for candidates, _ in some)
         depth = max(paths.interactions.shape[1] for _, paths in some)  # further faces of one wall are no interactions
-        candidates = Candidates.concatenate([each.widened(faces) for each, _ in some])
+        candidates = Candidates.concatenate([candidates.widened(faces) for candidates, _ in some])
         paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))
