@@ -42,7 +42,6 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 FREQUENCIES_HZ = (1e6, 1e12)
-"""Range of carrier frequencies [Hz]."""
 
 POWER_TOLERANCE_DB = 0.1
 """Default of `TraceSettings.power_tolerance_db` for powers [dB]."""
