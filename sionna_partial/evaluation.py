@@ -164,8 +164,8 @@ def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
 def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
     """Return the fractions of links (K,) whose probability integral transform is below some levels (K,) in [0, 1].
 
-    The transform is the predicted probability of a smaller gain. Where a gain has a probability mass, as in an outage,
-    the transform is spread evenly over it (randomised, in expectation). A calibrated prediction returns the levels.
+    The transform is the predicted probability of a smaller gain, spread evenly over a probability mass such as an
+    outage (randomised, in expectation). A calibrated prediction returns the levels.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
@@ -409,8 +409,8 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a predictor and baselines on the links of a data set, stage by stage.
 
-    Homes in the predictor's card are training homes, all others test homes. For receivers drawn from the whole map
-    area, the predictor is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
+    Homes in the predictor's card are training homes, all others test homes. For receivers drawn anywhere, the predictor
+    is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
 
     Parameters
     ----------

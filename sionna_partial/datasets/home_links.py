@@ -1,9 +1,9 @@
 """Homes of a data set: a robot explores a home, and links are traced on each of its maps and on the home.
 
 Each home is made in a process of its own, which serves one home after the other, so that libraries load and compile
-once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, spawn
-processes that import `__main__` again, so that a user's script without a guard would start again in each of them. They
-also lack a time limit per home and the last lines of a dead process.
+once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, would
+start a user's script without a `__main__` guard again in each process, and lack a time limit per home and the last
+lines of a dead process.
 """
 
 import contextlib
@@ -184,11 +184,10 @@ class _Positions:
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
     """Trace the links of a complete home on the robot's map at every stage, and on the complete home.
 
-    Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
-    cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
-    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding box of the known cells
-    with `margin_m`, independent of the size of the grid. No receiver is in a cell that a robot with errors mapped as a
-    wall, or within `NEAREST_M` of its transmitter.
+    Half of a transmitter's receivers are in free cells of the home, half (`anywhere`) in any cell of the map area
+    (bounding box of the known cells with `margin_m`) that is no wall; of each half, `short_link_fraction` within
+    `SHORT_LINK_M`. No receiver is in a cell that a robot with errors mapped as a wall, or within `NEAREST_M` of its
+    transmitter.
 
     The truth is outage for a receiver outside the free cells of the home (paper, "Indoor-Outdoor Estimation"), else the
     trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered by

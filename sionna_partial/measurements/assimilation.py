@@ -441,13 +441,12 @@ class Assimilation(Shown):
     The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
     Gaussian process whose correlation decreases with the walking length between receivers. A measurement at or below
     the sensitivity is an upper bound (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood. A large offset indicates a real
-    radio; the predicted loss over free space is then scaled, too.
+    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood; with a large offset, as of a real
+    radio, the predicted loss over free space is scaled, too.
 
-    Through walls of an unknown material there is one process per candidate. Their evidence, with the evidence of other
-    transmitters, gives the probabilities of the candidates and the deviations of process and fading.
+    Through walls of an unknown material there is one process per candidate, weighted by its evidence and that of other
+    transmitters.
 
-    `predict_map(measured=...)` does this for a map.
 
     Examples
     --------

@@ -107,9 +107,8 @@ def locate_transmitter(
     """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
     By reciprocity, links are predicted from the measured positions to all others; `allowed` returns the possible ones.
-    The likelihood of a gain is the predicted distribution with noise; a gain at or below the sensitivity is an upper
-    bound. The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared
-    together with the positions.
+    The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
+    with the positions.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
