@@ -415,6 +415,8 @@ class DatasetSettings(Checked):
         Conversion of maps to scenes; drywall without a material.
     trace : TraceSettings
         Settings of the traces.
+    cir_paths : int
+        Number of paths in the impulse responses of the complete map, the strongest of each link; 0 stores none.
 
     Raises
     ------
@@ -440,6 +442,7 @@ class DatasetSettings(Checked):
     short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
+    cir_paths: Annotated[int, Within(0, 1000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()

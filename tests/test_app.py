@@ -31,6 +31,7 @@ from websockets.typing import Origin
 
 import sionna_partial as sp
 from sionna_partial.app import session as app_session
+from sionna_partial.app.drawing import Stroke
 from sionna_partial.app.files import FILES, stored_map
 from sionna_partial.app.jobs import Status
 from sionna_partial.app.page import Page
@@ -340,7 +341,7 @@ class TestPresets:
         page.session.answer = replace(answer, coverage=answer.coverage.assign_attrs(wall_material="brick .69"))
         page.session.status = Status("Ready.")
         page.show()
-        assert "Ready. Walls: brick .69." in page.message.text
+        assert "Ready. Probability of wall materials: brick .69." in page.message.text
         assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
         assert page.links.text.count("<a ") == len(FILES)
         page.session.close()
@@ -588,7 +589,7 @@ class TestDrawing:
         assert session.partial == sp.load_map(tmp_path / "flat.png", resolution_m=0.01)
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0]])).tolist() == [1, 0]
         session.put([("", 1.0, 1.0)])
-        session.draw("free", [(0.5, 0.05), (0.7, 0.05)], 0.3)
+        session.draw(Stroke("free", ((0.5, 0.05), (0.7, 0.05)), 0.3))
         session.change_plan(threshold=190)
         assert window.settle() == "Ready."
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0], [0.6, 0.05]])).tolist() == [1, 1, 0]
@@ -610,15 +611,17 @@ class TestDrawing:
     ) -> None:
         session = window.session
         session.put([("", 1.0, 1.0)])
-        session.draw("brick", [(2.05, 0.5)], 0.4)
-        session.draw("wall", [(2.05, 1.9), (2.05, 3.0)], 9.0)
-        session.draw("free", [(2.05, 0.8), (2.05, 1.2)], 0.3)
+        session.draw(Stroke("brush", ((2.05, 0.5),), 0.4, "metal"))
+        session.draw(Stroke("area", ((1.9, 0.0), (1.9, 1.0), (2.2, 1.0), (2.2, 0.0)), material="brick"))
+        session.draw(Stroke("wall", ((2.05, 1.9), (2.05, 3.0)), 9.0))
+        session.draw(Stroke("free", ((2.05, 0.8), (2.05, 1.2)), 0.3))
         assert window.settle() == "Ready."
         partial = session.partial
         assert partial is not None
         column = partial.state[:, 20].tolist()
         assert column == [1] * 7 + [0] * 6 + [1] * 19
-        assert (partial.state[20:, 19:22].sum(), partial.wall_materials) == (14, (sp.Material.named("brick"),))
+        assert partial.state[20:, 19:22].sum() == 14
+        assert [partial.wall_materials[number - 1].itu for number in partial.wall_material[1:7, 20]] == ["brick"] * 6
         assert session.answer is not None
         monkeypatch.chdir(tmp_path)
         Path("map.npz").write_bytes(unzipped(session.file("project"), 10**7)["map.npz"])
@@ -626,12 +629,16 @@ class TestDrawing:
         exec(session.python(), names)
         assert names["partial"] == partial
         assert names["coverage"].identical(session.answer.coverage)
-        for _ in range(3):
+        for _ in range(4):
             session.undo()
         window.settle()
         assert session.partial == PARTIAL
-        with pytest.raises(SettingsError, match="stroke = 'cheese'"):
-            session.draw("cheese", [(1.0, 1.0)], 0.3)
+        for stroke, message in (
+            (Stroke("cheese", ((1.0, 1.0),)), "stroke = 'cheese'"),
+            (Stroke("area", ((1.0, 1.0), (2.0, 1.0)), material="brick"), "corners of an area = 2"),
+        ):
+            with pytest.raises(SettingsError, match=message):
+                session.draw(stroke)
 
     def test_strokes_stay_while_the_robot_explores(self, window: Window) -> None:
         session = window.session
@@ -640,7 +647,7 @@ class TestDrawing:
         assert session.partial is not None
         wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
         session.set(spacing_m=1.0)
-        session.draw("metal", [(float(wall_m[0]), float(wall_m[1]))], 0.3)
+        session.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
         session.explore_more(20)
         window.settle()
         assert session.partial.wall_materials == (sp.Material.named("metal"),)
@@ -915,12 +922,19 @@ def test_a_plan_is_dropped_measured_and_corrected(url: str, tmp_path: Path) -> N
         tab.wait(f"{_MODEL}('picture').x_range.end < 9")
         tab.click(*pixel(tab, 1.0, 1.0))
         tab.wait(_READY)
-        tab.run(f"{_MODEL}('stroke').value = 'brick', 0")
-        tab.drag(*pixel(tab, 2.05, 0.5), *pixel(tab, 2.05, 1.5))
-        tab.wait(f"{_MODEL}('map_text').text.includes('brick') && {_READY}")
-        assert tab.run(f"[{_MODEL}('points').data.x.length, {_MODEL}('stroke').value]") == [1, "brick"]
-        press(tab, "Undo")
-        tab.wait(f"!{_MODEL}('map_text').text.includes('brick') && {_READY}")
+        tab.run(f"{_MODEL}('paint').value = 'brick', 0")
+        for kind in ("brush", "area"):
+            tab.run(f"{_MODEL}('stroke').value = '{kind}', 0")
+            if kind == "brush":
+                tab.drag(*pixel(tab, 2.05, 0.5), *pixel(tab, 2.05, 1.5))
+            else:
+                for x_m, y_m, clicks in ((1.8, 0.5, 1), (2.3, 0.5, 1), (2.3, 1.5, 1), (1.8, 1.5, 2)):
+                    tab.click(*pixel(tab, x_m, y_m), clicks)
+                    time.sleep(0.4)  # two clicks within it are a double click
+            tab.wait(f"{_MODEL}('map_text').text.includes('brick') && {_READY}")
+            assert tab.run(f"[{_MODEL}('points').data.x.length, {_MODEL}('stroke').value]") == [1, kind]
+            press(tab, "Undo")
+            tab.wait(f"!{_MODEL}('map_text').text.includes('brick') && {_READY}")
         tab.run(f"{_MODEL}('stroke').value = '', 0")
         tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
         tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3.0) < 0.1")

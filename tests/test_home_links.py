@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from link_tables import assert_same, make_table
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
-from sionna_partial.datasets.shards import LinkTable, stage_name
+from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, stage_name, write_shard
 from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
@@ -97,6 +97,25 @@ class TestPlaces:
                 distance_m = table.phi.distance_m[(transmitter == number) & (table.anywhere == anywhere)]
                 assert len(distance_m) == 30
                 assert 15 <= (distance_m <= near_m).sum() < 30
+
+    def test_impulse_responses(self, home: PartialMap, table: LinkTable, tmp_path: Path) -> None:
+        write_shard(home_links(home, "two rooms", replace(SETTINGS, cir_paths=400)), tmp_path / "home.parquet", {})
+        found = read_shard(tmp_path / "home.parquet")
+        np.testing.assert_array_equal(found.gain_db, table.gain_db)
+        assert table.cir == {}
+        real, imaginary, delay_s = (found.cir[name] for name in CIR)
+        power = real.astype(float) ** 2 + imaginary.astype(float) ** 2
+        has_path = found.gain_db > GAIN_FLOOR_DB
+        np.testing.assert_allclose(10 * np.log10(power.sum(axis=1)[has_path]), found.gain_db[has_path], atol=0.2)
+        np.testing.assert_array_equal(np.isnan(delay_s), power == 0.0)
+        assert (np.diff(power, axis=1) <= 1e-6 * power[:, :1]).all()
+        assert not power[~has_path].any()
+        in_sight = found.link_state == LinkState.LOS
+        distance_m = np.nanmin(delay_s[in_sight], axis=1) * SPEED_OF_LIGHT_M_S
+        np.testing.assert_allclose(distance_m, found.features.distance_m[in_sight], rtol=1e-5)
+        few = LinkTable.concatenate([found.take(slice(3)), found.take([0])])
+        np.testing.assert_array_equal(few.cir[CIR[2]], delay_s[[0, 1, 2, 0]])
+        assert LinkTable.concatenate([found, table]).cir == {}
 
     def test_stages_by_observed_fraction(self, home: PartialMap) -> None:
         table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import LENGTH, STRAIGHT, STROKES
+from sionna_partial.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Stroke
 from sionna_partial.app.files import FILES
 from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
@@ -20,7 +20,7 @@ from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
-from sionna_partial.settings import material_name
+from sionna_partial.settings import WALL_MATERIALS, material_name
 
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
 _AIM = 0.06
@@ -34,9 +34,10 @@ _FILE_NAMES = {
     "tif": "GeoTIFF",
     "yaml": "ROS map",
     "pdf": "Report (PDF)",
-    "project": "Project",
+    "project": "Save the project",
 }
 
+_AREA_HINT = "Drag around the area, or click on its corners and double-click on the last one."
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
 const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
@@ -123,6 +124,8 @@ class Page:
         self.example = self._on(Select(title="Example home", options=homes), self._open_example)
         self.map_text = Div(name="map_text", sizing_mode="stretch_width")
         self.stroke = self._on(Select(title="Dragging on the map", name="stroke", value=""), lambda _: self.show())
+        self.hint = Div(text=_AREA_HINT)
+        self.paint = Select(title="Material", name="paint", options=[*WALL_MATERIALS], value="concrete")
         self.brush = Spinner(title="Brush [m]", name="brush", low=0.05, high=20, step=0.05, value=0.5)
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
@@ -235,7 +238,9 @@ class Page:
                 self.map_text,
                 _pair(self.length, self.dark),
                 self.stroke,
-                _pair(self.brush, self.undo),
+                self.hint,
+                _pair(self.paint, self.brush),
+                self.undo,
             ),
             "transmitters": _wide(
                 _pair(self.chosen, self.name),
@@ -309,7 +314,9 @@ class Page:
             self._line_m = points_m
             return
         self.picture.stroke.data = {"x": [], "y": [], "r": []}
-        self._guarded(self.session.draw, self.stroke.value, points_m, float(self.brush.value or 0.0))
+        material = self.paint.value if self.stroke.value in PAINTS else ""
+        stroke = Stroke(self.stroke.value, tuple(points_m), float(self.brush.value or 0.0), material)
+        self._guarded(self.session.draw, stroke)
 
     def _open_example(self, name: str) -> None:
         if name:
@@ -364,7 +371,7 @@ class Page:
             text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'
         answer = self.session.answer
         if answer is not None and status.fraction is None and "wall_material" in answer.coverage.attrs:
-            text += f" Walls: {html.escape(str(answer.coverage.attrs['wall_material']))}."
+            text += f" Probability of wall materials: {html.escape(str(answer.coverage.attrs['wall_material']))}."
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None
@@ -400,7 +407,8 @@ class Page:
         self.stroke.options = options if is_measured else [(LENGTH, STROKES[LENGTH])]
         if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
             self.stroke.value = self.stroke.options[0][0]
-        self.brush.visible = self.stroke.value not in ("", *STRAIGHT)
+        for model, kinds in ((self.brush, BRUSHES), (self.paint, PAINTS), (self.hint, (AREA,))):
+            model.visible = self.stroke.value in kinds
         self._once("unit", (is_measured,), lambda: self.picture.show_unit("m" if is_measured else "pixels"))
 
     def _show_transmitters(self) -> None:

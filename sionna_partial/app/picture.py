@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.app.answer import LEVELS, Answer
-from sionna_partial.app.drawing import LENGTH, STRAIGHT, Plan
+from sionna_partial.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
 from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
@@ -31,12 +31,13 @@ _UNSELECT = "points.selection_manager.clear()"
 """Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
 
 _STROKE = """
-if (mode.value == "") return
-const {x, y} = cb_obj, data = name == "tap" || name == "panstart" ? {x: [], y: []} : live.data
+const is_area = mode.value == encloses
+if (mode.value == "" || name == "doubletap" && !is_area) return
+const {x, y} = cb_obj, data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
 const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
 xs.push(x); ys.push(y)
-const drawn = {x: xs, y: ys, r: xs.map(() => mode.value == measures ? 0 : brush.value / 2)}
-const is_done = name == "tap" || name == "panend"
+const drawn = {x: xs, y: ys, r: xs.map(() => wide.includes(mode.value) ? brush.value / 2 : 0)}
+const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
@@ -45,6 +46,12 @@ if (is_done) stroke.data = drawn
 _COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc"]
 _OTHER, _PEN = "#004488", "#0066ff"
 """Colours of walls of `WALL_MATERIALS`, of other ones, and of strokes."""
+
+_BELOW_PIXELS = 130
+"""Height of axis and colour bar, which is the same for all layers."""
+
+_HANDLE_PIXELS = 44
+"""Diameter around a transmitter in which a finger takes hold of it."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
@@ -102,6 +109,7 @@ class Picture:
             tools="pan,wheel_zoom,box_zoom,reset",
             active_drag=None,
             active_scroll=None,
+            min_border_bottom=_BELOW_PIXELS,
             background_fill_color="#d9dce0",
         )
         self.plot = plot
@@ -135,15 +143,18 @@ class Picture:
         for source in (self.stroke, self._live):
             plot.circle("x", "y", radius="r", source=source, fill_color=_PEN, line_color=None, alpha=0.4)
             plot.line("x", "y", source=source, line_color=_PEN, line_width=3)
+            plot.scatter("x", "y", source=source, fill_color=_PEN, line_color=None)
+        self._area = plot.patch("x", "y", source=self._live, fill_color=_PEN, fill_alpha=0.3, line_color=None)
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self.poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self.aims, line_color="black", line_width=4)
         look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
-        points = plot.scatter("x", "y", source=self.points, marker="star", **look)
+        plot.scatter("x", "y", source=self.points, marker="star", **look)
         plot.text("x", "y", text="name", source=self.points, x_offset=13, **_LABEL)
-        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
+        handles = plot.scatter("x", "y", source=self.points, size=_HANDLE_PIXELS, alpha=0.0, nonselection_alpha=0.0)
+        tool = PointDrawTool(renderers=[handles], empty_value="", description="Put and move transmitters")
         hover = HoverTool(
             renderers=[parts[0] for parts in self.parts.values()],
             tooltips=[*_TOOLTIPS],
@@ -159,11 +170,13 @@ class Picture:
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
-        given |= {"straight": [*STRAIGHT], "measures": LENGTH}
-        for name in ("panstart", "pan", "panend", "tap"):
+        given |= {"straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
+        for name in ("panstart", "pan", "panend", "tap", "doubletap"):
             self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
-        code = "for (const tool of tools) tool.active = !mode.value"
-        mode.js_on_change("value", CustomJS(args={"tools": [*self._tools], "mode": mode}, code=code))
+        code = f"area.visible = mode.value == '{AREA}'; live.data = {{x: [], y: [], r: []}}"
+        code += "; for (const tool of tools) tool.active = !mode.value"
+        args = {"tools": [*self._tools], "mode": mode, "live": self._live, "area": self._area}
+        mode.js_on_change("value", CustomJS(args=args, code=code))
         shown = {"walls": self.wall_shades, "plan": self.plan, "slider": threshold}
         code = "walls.low = slider.value + 1; plan.visible = true"
         threshold.js_on_change("value", CustomJS(args=shown, code=code))

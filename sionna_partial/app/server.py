@@ -2,6 +2,7 @@
 
 import asyncio
 import functools
+import logging
 import secrets
 import socket
 from collections.abc import Mapping, Sequence
@@ -71,6 +72,7 @@ class AppServer:
         from bokeh.application.handlers.function import FunctionHandler
         from bokeh.server.server import Server
 
+        logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a window was closed during its job
         self._sessions, self._token = dict[str, Session](), secrets.token_urlsafe(24)
         self._open_first = functools.partial(Session.open_example, name=_FIRST_EXAMPLE)
         if partial is not None:

@@ -107,8 +107,8 @@ class Session:
 
     def close(self) -> None:
         """Cancel the job, and accept no other."""
+        self._call, self._show = lambda function: None, lambda: None
         self.cancel()
-        self._call = lambda function: None
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     @property
@@ -242,10 +242,10 @@ class Session:
 
         self.begin(work)
 
-    def draw(self, kind: str, points_m: Sequence[tuple[float, float]], width_m: float) -> None:
-        """Correct the map by a stroke of a brush."""
-        require_choice("stroke", kind, [name for name in STROKES if name != LENGTH])
-        self._redraw((*self.strokes, Stroke(kind, tuple(points_m), width_m)))
+    def draw(self, stroke: Stroke) -> None:
+        """Correct the map by a stroke."""
+        require_choice("stroke", stroke.kind, [name for name in STROKES if name != LENGTH])
+        self._redraw((*self.strokes, stroke))
 
     def undo(self) -> None:
         """Take the last stroke back."""

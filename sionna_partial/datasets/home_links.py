@@ -32,7 +32,7 @@ import numpy as np
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import is_whole, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.shards import INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
+from sionna_partial.datasets.shards import CIR, INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.files import SCENE_FILES, temporary_folder
@@ -199,7 +199,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
     positions = _draw_positions(home, maps, name, settings, rng)
-    inside, link_state, gain_db = _truth(home, positions, settings)
+    inside, link_state, gain_db, cir = _truth(home, positions, settings)
     return LinkTable.concatenate(
         LinkTable(
             home=np.full(len(phi), name),
@@ -213,6 +213,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
             anywhere=np.concatenate(positions.anywhere),
             observed_fraction=np.full(len(phi), partial.observed_fraction),
             complete_maps={name: home},
+            cir=cir,
         )
         for stage, partial, phi in zip(settings.stages, maps, _features(maps, positions, settings), strict=True)
     )
@@ -309,8 +310,10 @@ def points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: 
     return np.column_stack([home.origin_m + points * home.resolution_m, np.full(count, height_m)])
 
 
-def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -> tuple[Bools, States, Floats]:
-    """Return whether receivers (N,) are inside, their link state and path gain [dB], for all transmitters."""
+def _truth(
+    home: PartialMap, positions: _Positions, settings: DatasetSettings
+) -> tuple[Bools, States, Floats, dict[str, Floats]]:
+    """Return whether receivers (N,) are inside, their link state, path gain [dB] and impulse response `CIR`."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
     links = _traced(home, positions.tx_m, indoors, settings)
@@ -319,7 +322,23 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
     link_state[where] = np.concatenate([each.link_state for each in links])
     gain_db[where] = np.concatenate([each.gain_db for each in links])
-    return where, link_state, gain_db
+    empty = np.zeros((len(where), settings.cir_paths), np.float32)
+    cir = dict(zip(CIR, (empty, empty.copy(), np.full_like(empty, np.nan)), strict=True)) if settings.cir_paths else {}
+    parts = [_strongest(each, settings.cir_paths) for each in links if cir]
+    for name, found in zip(cir, zip(*parts, strict=True), strict=False):
+        cir[name][where] = np.concatenate(found)
+    return where, link_state, gain_db, cir
+
+
+def _strongest(links: TracedLinks, count: int) -> tuple[Floats, Floats, Floats]:
+    """Return the arrays (N, count) of `CIR` of the strongest paths, the strongest first."""
+    response = links.cir(normalize_delays=False)
+    gain, delay_s = response["a"].to_numpy()[:, 0, 0], response["delay_s"].to_numpy()
+    order = np.argsort(-np.abs(gain), axis=1, kind="stable")[:, :count]
+    more = [(0, 0), (0, count - order.shape[1])]
+    gain, delay_s = (np.take_along_axis(each, order, axis=1) for each in (gain, delay_s))
+    gain, delay_s = np.pad(gain, more), np.pad(delay_s, more, constant_values=np.nan)
+    return gain.real, gain.imag, delay_s
 
 
 def _traced(

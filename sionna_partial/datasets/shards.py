@@ -9,7 +9,7 @@ import os
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import shown
+from sionna_partial.checks import is_whole, shown
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
@@ -52,6 +52,12 @@ _TYPES = {
 
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
 
+CIR = ("path_gain_re", "path_gain_im", "path_delay_s")
+"""Columns of the impulse response between isotropic antennas on the complete map, the strongest path first.
+
+Complex baseband gain [1], 0 where there is no path, and absolute delay [s], NaN where there is none.
+"""
+
 _NAMES = (
     *COLUMNS[:2],
     *(f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"),
@@ -59,7 +65,12 @@ _NAMES = (
     "map_index",
     *COLUMNS[2:],
 )
-_FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
+
+
+def _fields(cir_paths: int) -> list[pa.Field]:
+    lists = dict.fromkeys(CIR, pa.list_(pa.float32(), cir_paths)) if cir_paths else {}
+    types = {name: _TYPES.get(name, pa.float64()) for name in _NAMES} | lists
+    return [pa.field(name, kind, nullable=False) for name, kind in types.items()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +97,9 @@ class LinkTable(Shown):
     observed_fraction : (N,) float64 array
         Observed fraction of the home's free area.
     complete_maps : mapping of str to PartialMap
-        Complete homes by name.
+        The complete homes by name.
+    cir : mapping of str to (N, cir_paths) float32 array
+        `CIR`, if the data set has impulse responses.
     """
 
     home: NDArray[np.str_]
@@ -100,6 +113,7 @@ class LinkTable(Shown):
     anywhere: Bools
     observed_fraction: Floats
     complete_maps: Mapping[str, PartialMap]
+    cir: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.features.context is None:
@@ -125,11 +139,12 @@ class LinkTable(Shown):
         """Select links by an index array, a mask (N,) or a slice."""
         features = self.__dict__.get("phi", self.features).take(index)  # with windows, if drawn
         columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
-        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, **columns)
+        cir = {name: values[index] for name, values in self.cir.items()}
+        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, cir=cir, **columns)
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
-        """Join links, one part after the other."""
+        """Join links, one part after the other, with impulse responses if all have as many paths."""
         tables = list(parts)
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
@@ -140,9 +155,10 @@ class LinkTable(Shown):
         number = {key: index for index, key in enumerate(maps)}
         numbers = [np.array([number[id(each)] for each in table.maps], dtype=np.int64) for table in tables]
         index = np.concatenate([each[table.map_index] for each, table in zip(numbers, tables, strict=True)])
-        return cls(
-            features=features, maps=tuple(maps.values()), map_index=index, complete_maps=complete_maps, **columns
-        )
+        is_same = len({tuple(values.shape[1:] for values in table.cir.values()) for table in tables}) == 1
+        cir = {name: np.concatenate([table.cir[name] for table in tables]) for name in tables[0].cir if is_same}
+        shared = {"maps": tuple(maps.values()), "map_index": index, "complete_maps": complete_maps, "cir": cir}
+        return cls(features=features, **shared, **columns)
 
 
 Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
@@ -177,9 +193,12 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
         "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
     }
     notes = {"format": FORMAT, "frequency_hz": table.features.frequency_hz, "maps": maps, **metadata}
+    cir_paths = next((values.shape[1] for values in table.cir.values()), 0)
+    notes |= {"cir_paths": cir_paths} if cir_paths else {}
     texts = {_PREFIX + name: json.dumps(notes[name], sort_keys=True) for name in sorted(notes)}
-    schema, columns = pa.schema(_FIELDS, metadata=texts), _columns(table)
-    values = [pa.array(columns[field.name], type=field.type) for field in _FIELDS]
+    schema, columns = pa.schema(_fields(cir_paths), metadata=texts), _columns(table)
+    lists = {name: pa.FixedSizeListArray.from_arrays(values.ravel(), cir_paths) for name, values in table.cir.items()}
+    values = [lists.get(each.name, pa.array(columns.get(each.name, []), type=each.type)) for each in schema]
     memory = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(values, schema=schema), memory, compression="zstd", write_page_checksum=True)
     with atomic_write(path) as stream:
@@ -196,9 +215,11 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
         table = file.read()
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    columns = {name: table[name].to_numpy() for name in table.column_names}
     try:
-        return _links_of(columns, notes)
+        columns = {name: table[name].to_numpy() for name in _NAMES}
+        lists = {name: table[name].combine_chunks().flatten().to_numpy() for name in table.column_names if name in CIR}
+        cir = {name: values.reshape(table.num_rows, -1) for name, values in lists.items()}
+        return _links_of(columns, notes, cir)
     except (KeyError, TypeError, ValueError, IndexError, zlib.error, MapError, PredictorError) as error:
         raise _damaged(path, error) from error
 
@@ -213,8 +234,10 @@ def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
         notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
+    cir_paths = notes.get("cir_paths", 0)
+    wanted = _fields(cir_paths) if is_whole(cir_paths) and cir_paths < _MAX_CELLS else []
     if notes.get("format") != FORMAT or [(each.name, each.type) for each in schema] != [
-        (each.name, each.type) for each in _FIELDS
+        (each.name, each.type) for each in wanted
     ]:
         raise PredictorError(
             f"path = '{path}' is no shard of this version ({FORMAT}): give a folder that `sionna-partial dataset` "
@@ -294,7 +317,7 @@ def file_stem(name: str) -> str:
     return f"{content[:150].decode(errors='ignore')}-{hashlib.sha256(content).hexdigest()[:16]}"
 
 
-def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
+def _links_of(columns: dict[str, Any], notes: Any, cir: Mapping[str, Floats]) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
@@ -307,7 +330,8 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     home = columns["home"].astype(np.str_)
     complete_maps = {name: _unpacked(each) for name, each in notes["maps"]["complete"].items()}
     phi = LinkFeatures(**found, context=context, frequency_hz=notes["frequency_hz"])
-    return LinkTable(home=home, features=phi, maps=maps, map_index=map_index, complete_maps=complete_maps, **table)
+    shared = {"maps": maps, "map_index": map_index, "complete_maps": complete_maps, "cir": cir}
+    return LinkTable(home=home, features=phi, **shared, **table)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:
