@@ -5,9 +5,8 @@ import re
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
+from predictor_links import NLOS, OUTAGE, QUIET, quick_predictor
 
-from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation import (
     ALWAYS_OUTAGE,
@@ -16,10 +15,9 @@ from sionna_partial.evaluation import (
     Baselines,
     Majority,
     evaluate,
-    home_scores,
     measure,
 )
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
@@ -112,34 +110,6 @@ class TestEvaluate:
         assert found.accuracy_error == pytest.approx(np.std(accuracies, ddof=1) / math.sqrt(3))
         assert found.rmse_db == pytest.approx(np.mean(errors_db))
         assert found.rmse_error_db == pytest.approx(np.std(errors_db, ddof=1) / math.sqrt(3))
-
-    def test_complete_maps_are_answered_by_their_trace(self, table):
-        known = table.phi.link_state == table.link_state
-        right = dataclasses.replace(table, gain_db=table.phi.gain_db).take(known & ~table.anywhere)
-        rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(model="partial trace")
-        assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
-        assert set(right.link_state) >= {LOS, OUTAGE}
-
-
-class TestHomeScores:
-    def test_each_home_is_measured_by_itself_in_the_order_of_names(self, table):
-        links = table.take(table.home == "home 3")
-        right = dataclasses.replace(links, link_state=links.phi.link_state, gain_db=links.phi.gain_db)
-        third, gain_db = np.arange(len(links)) % 3 == 0, np.full(len(links), -60.0)
-        other = dataclasses.replace(
-            right,
-            home=np.full(len(links), "home 10"),
-            features=dataclasses.replace(
-                right.features, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db
-            ),
-            link_state=np.where(third, OUTAGE, LOS).astype(np.uint8),
-            gain_db=gain_db + 3.0,
-        )
-        both = LinkTable.concatenate([right, other])
-        accuracies, rmses_db = home_scores(LinkPrediction.of_trace(both.phi), both)
-        expected_db = math.sqrt((90.0**2 + 2 * 3.0**2) / 3)
-        np.testing.assert_allclose(accuracies, [2 / 3, 1.0])
-        np.testing.assert_allclose(rmses_db, [expected_db, 0.0], atol=1e-9)
 
 
 class TestBaselines:

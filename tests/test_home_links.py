@@ -134,14 +134,6 @@ class TestTruthAndFeatures:
             np.testing.assert_array_equal(mine.link_state, links.link_state)
             np.testing.assert_allclose(mine.gain_db, links.gain_db, atol=1e-3)
 
-    def test_nothing_is_seen_at_stage_0(self, table: LinkTable) -> None:
-        here = table.take(table.stage == 0)
-        assert not here.context.tx_seen.any()
-        assert not here.context.rx_seen.any()
-        assert not here.observed_fraction.any()
-        assert (here.phi.link_state == LinkState.LOS).all()
-        np.testing.assert_allclose(here.phi.unobserved_distance_m, here.phi.distance_m)
-
     def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable) -> None:
         assert_same(home_links(home, "two rooms", SETTINGS), table)
         area = map_area(home, SETTINGS.margin_m)

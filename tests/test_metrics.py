@@ -64,17 +64,6 @@ class TestMeasure:
         assert found.calibration_error < 0.015
         assert found.coverage_90 == pytest.approx(0.9, abs=0.006)
 
-    def test_likelihood_is_that_of_the_model_on_average(self):
-        answer, state, gain_db = drawn(100_000)
-        p = np.array([answer.p_outage, answer.p_los, answer.p_nlos])
-        entropy = -(p * np.log(p)).sum(axis=0).mean()
-        gain = sum(
-            p[state].mean() * np.log(std * math.sqrt(2 * math.pi * math.e)) for state, std in ((1, 2.0), (2, 8.0))
-        )
-        found = measure(answer, state, gain_db)
-        assert found.nll_state == pytest.approx(entropy, abs=0.01)
-        assert found.nll == pytest.approx(entropy + gain, abs=0.02)
-
     def test_too_narrow_and_too_wide_intervals_are_told(self):
         assert measure(*drawn(20_000, narrow=2.0)).coverage_90 < 0.86
         assert measure(*drawn(20_000, narrow=0.3)).coverage_90 > 0.93

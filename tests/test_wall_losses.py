@@ -44,14 +44,6 @@ def all_seen() -> sp.PartialMap:
     return sp.PartialMap(state, 0.1)
 
 
-def test_loss_of_a_wall() -> None:
-    drywall = sp.Material.named("drywall")
-    losses = [wall_loss_db(drywall, 1e9 * band) for band in (2.4, 5.0, 28.0)]
-    assert losses == sorted(losses)
-    assert 2.0 < losses[0] < 4.0
-    assert wall_loss_db(sp.Material.named("metal"), 5e9) == MOST_LOSS_DB
-
-
 def test_walls_of_a_map_count_by_their_cells() -> None:
     partial, settings = half_seen(), (WIFI, sp.SceneSettings())
     losses = [wall_loss_db(sp.Material.named(name), 5e9) for name in ("drywall", "metal")]
