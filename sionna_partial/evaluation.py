@@ -31,7 +31,6 @@ PIT_BINS = 20
 """Equal-width bins of the gain's probability integral transform in `Calibration`."""
 
 INTERVAL = (0.05, 0.95)
-"""Levels of the central 90 % interval."""
 
 _NO_SPREAD_DB = 1e-6
 """Standard deviation below which a gain has no spread [dB]."""
@@ -56,18 +55,14 @@ DEFINITIONS = {
     "coverage_90": "fraction of links whose true gain lies in the central 90 % interval, by the randomised probability "
     "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
 }
-"""Definitions of the `Metrics`."""
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
 
 _MAX_BYTES = 1_000_000
-"""Largest file of the majority baseline [bytes]."""
 
 OFFICES = ("mixed", "open")
-"""Indoor scenarios of 3GPP TR 38.901."""
 
 _INDOOR_STD_DB = (0.0, 3.0, 8.03)
-"""Shadow fading by LinkState [dB]."""
 
 ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
 """Number of ends of a link in observed cells."""
@@ -76,7 +71,6 @@ WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
 """Predictions for receivers anywhere: as if all were indoors, and by `LinkPrediction.anywhere`."""
 
 ALWAYS_OUTAGE = "always outage"
-"""Baseline for receivers anywhere."""
 
 
 @dataclass(frozen=True)
@@ -170,8 +164,8 @@ def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
 def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
     """Return the fractions of links (K,) whose probability integral transform is below some levels (K,) in [0, 1].
 
-    The transform is the predicted probability of a smaller gain. Where a gain has a probability mass, as in an outage,
-    the transform is spread evenly over it (randomised, in expectation). A calibrated prediction returns the levels.
+    The transform is the predicted probability of a smaller gain, spread evenly over a probability mass such as an
+    outage (randomised, in expectation). A calibrated prediction returns the levels.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
@@ -182,7 +176,6 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
 
 
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
-    """Return the loss of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)
@@ -416,8 +409,8 @@ def evaluate(
 ) -> Evaluation:
     """Evaluate a predictor and baselines on the links of a data set, stage by stage.
 
-    Homes in the predictor's card are training homes, all others test homes. For receivers drawn from the whole map
-    area, the predictor is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
+    Homes in the predictor's card are training homes, all others test homes. For receivers drawn anywhere, the predictor
+    is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
 
     Parameters
     ----------
@@ -522,7 +515,6 @@ def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, .
 
 
 def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
-    """Return the test and training homes in the order of the data set."""
     names = list(dict.fromkeys(map(str, links.home)))
     trained = set(model.homes)
     test, train = (tuple(name for name in names if (name in trained) == seen) for seen in (False, True))
@@ -563,7 +555,6 @@ def _rows(
 def _differences(
     receivers: str, stage: float, links: LinkTable, predictions: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
-    """Compare the first prediction with every other one."""
     scores = {model: home_scores(prediction, links) for model, prediction in predictions.items()}
     first, *others = scores
     for baseline in others:

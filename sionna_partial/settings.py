@@ -42,7 +42,6 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 
 
 FREQUENCIES_HZ = (1e6, 1e12)
-"""Range of carrier frequencies [Hz]."""
 
 POWER_TOLERANCE_DB = 0.1
 """Default of `TraceSettings.power_tolerance_db` for powers [dB]."""
@@ -189,9 +188,9 @@ class SceneSettings(Checked):
     Parameters
     ----------
     material : Material, str or None
-        Material of walls, floor and ceiling, or of parts of a mesh without one; or a name for `Material.named`. With
-        None it is the map's material. If the map has none, the trace has drywall; for paths through walls the material
-        is unknown, and predictions average over the candidates of `WallMaterials`.
+        Material of walls, floor and ceiling, or of parts of a mesh without one; or a name for `Material.named`. None is
+        the map's material. If the map has none, the trace has drywall, and predictions through walls average over the
+        candidates of `WallMaterials`.
     bridge_gap_m : float
         Longest gap of UNKNOWN cells that is closed in a seen wall [m]. Gaps of FREE cells are closed up to two cells
         and 0.11 m.
@@ -260,9 +259,9 @@ class TraceSettings(Checked):
     max_walls : int
         Largest number of walls that a path goes through, 1 to 16, besides `max_depth`.
     wall_depth_m : float
-        Largest depth of one wall [m], 0 to 10. Successive faces on a path within this depth, with no free cell between
-        them, are one wall with the loss of one slab, as are the two faces of a closed body of a mesh. At 0 every face
-        is a slab, as in the exported scene.
+        Largest depth of one wall [m], 0 to 10. Successive faces on a path within it, without a free cell between them,
+        have the loss of one slab, as have the two faces of a closed body of a mesh. At 0 every face is a slab, as in
+        the exported scene.
     diffuse_reflection : bool
         Diffuse reflections. All paths are then found by shooting rays (Sionna RT's candidate generator), which is
         slower.

@@ -46,10 +46,8 @@ MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
 """Largest scheduler file, and largest index of a data set [bytes]."""
 
 LEFTOVERS = (".tmp-", NEW_FOLDER)
-"""Prefixes of folders that a killed run leaves."""
 
 CONNECT_S = 30.0
-"""Time limit for connecting to a scheduler [s]."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,6 @@ def build_dataset(
 def _results(
     client: Client, tasks: list[HomeTask], report: Callable[[str], None]
 ) -> Iterator[tuple[HomeTask, HomeResult]]:
-    """Make as many homes at a time as there are workers: no home waits on a worker that another home may kill."""
     waiting, running = tasks[::-1], dict[Future, HomeTask]()
     while waiting or running:
         try:
@@ -249,7 +246,6 @@ def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple
 
 
 def _leaves(tree: object, name: str) -> Iterator[tuple[str, object]]:
-    """Yield names, such as settings.trace.max_depth, and values of nested settings."""
     if not isinstance(tree, dict):
         yield name, tree
         return

@@ -1,9 +1,9 @@
 """Homes of a data set: a robot explores a home, and links are traced on each of its maps and on the home.
 
 Each home is made in a process of its own, which serves one home after the other, so that libraries load and compile
-once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, spawn
-processes that import `__main__` again, so that a user's script without a guard would start again in each of them. They
-also lack a time limit per home and the last lines of a dead process.
+once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, would
+start a user's script without a `__main__` guard again in each process, and lack a time limit per home and the last
+lines of a dead process.
 """
 
 import contextlib
@@ -58,21 +58,17 @@ Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]
 """Seed of `make_home`, (seed, kind), or path of a complete map or of a folder of maps."""
 
 MAP_SUFFIXES = (".yaml", ".yml", ".npz")
-"""Suffixes of maps in a folder."""
 
 COMMON_STEMS = ("map", "scene")
 """Names of map files for which the home has the name of the folder."""
 
 NEAREST_M = 0.1
-"""Smallest distance of transmitter and receiver [m]."""
 
 FROM_BORDER_CELLS = 0.25
-"""Distance of transmitters and receivers from the borders of their cells [cells]."""
 
 _LIDAR_FRACTION = 2 / 3
 
 MAX_DRAWS = 1000
-"""Largest number of draws of an unusable position."""
 
 _log = logging.getLogger(__name__)
 
@@ -89,7 +85,6 @@ TIMEOUT_LINE = "Timeout ("
 """First words that faulthandler writes at a time-out."""
 
 LAST_LINES = 20
-"""Number of a dead process's last lines in the report."""
 
 PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba", "scipy", "shapely", "pyarrow")
 """Packages whose versions may change the bytes of a data set."""
@@ -176,14 +171,11 @@ def _maps_at(path: Path) -> Iterator[HomeSource]:
 
 
 def _scene_file(folder: Path) -> Path | None:
-    """Return the map file of an exported scene."""
     return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)
 
 
 @dataclass(frozen=True)
 class _Positions:
-    """T transmitters (3,), and for each its N receivers (N, 3) and `anywhere` (N,)."""
-
     tx_m: list[Floats]
     rx_m: list[Floats]
     anywhere: list[Bools]
@@ -192,11 +184,10 @@ class _Positions:
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
     """Trace the links of a complete home on the robot's map at every stage, and on the complete home.
 
-    Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
-    cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
-    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding box of the known cells
-    with `margin_m`, independent of the size of the grid. No receiver is in a cell that a robot with errors mapped as a
-    wall, or within `NEAREST_M` of its transmitter.
+    Half of a transmitter's receivers are in free cells of the home, half (`anywhere`) in any cell of the map area
+    (bounding box of the known cells with `margin_m`) that is no wall; of each half, `short_link_fraction` within
+    `SHORT_LINK_M`. No receiver is in a cell that a robot with errors mapped as a wall, or within `NEAREST_M` of its
+    transmitter.
 
     The truth is outage for a receiver outside the free cells of the home (paper, "Indoor-Outdoor Estimation"), else the
     trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered by
@@ -275,7 +266,6 @@ def map_area(home: PartialMap, margin_m: float) -> PartialMap:
 def _draw_positions(
     home: PartialMap, maps: list[PartialMap], name: str, settings: DatasetSettings, rng: np.random.Generator
 ) -> _Positions:
-    """Draw the transmitters, and receivers in free cells and in all cells that no map has as walls."""
     open_cells = np.logical_and.reduce([each.state != CellState.WALL for each in (home, *maps)])
     free = open_cells & (home.state == CellState.FREE)
     links, count = settings.links_per_home, settings.transmitters_per_home
@@ -298,7 +288,6 @@ def _receivers(
     settings: DatasetSettings,
     rng: np.random.Generator,
 ) -> Floats:
-    """Draw receivers (count, 3) away from the transmitter [m]."""
     short, height_m = round(settings.short_link_fraction * count), settings.rx_height_m
     x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
     near_cells = np.hypot(x[None] - tx_m[0], y[:, None] - tx_m[1]) <= SHORT_LINK_M
@@ -479,8 +468,6 @@ def serve(descriptor: int) -> None:
 
 
 class _HomeProcess:
-    """A process that makes homes, seen from the worker."""
-
     def __init__(self) -> None:
         self._link, far_end = Pipe()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
@@ -531,7 +518,6 @@ class _HomeProcess:
         _alive.discard(self)
 
     def close(self) -> None:
-        """End the process and release its resources."""
         self.kill()
         self._link.close()
         self._log.close()

@@ -37,7 +37,6 @@ FORMAT = "sionna-partial links 4"
 """Name and version of the format, in the metadata of shards."""
 
 _MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
-"""Largest number of links of a home, of cells of its maps and of bytes of its shard."""
 
 _MAX_NAME_BYTES = 200
 """Length above which names of homes are shortened for files, where systems allow 255 [bytes]."""
@@ -50,10 +49,8 @@ _TYPES = {
     **dict.fromkeys(("link_state", "partial_link_state"), pa.uint8()),
     **dict.fromkeys(("inside", "anywhere"), pa.bool_()),
 }
-"""Types of the columns other than float64."""
 
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
-"""Names of the columns other than the features."""
 
 CIR = ("path_gain_re", "path_gain_im", "path_delay_s")
 """Columns of the impulse response between isotropic antennas on the complete map, the strongest path first.
@@ -125,7 +122,6 @@ class LinkTable(Shown):
         link_numbers("gain_db", self.gain_db, (len(self),))
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.home)
 
     @property
@@ -339,7 +335,6 @@ def _links_of(columns: dict[str, Any], notes: Any, cir: Mapping[str, Floats]) ->
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:
-    """Return a floor plan as JSON with deflated cells."""
     material: dict[str, object] = {} if partial.material is None else {"material": asdict(partial.material)}
     for name, (cells, counted, values) in partial.layers().items():
         material |= {name: _deflated(cells), counted: values}

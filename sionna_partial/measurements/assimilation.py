@@ -71,7 +71,6 @@ class Kind(NamedTuple):
     """Expected common offset [dB], and common factor on the loss over free space."""
 
     covariance: Floats
-    """Prior covariance (2, 2) of offset and factor."""
 
     seen_range_m: float
     """Correlation length of residuals if both ends of a link are in seen cells [m]."""
@@ -168,25 +167,21 @@ class Walks:
 
     @cached_property
     def _blocks(self) -> tuple[States, Floats]:
-        """Blocks of map cells, which are the cells of walks, and their lower-left corner."""
         return aligned_blocks(self.partial, self._step)
 
     @cached_property
     def _cost(self) -> Floats:
-        """Cost of a cell of walks, 0 in walls."""
         blocks, _ = self._blocks
         unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
         return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
 
     @cached_property
     def _nearest(self) -> NDArray[np.intp]:
-        """Nearest passable cell of each cell."""
         cell = ndimage.distance_transform_edt(self._cost == 0.0, return_distances=False, return_indices=True)
         return np.ravel_multi_index(tuple(cell), self._cost.shape)
 
     @cached_property
     def _lengths_m(self) -> NDArray[np.float32]:
-        """Lengths (P, K) of walks to all cells [m]."""
         ends, costs = grid_edges(self._cost)
         lengths_m = costs * self._step * self.partial.resolution_m
         graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
@@ -203,8 +198,6 @@ class Walks:
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """Links of one transmitter (3,), and correlations with the measured ones."""
-
     walks: Walks
     tx_m: Floats
     frequency_hz: float
@@ -217,7 +210,6 @@ class _Links:
         return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
 
     def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
-        """Return the correlation (P, N) of residuals at the measured positions and at receivers (N, 3)."""
         walks_m = self.walks.lengths_m(rx_m)
         either_seen = self._both_seen(self.walks.points_m)[:, None] | self._both_seen(rx_m)
         range_m = np.where(either_seen, kind.seen_range_m, UNSEEN_RANGE_M)
@@ -270,11 +262,9 @@ class _Hypothesis(NamedTuple):
 
     @property
     def covariance(self) -> Floats:
-        """Covariance (P, P) of the residuals without noise."""
         return self.correlation + self.design.T @ self.kind.covariance @ self.design
 
     def log_evidence(self, received: Bools) -> float:
-        """Return the log-likelihood of the received residuals, up to a constant."""
         z = np.maximum(self.residual, -self.kind.deepest)[received]
         factor = cho_factor(
             self.covariance[np.ix_(received, received)] + np.diag(self.noise[received] ** 2), lower=True
@@ -330,7 +320,6 @@ class _Fit(NamedTuple):
 def _hypotheses(
     sample: _Sample, links: _Links, prior: LinkPrediction, kinds: Sequence[Kind], p_powers: float
 ) -> Iterator[_Hypothesis]:
-    """Yield all hypotheses with log-posteriors, up to a constant."""
     measured, received = sample.measured, sample.received
     above_db = sample.level_db - prior.gain_mean_db
     below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
@@ -380,7 +369,6 @@ class _Compared(NamedTuple):
         return cls(sample, links, materials, learnt, correlation)
 
     def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Return the log-posterior (2, K, S, N) of kinds, candidates, process and noise, and the evidence (K, S, N)."""
         received = self.sample.received
         below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))
         parts = []
@@ -403,7 +391,6 @@ class _Compared(NamedTuple):
         return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
 
     def fit(self, k: int, p: Floats) -> _Fit:
-        """Fit the process under candidate k, given the probabilities (2, S, N) of kinds, process and noise."""
         best, fading_db = self._hypothesis(k, p)
         return _Fit.of(best, self.sample.received, fading_db)
 
@@ -418,7 +405,6 @@ class _Compared(NamedTuple):
 
     @property
     def _given_db(self) -> float:
-        """Root mean square of the given standard deviations, 0 without [dB]."""
         std_db = self.sample.measured.std_db
         return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
 
@@ -455,13 +441,12 @@ class Assimilation(Shown):
     The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
     Gaussian process whose correlation decreases with the walking length between receivers. A measurement at or below
     the sensitivity is an upper bound (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood. A large offset indicates a real
-    radio; the predicted loss over free space is then scaled, too.
+    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood; with a large offset, as of a real
+    radio, the predicted loss over free space is scaled, too.
 
-    Through walls of an unknown material there is one process per candidate. Their evidence, with the evidence of other
-    transmitters, gives the probabilities of the candidates and the deviations of process and fading.
+    Through walls of an unknown material there is one process per candidate, weighted by its evidence and that of other
+    transmitters.
 
-    `predict_map(measured=...)` does this for a map.
 
     Examples
     --------
@@ -586,7 +571,6 @@ class Assimilation(Shown):
         p_powers: float,
         others: Sequence[Assimilation],
     ) -> Assimilation:
-        """Fit the process under each candidate material, weighted by evidence."""
         materials, weights = prior.by_material
         compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
         log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
@@ -714,7 +698,6 @@ def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Flo
 
 
 def _inverse(covariance: Floats, precision: Floats) -> Floats:
-    """Return (covariance + 1 / precision)^-1; precisions may be 0."""
     root = np.sqrt(precision)
     factor = cho_factor(np.eye(len(root)) + root[:, None] * covariance * root, lower=True)
     return root[:, None] * cho_solve(factor, np.diag(root))

@@ -40,10 +40,8 @@ OFFSETS_DB, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 40.0
 """Candidate offsets of powers, and the prior standard deviation of the offset [dB]."""
 
 OUTDOOR = 1e-6
-"""Weight of positions outdoors."""
 
 REGION = 0.9
-"""Probability of the region of `likely_region`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,9 +107,8 @@ def locate_transmitter(
     """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
     By reciprocity, links are predicted from the measured positions to all others; `allowed` returns the possible ones.
-    The likelihood of a gain is the predicted distribution with noise; a gain at or below the sensitivity is an upper
-    bound. The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared
-    together with the positions.
+    The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
+    with the positions.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
@@ -142,7 +139,6 @@ def locate_transmitter(
 
 
 def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
-    """Return positions over and around the free cells, with probability 0."""
     cells = np.argwhere(partial.state == CellState.FREE)[:, ::-1]
     low_m, high_m = np.reshape(partial.bounds_m, (2, 2))
     if len(cells):
@@ -159,7 +155,6 @@ def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
 
 
 def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_db: Floats) -> Floats:
-    """Return the log-likelihood (O, N) of one measurement for each offset and predicted link."""
     probabilities, means_db, stds_db = prediction.by_state
     noise_db = LIKELY_NOISE_DB if measured.std_db is None else measured.std_db[0]
     spread_db = np.sqrt(stds_db**2 + noise_db**2 + TRACE_STD_DB**2)

@@ -41,16 +41,13 @@ FEW_REPEATS = 10
 """Number of repetitions at which half of their scatter is attributed to noise."""
 
 SAME_TX_M = 0.5
-"""Distance within which measured links have the same transmitter [m]."""
 
 MOST_MEASUREMENTS = 20_000
-"""Largest number of measurements of one transmitter."""
 
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
 """Number of other transmitters for learning the loss of walls, and of links of each of them."""
 
 VACUUM_HEIGHT_M = 0.1
-"""Antenna height of a vacuum robot [m]."""
 
 _log = logging.getLogger(__name__)
 
@@ -136,7 +133,6 @@ class Measurements(Shown):
         object.__setattr__(self, "sensitivity_db", float(sensitivity_db))
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.gain_db)
 
     def take(self, index: NDArray[np.generic]) -> Measurements:
@@ -308,7 +304,6 @@ def _read(
 
 
 def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
-    """Return the received powers of an access point in a recording of Valeronoi, and their positions."""
     from sionna_partial.maps.vacuum import read_json  # rarely needed
 
     raw, _, frame = read_json(path, "measurements", MeasurementError)
@@ -339,7 +334,6 @@ def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
 
 
 def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
-    """Return our name for each header of a CSV in lower case."""
     names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
     if not isinstance(columns, Mapping | None):
         raise MeasurementError(f"columns = {shown(columns)} is no mapping: {_NAME_COLUMNS.format('rx_x')}.")
@@ -388,7 +382,6 @@ def _field(source: Any, name: str) -> Any:
 
 
 def _ends(source: Any, name: str) -> Any:
-    """Return positions (N, 3), from one field or one per axis."""
     positions = _field(source, name)
     if positions is not None:
         return positions
@@ -431,7 +424,6 @@ def _positions(name: str, values: ArrayLike, count: int, *, known: bool = True) 
 
 
 def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
-    """Raise a MeasurementError for the first bad value."""
     if not good.all():
         first = tuple(int(index) for index in np.argwhere(~good)[0])
         more = f" (and {int((~good).sum()) - 1} more)" if (~good).sum() > 1 else ""

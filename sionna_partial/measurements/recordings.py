@@ -24,10 +24,8 @@ if TYPE_CHECKING:
     import xarray as xr
 
 TF = "TFMessage"
-"""Type of messages with the transforms between frames."""
 
 POSES = ("PoseWithCovarianceStamped", "PoseStamped", "Odometry")
-"""Types of messages with a pose, the preferred ones first."""
 
 ROBOT_FRAMES = ("base_link", "base_footprint")
 """Usual names of a robot's frame (REP 105)."""
@@ -178,7 +176,6 @@ def _pose_table(track: _Track) -> xr.Dataset:
 
 
 def _power(message: Message, field: str, topic: str) -> float:
-    """Return the number in a field of a message, which may be NaN or infinite."""
     names = [name for name in dir(message.content) if not name.startswith("_")]
     try:
         return float(reduce(getattr, field.split("."), message.content))  # type: ignore[arg-type]
@@ -189,7 +186,6 @@ def _power(message: Message, field: str, topic: str) -> float:
 
 
 def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, stamped: bool) -> _Track:
-    """Return the robot's poses in the map's frame."""
     kinds, target = recording.kinds, _map_frame(recording)
     links = _transforms(recording, stamped=stamped) if TF in kinds.values() else {}
     frames = [frame] if frame else [name for name in ROBOT_FRAMES if name in links]
@@ -214,7 +210,6 @@ def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, 
 
 
 def _map_frame(recording: Recording) -> str:
-    """Return the frame of the recorded map, or "map" (REP 105)."""
     grids = [topic for topic, kind in recording.kinds.items() if kind == GRID]
     first = next(recording.messages(*sorted(grids, key="/map".__ne__)[:1]), None)
     return _frame(first.content.header.frame_id if first else "") or "map"
@@ -237,7 +232,6 @@ def _pose_track(recording: Recording, topic: str, *, stamped: bool) -> _Track:
 
 
 def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
-    """Return the poses of each frame in its parent."""
     rows: dict[tuple[str, str], list[Any]] = {}
     topics = [topic for topic, kind in recording.kinds.items() if kind == TF]
     for message in recording.messages(*topics):
@@ -262,7 +256,6 @@ def _track(parent: str, rows: Iterable[Any]) -> _Track:
 
 
 def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
-    """Return the transforms from a frame up to `target`, or an empty list."""
     chain: list[_Track] = []
     while frame != target:
         if frame not in links or len(chain) > len(links):

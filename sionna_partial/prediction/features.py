@@ -40,7 +40,6 @@ ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path through u metres has the weight exp(-u / length)."""
 
 _PATHS_AT_ONCE = 100_000
-"""Number of paths in a block, which bounds the memory."""
 
 SEEN_M = 1e-3
 """Largest unobserved length of a path in observed space [m]."""
@@ -111,7 +110,6 @@ class LinkContext(Shown):
     windows: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.tx_m)
 
     @classmethod
@@ -409,7 +407,6 @@ class LinkFeatures(Shown):
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 
     def __len__(self) -> int:
-        """Return the number of links, N or T N."""
         return self.distance_m.size
 
     @property
@@ -599,7 +596,6 @@ def features_of_paths(
 def _features(
     paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float, *, context: bool = True
 ) -> LinkFeatures:
-    """Return the features of all links of `paths`, without windows."""
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
     found = paths.context(link_state, unobserved_m) if context else None

@@ -43,7 +43,6 @@ MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_netw
 """Names of the networks; map networks in the order of `CELLS_M`."""
 
 MAP_FEATURES = 16
-"""Numbers per cell that the link network reads."""
 
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS and given NLOS."""
@@ -388,7 +387,6 @@ def _by_window(networks: Networks, context: LinkContext, read: MapReader | None)
 
 
 def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:
-    """Return the windows (U,) in use, and the links of each window."""
     used, counts = np.unique(context.window_index, return_counts=True)
     return used, np.split(np.argsort(context.window_index, kind="stable"), np.cumsum(counts)[:-1])
 
@@ -439,11 +437,9 @@ class _Examples:
         self._columns = {name: column[order] for name, column in columns.items()}
 
     def __len__(self) -> int:
-        """Return the number of windows W."""
         return len(self._used)
 
     def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
-        """Yield the arguments of gradient steps."""
         order = np.zeros(0, dtype=np.intp)
         for _ in range(steps):
             while len(order) < WINDOWS_AT_ONCE:
@@ -477,7 +473,6 @@ def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.floa
 
 
 def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
-    """Return a compiled gradient step, which returns the loss."""
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer = adam_w(weights, steps)
 

@@ -40,7 +40,6 @@ INDOOR_INPUTS = ("unobserved_distance_m",)
 """Unscaled inputs of the paper's networks; the traced link state selects the network."""
 
 STD_RANGE_DB = (0.3, 40.0)
-"""Range of standard deviations of a gain network [dB]."""
 
 _LINKS_AT_ONCE = 65_536
 _LARGEST = 1e30
@@ -110,7 +109,6 @@ OUTPUT_WIDTHS = {
     **{row.name: 2 for row in GAIN_NETWORKS},
     **dict.fromkeys(INDOOR_NETWORKS.values(), 1),
 }
-"""Number of outputs of every network."""
 
 _BACKEND, _DATA_FORMAT = "tensorflow", "channels_last"
 """Settings of Keras that our networks need."""
@@ -273,7 +271,6 @@ def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) ->
 
 
 def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
-    """Yield blocks of features that bound the memory, at least one."""
     for start in range(0, max(1, len(phi)), _LINKS_AT_ONCE):
         yield phi.take(slice(start, start + _LINKS_AT_ONCE))
 
@@ -356,7 +353,6 @@ def _fit_gain(row: GainNetwork, phi: LinkFeatures, gain_db: Floats, settings: Pr
 
 
 def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
-    """Return the range of every feature, a default if there are few links."""
     if len(phi) < settings.minimum_links:
         return _DEFAULT_RANGES
     spans = {name: (float(getattr(phi, name).min()), float(getattr(phi, name).max())) for name in _DEFAULT_RANGES}
@@ -389,7 +385,6 @@ def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> N
 
 
 def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
-    """Return the negative log-likelihood of gains (N, 1) given means and log-variances (N, 2), up to a constant."""
     ops = import_keras().ops
     mean, log_variance = prediction[:, :1], prediction[:, 1:]
     return 0.5 * (log_variance + ops.square(gain_db - mean) * ops.exp(-log_variance))
@@ -415,7 +410,6 @@ def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings:
 def _batches(
     inputs: dict[str, NDArray[np.float32]], gain_db: NDArray[np.float32], size: int, rng: np.random.Generator
 ) -> Iterator[tuple[dict[str, NDArray[np.float32]], NDArray[np.float32]]]:
-    """Yield shuffled batches without end."""
     for start in itertools.cycle(range(0, len(gain_db), size)):
         if start == 0:
             order = rng.permutation(len(gain_db))

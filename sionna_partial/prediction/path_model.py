@@ -36,7 +36,6 @@ from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
 STATES = (LinkState.LOS, LinkState.NLOS)
 
 ANALOGUES = 8
-"""Number of analogues from which one is drawn."""
 
 _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0]])
 """Units of search keys for LOS and NLOS: gain above free space [dB], logarithms of distance and unobserved length, gain
@@ -268,12 +267,10 @@ class AntennaLinks:
         return phi, prediction.mapped(relative), np.where(complete, antenna_db, mean_db)
 
     def _table(self) -> Floats:
-        """Return the gain in all whole degrees of zenith and azimuth (181, 360)."""
         angles_deg = np.stack(np.meshgrid(np.arange(181.0), np.arange(360.0), indexing="ij"), axis=-1)
         return self.antenna.gain(np.radians(angles_deg.reshape(-1, 2)), self.frequency_hz).reshape(181, 360)
 
     def _spread(self, state: LinkState, table: Floats) -> Floats:
-        """Return the mean gain (N,) over the departures of unseen paths."""
         zenith_deg, azimuth_deg = np.round(np.degrees(self._direct_rad)).astype(np.intp).T
         mean = np.zeros(len(zenith_deg))
         for (down, left), power in zip(*PathModel.load().departures_deg(state), strict=True):

@@ -355,9 +355,9 @@ class Predictor(Shown):
     log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved distance
     for each partial link state, 1 before `fit_indoor`.
 
-    With `PredictorSettings.networks` other than "paper", further networks (`map_networks`) read the space along the
-    paths and the map around the transmitter. They predict links whose features have a context; on a complete map the
-    trace is the prediction. Features without a context are predicted by the paper's networks, fitted to the same links.
+    With `PredictorSettings.networks` other than "paper", further networks (`map_networks`) predict links whose features
+    have a context; on a complete map the trace is the prediction. Features without a context are predicted by the
+    paper's networks, fitted to the same links.
 
     Parameters
     ----------
@@ -419,8 +419,8 @@ class Predictor(Shown):
     ) -> Predictor:
         """Train on links of known truth; equal links and settings give equal weights.
 
-        Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, and by the
-        continuous ranked probability score (CRPS) in the others.
+        Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, by the CRPS
+        in the others.
 
         Parameters
         ----------
@@ -549,8 +549,8 @@ class Predictor(Shown):
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.
 
-        The card records the features with their scaling (applied inside the networks), settings, homes, metrics,
-        versions and the SHA-256 of the `.keras` file.
+        The card records features, their scaling (applied inside the networks), settings, homes, metrics, versions and
+        the SHA-256.
 
         Parameters
         ----------

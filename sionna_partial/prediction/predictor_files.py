@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     import keras
 
 FORMAT = "sionna_partial predictor 2"
-"""First entry of every card."""
 
 SUFFIX, WEIGHTS_FILE, CHECKSUMS = ".keras", "model.weights.h5", "SHA256SUMS"
 
@@ -170,7 +169,6 @@ def _sizes(entry: Any) -> Iterator[int]:
 
 
 def _classes(entry: Any) -> Iterator[str]:
-    """Yield the classes in a configuration; foreign ones with their module."""
     if isinstance(entry, dict) and "class_name" in entry:
         module, name = str(entry.get("module") or "keras"), str(entry["class_name"])
         yield name if module.split(".")[0] == "keras" else f"{module}.{name}"

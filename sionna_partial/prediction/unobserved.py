@@ -44,7 +44,6 @@ that line meets a known wall. detour: see `_detours`.
 """
 
 WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
-"""Shape of the windows of a transmitter."""
 
 _FINEST = 4
 """Largest number of map cells along a window cell; finer maps are coarsened once for all windows."""
@@ -233,7 +232,6 @@ def _enter_axis(start: float, step: float, size: int) -> tuple[float, float]:
 
 @njit(cache=True)
 def _first_line(position: float, step: float) -> int:
-    """Return the first grid line from `position` in the direction of `step`."""
     return int(np.floor(position)) + 1 if step > 0.0 else int(np.ceil(position)) - 1
 
 

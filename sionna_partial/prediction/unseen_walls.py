@@ -36,7 +36,6 @@ if TYPE_CHECKING:
     import keras
 
 CELL_M = 0.3
-"""Edge of the cells that the network reads [m]."""
 
 WEIGHTS_FILE = PREDICTORS_FOLDER / "unseen_walls.npz"
 
@@ -184,7 +183,6 @@ def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
 
 
 def _known_part(partial: PartialMap) -> PartialMap:
-    """Return the bounding box of the known cells, or the map if there are none."""
     known = partial.state != CellState.UNKNOWN
     if not known.any():
         return partial

@@ -85,7 +85,6 @@ def _same(known: TracedLinks, link: Indices, true: TracedLinks, true_link: Indic
 def _analogues(
     true: TracedLinks, link: Indices, new: Bools, geometry: LinkGeometry, state: LinkState
 ) -> list[tuple[Floats, Floats]]:
-    """Return key and new paths of each link of one state."""
     power, count = np.abs(true.a) ** 2, len(geometry.distance_m)
     indirect = (true.interactions > 0).any(axis=1)
     survivors = np.bincount(link, weights=power * (~new & indirect), minlength=count).astype(np.float64)
@@ -158,7 +157,6 @@ def made_examples(homes: int = 60, floors: int = 10, first_seed: int = 320_000) 
 
 
 def _points(home: PartialMap, count: int, rng: np.random.Generator) -> Floats:
-    """Draw points (count, 3) in free cells, off their borders [m]."""
     row, column = rng.permutation(np.argwhere(home.state == CellState.FREE))[:count].T
     cell = np.stack([column, row], axis=1) + rng.uniform(0.25, 0.75, (len(row), 2))
     return np.column_stack([home.origin_m + cell * home.resolution_m, np.full(len(row), DEFAULT_HEIGHT_M)])

@@ -144,7 +144,6 @@ def _batches(maps: list[Lines], steps: int, rng: np.random.Generator) -> Iterato
 
 
 def _part(lines: Lines, rng: np.random.Generator) -> Lines | None:
-    """Cut a random square with lines out of a map, in one of eight orientations; None without enough lines."""
     for _ in range(_TRIALS):
         spare = [count - IMAGE_CELLS for count in lines.image.shape[1::-1]]
         corner = np.array([rng.integers(min(0, most), max(0, most) + 1) for most in spare])
