@@ -1,4 +1,4 @@
-"""Floor plans as pictures whose scale is drawn on them, and corrections that are drawn on a map."""
+"""Floor plans as pictures, and corrections that are drawn on a map."""
 
 import tempfile
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ _MOST_POINTS = 100_000
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A floor plan as a picture: shades with dark walls (rows, columns), and the edge of a pixel [m], if known."""
+    """A picture of a floor plan: shades (rows, columns), dark for walls, and the edge of a pixel [m], if known."""
 
     name: str
     content: bytes
@@ -44,12 +44,12 @@ class Plan:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the picture [m], in pixels before its scale is known."""
+        """Width and height [m], or [pixels] before the scale is known."""
         rows, columns = self.shade.shape
         return columns * (self.pixel_m or 1.0), rows * (self.pixel_m or 1.0)
 
     def read(self) -> PartialMap:
-        """Return the map of the plan, whose scale must be known."""
+        """Return the map of a plan with a scale."""
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
             path = stored_map([(self.name, self.content)], Path(folder))
             try:
@@ -60,7 +60,7 @@ class Plan:
 
 
 def uploaded_plan(files: Sequence[tuple[str, bytes]]) -> Plan | None:
-    """Read a picture of uploaded files (name, content); None if they are something else."""
+    """Read a picture from uploaded files (name, content); None for other files."""
     if len(files) != 1 or PurePath(files[0][0]).suffix.lower() not in PICTURE_SUFFIXES:
         return None
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
@@ -68,9 +68,15 @@ def uploaded_plan(files: Sequence[tuple[str, bytes]]) -> Plan | None:
     return Plan(*files[0], shade, threshold)
 
 
+def drawn(partial: PartialMap, strokes: Sequence["Stroke"]) -> PartialMap:
+    for stroke in strokes:
+        partial = stroke.on(partial)
+    return partial
+
+
 @dataclass(frozen=True)
 class Stroke:
-    """A correction of a map: one of `STROKES` along, or of an area within, points [m]; `BRUSHES` have a width [m]."""
+    """A correction of a map along, or of the area within, points [m]; `BRUSHES` have a width [m]."""
 
     kind: str
     points_m: tuple[tuple[float, float], ...]
@@ -78,13 +84,7 @@ class Stroke:
     material: str = ""
 
     def on(self, partial: PartialMap) -> PartialMap:
-        """Return the corrected map.
-
-        Raises
-        ------
-        MapError
-            If it has a mesh.
-        """
+        """Return the corrected map; only materials can be changed on a mesh (MapError)."""
         count = len(self.points_m)
         require(0 < count <= _MOST_POINTS, "points", count, "draw a shorter line.")
         if self.kind == AREA:

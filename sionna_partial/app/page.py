@@ -1,4 +1,4 @@
-"""The page of the app: the state of a session drawn by Bokeh, and clicks that are handed to the session."""
+"""The page of the app: draws the state of a session with Bokeh, and passes clicks to the session."""
 
 import functools
 import html
@@ -51,14 +51,7 @@ TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 
 
 class Page:
-    """Page of one window.
-
-    Parameters
-    ----------
-    document : bokeh.document.Document
-    files_url : str
-        Under which its files are downloaded.
-    """
+    """Page of one window, whose files are downloaded below `files_url`."""
 
     def __init__(self, document: Any, files_url: str) -> None:
         from bokeh.models import CustomJS
@@ -214,7 +207,7 @@ class Page:
             self._button(name)
             for name in (
                 "Open a map, floor plan or project\u2026",
-                "Learn from measurements (CSV)\u2026",
+                "Learn from measurements\u2026",
                 "Copy as Python",
             )
         )
@@ -301,12 +294,12 @@ class Page:
             self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
 
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
-        """Choose the transmitter that is clicked or dragged. To clear the selection here would end a drag."""
+        """Choose a clicked or dragged transmitter; clearing the selection here would end a drag."""
         if new and not self._is_showing:
             self._choose(self.picture.points.data["name"][new[-1]])
 
     def _on_stroke(self, _name: str, _old: Any, new: Any) -> None:
-        """Take a stroke: a length waits for its number, a correction is shown on the map."""
+        """Keep a drawn length until its number is typed, or draw a correction."""
         points_m = [*zip(map(float, new["x"]), map(float, new["y"]), strict=True)]
         if not points_m or self._is_showing:
             return
@@ -344,7 +337,6 @@ class Page:
     # Updates
 
     def show(self) -> None:
-        """Draw the state of the session."""
         self._is_showing = True
         try:
             self._show_status()
@@ -359,7 +351,6 @@ class Page:
             self._is_showing = False
 
     def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
-        """Draw changes only."""
         if self._drawn.get(name) != key:
             draw()
             self._drawn[name] = key
@@ -466,7 +457,7 @@ class Page:
         self.measured_text.text = f"{len(used)} measured points{unused}"
 
     def _aimed(self) -> dict[str, list[list[float]]]:
-        """Return lines from transmitters with a main direction along it [m]."""
+        """Return lines [m] along the main directions of antennas."""
         partial, lines = self.session.partial, []
         length_m = 0.0 if partial is None else _AIM * partial.resolution_m * max(partial.shape)
         for each in self.session.transmitters.values():
@@ -510,7 +501,6 @@ class Page:
 
 
 _USED, _UNUSED = "#ee6677", "#ffffff"
-"""Colours of measured points."""
 
 _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
@@ -519,7 +509,6 @@ _LINKS = (
 
 
 def _pair(*models: Any) -> Any:
-    """Put models beside each other, over the whole width."""
     from bokeh.layouts import row
 
     for model in models:
@@ -528,7 +517,6 @@ def _pair(*models: Any) -> Any:
 
 
 def _wide(*models: Any) -> Any:
-    """Put models below each other, over the whole width."""
     from bokeh.layouts import column
 
     for model in models:
@@ -537,13 +525,12 @@ def _wide(*models: Any) -> Any:
 
 
 def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
-    """Return whether the page has these transmitters, up to rounding: to send them again would disturb a drag."""
+    """Return whether the page has these transmitters, up to rounding: sending them again would disturb a drag."""
     same = all([*drawn[name]] == rows[name] for name in ("name", "colour"))
     return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
 def _legend(partial: PartialMap) -> str:
-    """Return the colours of walls whose material is known."""
     used = np.unique(0 if partial.wall_material is None else partial.wall_material)
     materials = [partial.wall_materials[number - 1] for number in used if number]
     return "".join(
@@ -553,7 +540,7 @@ def _legend(partial: PartialMap) -> str:
 
 
 def _summary(answer: Answer, threshold_dbm: float) -> str:
-    """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
+    """Return the covered fractions, and the errors in a home that is known."""
     given: dict[str, Any] = {"probability": LIKELY, "eirp_dbm": answer.eirp_dbm}
     area = answer.coverage.radio.area(threshold_dbm, **given)["fraction"]
     rows = [*zip(answer.coverage["tx"].to_numpy(), *area.to_numpy()[:2], strict=True)]

@@ -1,4 +1,4 @@
-"""The plot of the page: map, layers with their colour bars, transmitters, measured points, next views."""
+"""Plot of the page: map, layers, transmitters, measured points and next views."""
 
 import math
 from typing import Any
@@ -19,16 +19,15 @@ from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes,
 from sionna_partial.settings import WALL_MATERIALS, Material, material_name
 
 LIKELY = 0.9
-"""Probability with which an area counts as covered."""
+"""Probability at which an area counts as covered."""
 
 OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
-"""Layers whose line at the threshold is drawn."""
+"""Layers with a line at the threshold."""
 
 LAYERS = radio_layers(MOST_TRANSMITTERS)
-"""Layers by the name of their variable."""
 
 _UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
+"""Otherwise the next drag would move a clicked transmitter as well."""
 
 _STROKE = """
 const is_area = mode.value == encloses
@@ -41,22 +40,22 @@ const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
-"""Draws a stroke, and gives it to the session at its end."""
+"""Draws a stroke in the browser, and sends it at its end."""
 
 _COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc"]
 _OTHER, _PEN = "#004488", "#0066ff"
-"""Colours of walls of `WALL_MATERIALS`, of other ones, and of strokes."""
+"""Colours of `WALL_MATERIALS`, of other walls, and of strokes."""
 
 _BELOW_PIXELS = 130
-"""Height of axis and colour bar, which is the same for all layers."""
+"""Height of axis and colour bar of every layer."""
 
 _HANDLE_PIXELS = 44
-"""Diameter around a transmitter in which a finger takes hold of it."""
+"""Diameter in which a finger grabs a transmitter."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
 _STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
-"""Step of the scales of levels [dB], and number of steps below and above the threshold."""
+"""Steps of scales [dB], and their number below and above the threshold."""
 
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
@@ -68,7 +67,7 @@ _TOOLTIPS = (
     ("P(above threshold)", "@p_above{0.00}"),
 )
 _GROUND, _WALLS = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9"), ("#00000000", "#000000", "#00000000", "#ffffff60")
-"""Colours of free cells, walls, unknown cells and their hatch, below the coverage and above it."""
+"""Colours of free cells, walls, unknown cells and hatches, below and above the coverage."""
 
 _LABEL: dict[str, Any] = {
     "text_baseline": "middle",
@@ -80,8 +79,6 @@ _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
 
 
 class Picture:
-    """Plot of one window."""
-
     def __init__(self) -> None:
         from bokeh.models import ColumnDataSource, DataRange1d, FixedTicker, LinearColorMapper
         from bokeh.plotting import figure
@@ -126,7 +123,7 @@ class Picture:
             name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below") for name, layer in LAYERS.items()
         }
         for name, (_, bar) in self.parts.items():
-            bar.title = bar.title or LAYERS[name].title  # one height of all bars: the map stays where it is
+            bar.title = bar.title or LAYERS[name].title  # bars of one height
             if name in LEVELS:
                 bar.ticker = FixedTicker()
         for colour, width in (("white", 4), ("black", 2)):
@@ -136,7 +133,7 @@ class Picture:
         self._add_marks()
 
     def _add_marks(self) -> None:
-        """Draw measured points, routes, views and transmitters on top, with the tools that read and move them."""
+        """Draw the top layers, with the tools that read and move them."""
         from bokeh.models import CustomJS, HoverTool, PointDrawTool
 
         plot = self.plot
@@ -166,7 +163,7 @@ class Picture:
         plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
 
     def follow(self, mode: Any, brush: Any, threshold: Any) -> None:
-        """Draw strokes of a kind and a width that controls have, and the walls of a plan by a slider."""
+        """Draw strokes by the kind and width of two controls, and the walls of a plan by a slider."""
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
@@ -182,13 +179,13 @@ class Picture:
         threshold.js_on_change("value", CustomJS(args=shown, code=code))
 
     def show_unit(self, unit: str) -> None:
-        """Name the unit of both axes."""
         for name, axis in (("x", self.plot.xaxis), ("y", self.plot.yaxis)):
             axis.axis_label = f"{name} [{unit}]"
 
     def show_map(self, partial: PartialMap | None, plan: Plan | None) -> None:
-        """Draw the cells of a map, or a plan that has no scale yet."""
-        self.stroke.data = {"x": [], "y": [], "r": []}
+        """Draw a map, or a plan that has no scale yet."""
+        for source in (self.stroke, self._live):
+            source.data = {"x": [], "y": [], "r": []}
         has_map = partial is not None
         (x0, y0, x1, y1), cells = (0.0, 0.0, *(plan.size_m if plan else (1.0, 1.0))), np.zeros((1, 1), np.uint8)
         colours = []
@@ -209,10 +206,7 @@ class Picture:
     def show_answer(
         self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool, outline: str = ""
     ) -> None:
-        """Draw the layers of a transmitter, or of the strongest for "", with scales that follow the threshold.
-
-        `outline` is one of `OUTLINES`.
-        """
+        """Draw the layers of a transmitter, or of the strongest for ""; `outline` is one of `OUTLINES`."""
         if answer is None:
             self.values.data = {column: [] for column in self.values.data}
             self.outline.data = {"xs": [], "ys": []}
@@ -238,7 +232,7 @@ class Picture:
         self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
 
     def _show_scales(self, thresholds: dict[str, float], names: list[str]) -> None:
-        """Let scales of levels change colour in steps of 5 dB, with a break at the threshold; servers have names."""
+        """Set scales in steps of 5 dB whose colours break at the threshold, and the names of servers."""
         for name, threshold in thresholds.items():
             _, bar = self.parts[name]
             low, high = threshold - _BELOW * _STEP_DB, threshold + _ABOVE * _STEP_DB
@@ -250,7 +244,7 @@ class Picture:
         bar.color_mapper.update(palette=server_codes(MOST_TRANSMITTERS)[: len(names)], high=len(names) - 0.5)
 
     def show_views(self, views: NextViews | None) -> None:
-        """Draw the next views of a robot, and the ways to them."""
+        """Draw next views of a robot, and the ways to them."""
         shown = views or ()
         self.routes.data = {"xs": [view.path_m[:, 0] for view in shown], "ys": [view.path_m[:, 1] for view in shown]}
         self.poses.data = {
@@ -262,10 +256,7 @@ class Picture:
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown.
-
-    3 is a hatch, 3 + k a wall of material k.
-    """
+    """Return the cells of a map in 600 to 1000 rows or columns: states, 3 for a hatch, 3 + k for material k."""
     merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
     ny, nx = (math.ceil(n / merge) for n in partial.shape)
     padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
@@ -286,7 +277,6 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
 
 
 def material_colour(material: Material) -> str:
-    """Return the colour in which its walls are drawn."""
     return dict(zip(WALL_MATERIALS, _COLOURS, strict=True)).get(material_name(material), _OTHER)
 
 
