@@ -185,11 +185,7 @@ IN_THE_WAY = [
         (require_writable, name, "a part of the path is a file; choose another folder")
         for name in ("file", "file/deep")
     ),
-    (
-        require_writable,
-        "/proc/new",
-        r"path = '/proc/new' could not be .* \(No such file.*: nothing can be made there; choose",
-    ),
+    (require_writable, "/proc/new", r"'/proc/new' could not be .* \(No such file.*: nothing can be made there; choose"),
 ]
 """Functions that write, names, and what is said about them."""
 

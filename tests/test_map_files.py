@@ -201,9 +201,7 @@ def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> 
 def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     save_map(SMALL, tmp_path / "home.npz")
     folder = export(tmp_path / "scene")
-    with pytest.raises(
-        MapError, match=r"resolution_m is for scans, drawings, .* alone, but path = '.*home.npz' is none: leave"
-    ):
+    with pytest.raises(MapError, match=r"resolution_m is for scans, .* alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
     with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its"):
         load_map(folder, up="z")

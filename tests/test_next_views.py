@@ -189,17 +189,6 @@ class TestCoveragePolicy:
         seen = runs[0].states[0]
         assert np.array_equal(seen[seen != 2], home.state[seen != 2])
 
-    @pytest.mark.parametrize(
-        ("arguments", "error", "message"),
-        [
-            ({"policy": "haste"}, SettingsError, "policy = 'haste' is not allowed: choose one of random, coverage"),
-            ({"policy": "coverage", "tx": (99.0, 0.0)}, PositionError, "tx = .* is outside the map"),
-        ],
-    )
-    def test_bad_input(self, hall, arguments, error, message):
-        with pytest.raises(error, match=message):
-            sp.explore(hall, (5,), **arguments)
-
 
 def test_animation_with_predictions(hall, tmp_path):
     exploration = sp.explore_trajectory(hall, (0, 10), 2)

@@ -49,10 +49,7 @@ class TestMap:
         [
             ({"obstacle": np.ones((3, 3), int)}, r"obstacle has shape \(3, 3\)"),
             ({"obstacle_heights_m": (0.0,)}, r"obstacle_heights_m = 0\.0 is not allowed"),
-            (
-                {"obstacle_heights_m": (0.75,)},
-                "obstacle has values 0 to 2, and obstacle_heights_m has 1 entries",
-            ),
+            ({"obstacle_heights_m": (0.75,)}, "obstacle has values 0 to 2, and obstacle_heights_m has 1 entries"),
             ({"obstacle_heights_m": tuple(0.1 + 0.001 * k for k in range(300))}, "has 300 entries: give at most 255"),
         ],
     )

@@ -1,5 +1,6 @@
 """Wall outlines: literal tiny maps, synthetic nasty maps, properties; and staircases."""
 
+import functools
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,8 +23,7 @@ from sionna_partial.settings import SceneSettings
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 
 
-def drawn(text: str, resolution_m: float = 0.05) -> PartialMap:
-    return extruded.drawn(text, resolution_m)
+drawn = functools.partial(extruded.drawn, resolution_m=0.05)
 
 
 def in_cells(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
@@ -166,7 +166,7 @@ def test_tolerance_zero_keeps_every_corner() -> None:
 
 def test_only_the_layer_that_faces_free_cells_was_seen() -> None:
     for behind in ("########", "?##?#?#?", "????????"):
-        partial = drawn(f"???????????? ??{behind}?? ??########?? ............", 0.05)
+        partial = drawn(f"???????????? ??{behind}?? ??########?? ............")
         assert segment_set(partial) == {((2.0, 1.5), (10.0, 1.5))}
 
 
@@ -229,7 +229,7 @@ def test_joints_are_closed(text: str) -> None:
 )
 def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float) -> None:
     """A gap that is too long, or across which FREE cells were seen; where it is unknown, walls reach its border."""
-    partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m)
+    partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m=resolution_m)
     first, last = row.index("#"), row.rindex("#")
     opening = row.strip(".").replace("?", ".").split(".")
     left, right = first + len(opening[0]) - 1, last - len(opening[-1]) + 1
@@ -243,7 +243,7 @@ def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float)
 @pytest.mark.parametrize("cells", [1, 5, 6])
 def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None:
     wall = f"....####{'?' * cells}####...."
-    partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", 0.1)
+    partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", resolution_m=0.1)
     assert len(wall_outlines(partial).segments) == (1 if cells <= 5 else 2)
 
 
@@ -272,7 +272,7 @@ def test_unobserved_regions_become_no_walls() -> None:
         ................................??
         ##################################
         """,
-        0.1,
+        resolution_m=0.1,
     )
     outlines = wall_outlines(partial)
     assert len(outlines.segments) == 6
