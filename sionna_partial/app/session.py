@@ -18,9 +18,16 @@ import xarray as xr
 
 from sionna_partial.app.answer import Answer
 from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Stroke, drawn, uploaded_plan
-from sionna_partial.app.files import FILES, coverage_file, uploaded_map
+from sionna_partial.app.files import (
+    FILES,
+    Project,
+    coverage_file,
+    project_file,
+    script,
+    uploaded_map,
+    uploaded_project,
+)
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
-from sionna_partial.app.project import Project, project_file, script, uploaded_project
 from sionna_partial.app.radio import (
     MOST_TRANSMITTERS,
     PRESETS,
@@ -310,12 +317,8 @@ class Session:
         require(new_name == name or new_name not in self.transmitters, "name", new_name, "another one has it.")
         changed = replace(self.transmitters[name], **values)
         self.chosen = new_name if self.chosen == name else self.chosen
-        self._take_transmitters(
-            {
-                new_name if each == name else each: changed if each == name else old
-                for each, old in self.transmitters.items()
-            }
-        )
+        pairs = [(new_name, changed) if key == name else (key, old) for key, old in self.transmitters.items()]
+        self._take_transmitters(dict(pairs))
 
     def remove(self, name: str) -> None:
         self._take_transmitters({each: old for each, old in self.transmitters.items() if each != name})
