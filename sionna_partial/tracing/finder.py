@@ -49,7 +49,7 @@ Kinds = tuple[list[Kind], list[Kind]]
 class PlanScene:
     """An extruded floor plan on disk, with the names of its shapes in the order in which faces are counted.
 
-    `floor` (ny, nx) are the cells of its map that have a floor.
+    `floor` (ny, nx) are the cells of its map that have a floor. Limits of paths through walls may be `coarse`.
     """
 
     xml: Path
@@ -59,6 +59,7 @@ class PlanScene:
     wedges: Wedges
     partial: PartialMap
     floor: Bools
+    coarse: bool = False
 
     @cached_property
     def interior(self) -> Interior:
@@ -66,7 +67,7 @@ class PlanScene:
         depth_m, partial = self.settings.wall_depth_m, self.partial
         walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
         solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
-        return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
+        return Interior.of(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         """Return the kinds of candidates between a transmitter (3,) with an antenna and receivers (N, 3)."""
@@ -79,7 +80,7 @@ class PlanScene:
             opaque.append(DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, materials, walls))
         if not settings.through_walls:
             return opaque, []
-        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials)
+        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials, coarse=self.coarse)
         if not settings.diffraction:
             return opaque, [crossing]
         return opaque, [crossing, CrossedEdgeCandidates(geometry, self.wedges, crossing)]
@@ -95,6 +96,7 @@ class MeshScene:
     vertices_m: Floats
     triangles: NDArray[np.int64]
     cells: Cells
+    coarse: bool = False
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         """Return the kinds of candidates, by the sequences of planes that rays meet."""
@@ -105,7 +107,8 @@ class MeshScene:
         opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
         if not settings.through_walls:
             return opaque, []
-        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, min(SPLIT_RAYS, settings.samples_per_tx), gains)]
+        count = min(SPLIT_RAYS, settings.samples_per_tx)
+        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, count, gains, coarse=self.coarse)]
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:

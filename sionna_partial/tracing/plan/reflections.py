@@ -307,7 +307,7 @@ class _Paths(NamedTuple):
 class CrossingCandidates:
     """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
 
-    They have at most two reflections at floor and ceiling, and are limited by `Limits`.
+    They have at most two reflections at floor and ceiling, and are limited by `Limits`, of which `coarse` is one.
     """
 
     name = "paths through walls"
@@ -319,10 +319,12 @@ class CrossingCandidates:
         interior: Interior,
         settings: TraceSettings,
         materials: Materials,
+        *,
+        coarse: bool = False,
     ) -> None:
         self._geometry = geometry
         walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
-        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1)
+        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1, coarse=coarse)
         self.building = Building.of(geometry.plan, interior, room, materials, limits)
         self.lowered = Lowered.of(geometry, self.building, settings.max_walls)
 
