@@ -1,7 +1,7 @@
 """Predict radio coverage from a robot's partial map of a building.
 
-The public names, which `__init__.pyi` lists, load their modules, and the libraries that those need, when they are first
-used. Importing the package also chooses the LLVM library of Dr.Jit: import it before `sionna.rt`, `mitsuba` or `drjit`.
+Public names, listed in `__init__.pyi`, load their modules and libraries on first use. The import also chooses the LLVM
+library of Dr.Jit: import this package before `sionna.rt`, `mitsuba` or `drjit`.
 """
 
 import ast

@@ -1,4 +1,4 @@
-"""The demo: coverage predicted from a half-explored home that ships with the package, against the truth."""
+"""Demo: coverage predicted from a shipped, half-explored home, against the truth."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -22,7 +22,7 @@ from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import demo_homes, scenes_folder
 
 TRUTH, NOTHING, PARTIAL = "truth", "nothing observed", "partial map"
-"""Titles of the three coverage maps that are compared (paper, Fig. 5)."""
+"""Titles of the compared coverage maps (paper, Fig. 5)."""
 
 
 def run_demo(
@@ -30,8 +30,7 @@ def run_demo(
 ) -> tuple[list[str], str]:
     """Predict the coverage of a shipped home after some steps of exploration, and compare it with the truth.
 
-    Written are `coverage` in every format, `comparison.png` (truth, nothing observed, partial map) and `table.txt`.
-    Returned are the names of these files and the table.
+    Return the names of the written files (`coverage` in every format, `comparison.png`, `table.txt`) and the table.
     """
     report = progress or no_progress
     complete, known, tx = demo_scene(home, step)
@@ -57,7 +56,7 @@ def run_demo(
 
 
 def demo_scene(home: str, step: int) -> tuple[PartialMap, PartialMap, tuple[float, ...]]:
-    """Load a shipped home: the complete map, its partial map, and the transmitter position [m]."""
+    """Load a shipped home: complete map, partial map and transmitter position [m]."""
     scenes, homes = scenes_folder(), demo_homes()
     if home not in homes:
         raise SceneError(f"home = {home!r} is not in '{scenes}': choose one of {', '.join(homes)}.")

@@ -1,22 +1,17 @@
-"""The predicted distribution as one differentiable function of transmitter, materials, frequency and network weights.
+"""Predicted distribution as a differentiable function of transmitter, materials, frequency and network weights.
 
-Paths and their derivatives come from `tracing`, a `tf.custom_gradient` hands both to TensorFlow, and everything from
-there on, features and networks, is TensorFlow. At the position where links were traced the distribution equals
-`Predictor.predict`; on a nearly complete map the networks alone give it.
+`tracing` provides paths and their derivatives, which a `tf.custom_gradient` hands to TensorFlow; features and networks
+are TensorFlow. Where links were traced, the distribution equals `Predictor.predict`.
 
 Limits of the gradients:
 
-- Paths are taken from the trace. One that would appear elsewhere is missing; one that is no longer valid loses its
-  power in a step, which no derivative includes. Link states of the partial trace, the link states that the map leaves
-  possible, and whether the ends are in observed cells, are taken from the trace, too.
-- The unobserved length of a line, d_unobs, has a derivative that jumps from cell to cell. Where the transmitter moves,
-  the length is the traced length times s(tx) / s(tx at the trace), and s is `SmoothLengths`. The same holds for the
-  lengths of all paths in unknown cells, and of direct lines in known walls. A line that was wholly observed stays so.
-- The outputs of the map networks are evaluated around the transmitter and 15 cm to each side, and are linear between.
-  Their derivative jumps where a receiver passes the centre of one of their cells.
-- Where the map is complete the distribution is the trace itself: its probabilities are constant, and its gain is that
-  of the paths.
-- There are first derivatives only: TensorFlow refuses second derivatives.
+- Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
+  missing; one that becomes invalid loses its power in a step, which has no derivative.
+- The unobserved length of a line has a derivative that jumps from cell to cell. When the transmitter moves, lengths in
+  unknown cells and in walls are the traced lengths times the ratio of `SmoothLengths`; a length of 0 remains 0.
+- The outputs of the map networks are linear between positions 15 cm to each side of the transmitter. Their derivative
+  jumps where a receiver passes the centre of one of their cells.
+- On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
 
 from __future__ import annotations
@@ -78,16 +73,16 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
-"""Distance within which a segment runs along the border of patches [cells]."""
+"""Distance from the border of patches within which a segment is taken to run along it [cells]."""
 
 WINDOW_STEP_M = CELLS_M[0] / 2
-"""Distance from the transmitter at which further windows are drawn [m]."""
+"""Distance from the transmitter to further windows [m]."""
 
 STEEPEST = 4.0
-"""Largest ratio of the growth of a length to the growth of its smooth surrogate, as where it hardly touches a cell."""
+"""Largest ratio of a length's growth to the growth of its smooth surrogate, for lines that touch a cell's corner."""
 
 _NEAREST_M = 1e-6
-"""Distance that a transmitter keeps from receivers: at the receiver, a distance has no slope [m]."""
+"""Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
 
 _LIMITS = {
     "tx_m": (-1e9, 1e9),
@@ -101,16 +96,13 @@ _LIMITS = {
 class SmoothLengths:
     """Length of segments in cells of one kind, smooth in their ends.
 
-    The length that `unobserved_lengths_m` measures is continuous, but its derivatives jump wherever a segment passes
-    the corner of a cell. Here the mask of the cells, 1 in cells of the kind and 0 in others, is interpolated bilinearly
-    between the centres of cells before it is integrated along the segment. Edges become ramps that are one cell wide.
+    The length of `unobserved_lengths_m` has derivatives that jump at the corners of cells. Here the mask of the cells
+    (1 in the kind, 0 elsewhere) is interpolated bilinearly between cell centres before it is integrated along the
+    segment, so that edges become ramps of one cell.
 
-    For a segment that crosses a straight edge along the axes from side to side, the length is the same. It differs by a
-    fraction of a cell where a segment passes a corner or ends within a cell of an edge, and by up to half of the length
-    on which it runs along an edge. The first derivatives are continuous, and exact to rounding, except for segments
-    that run along a line through the centres of cells, or are upright above one: there they are the mean of both sides.
-
-    Everything outside the grid is unknown. Lengths are those in the cells, also on a complete map.
+    Across a straight edge lengths remain equal. They differ by a fraction of a cell at corners and ends near an edge,
+    and by up to half of the length along an edge. First derivatives are continuous and exact; on lines through cell
+    centres they are the mean of both sides. Everything outside the grid is unknown.
     """
 
     def __init__(self, partial: PartialMap, kind: CellState) -> None:
@@ -121,12 +113,12 @@ class SmoothLengths:
         self._resolution_m = partial.resolution_m
 
     def __call__(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the lengths (N,) [m] of segments between (N, 3) or (3,) ends [m]; NaN where an end is."""
+        """Return the lengths (N,) [m] between ends (N, 3) or (3,) [m]; NaN for an end that is NaN."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         return self._integrals(start_m, end_m)[:, 0] * np.linalg.norm(end_m - start_m, axis=1)
 
     def slopes(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives (N, 3) of the lengths with respect to start and end; 0 where the ends coincide."""
+        """Return the derivatives (N, 3) with respect to start and end; 0 where the ends coincide."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         integrals, step_m = self._integrals(start_m, end_m), end_m - start_m
         distance_m = np.linalg.norm(step_m, axis=1, keepdims=True)
@@ -137,7 +129,6 @@ class SmoothLengths:
         return start, end
 
     def _integrals(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return what `_fill_integrals` fills in, for segments (N, 3) [m]."""
         starts, ends = ((points[:, :2] - self._first_centre_m) / self._resolution_m for points in (start_m, end_m))
         integrals = np.zeros((len(starts), 5))
         _fill_integrals(self._mask, self._even, starts, ends, integrals)
@@ -145,10 +136,10 @@ class SmoothLengths:
 
 
 def _even_patches(mask: Bools) -> NDArray[np.int32]:
-    """Return how far the next uneven patch is in every direction, corners included; 0 in uneven patches.
+    """Return the distance to the next uneven patch in any direction, diagonals included; 0 in uneven patches.
 
-    A patch is what four cell centres enclose, and even if their cells are of one state: there the interpolation is
-    constant.
+    A patch lies between four cell centres. It is even if their cells have one state: the interpolation is constant
+    there.
     """
     around = mask[:-1, :-1].astype(np.int8) + mask[:-1, 1:] + mask[1:, :-1] + mask[1:, 1:]
     even = around % 4 == 0
@@ -163,8 +154,8 @@ def _fill_integrals(
 ) -> None:
     """Integrate the interpolated mask u over the parameter t of segments, from 0 at the start to 1 at the end.
 
-    Points (N, 2) are counted in cells from the centre of the first cell of the mask. Zeros in `integrals` (N, 5) become
-    the integrals of u, (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
+    Points (N, 2) are in cells from the centre of the mask's first cell. Zeros in `integrals` (N, 5) become the
+    integrals of u, (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
     """
     for i in range(len(ends)):
         start_x, start_y, end_x, end_y = starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1]
@@ -186,7 +177,7 @@ def _fill_integrals(
 
 @njit(cache=True)
 def _aside(start: float, end: float) -> float:
-    """Return how far to step to either side of a border that a segment runs along; 0 if it does not."""
+    """Return the step to either side of a border along which a segment runs; 0 if it does not."""
     along = abs(end - start) < _BORDER_CELLS and abs(start - np.round(start)) < _BORDER_CELLS
     return 2.0 * _BORDER_CELLS if along else 0.0
 
@@ -216,10 +207,7 @@ def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment
 def _add_patch(
     corners: NDArray[np.int8], row: int, column: int, segment: Segment, here: float, there: float, sums: Floats
 ) -> None:
-    """Add what `_integrate` adds between two fractions of a segment that is in one patch there, by Simpson's rule.
-
-    The integrand is quadratic in t, and the rule exact.
-    """
+    """Add the integrals between two fractions of a segment in one patch, by Simpson's rule, which is exact here."""
     corner, right, up = corners[0, 0], corners[0, 1], corners[1, 0]
     twist = corners[1, 1] - right - up + corner
     width = there - here
@@ -235,13 +223,13 @@ def _add_patch(
 
 @dataclass(frozen=True, eq=False)
 class LinkDistribution(LinkPrediction):
-    """A `LinkPrediction` of (N,) float64 tensors, which have derivatives: for objectives and losses."""
+    """A `LinkPrediction` of (N,) float64 tensors that have derivatives."""
 
     def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
         """Return the probability (N,) that the gain exceeds a threshold above -150 dB [dB].
 
-        Without uncertainty the probability is a step, which has no slope; `softness_db`, the standard deviation of a
-        further Gaussian spread of the gain [dB], gives it one.
+        `softness_db` is the standard deviation of an additional Gaussian spread of the gain [dB]: without uncertainty,
+        the probability is a step that has no slope.
         """
         covered = tf.zeros_like(self.p_los)
         for probability, mean_db, std_db in (
@@ -256,30 +244,29 @@ class LinkDistribution(LinkPrediction):
 
 
 class DifferentiableScene:
-    """A map and a predictor for the differentiable links of any transmitters: built once, traced for each.
+    """A map and a predictor for differentiable links, traced for each transmitter.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        Map of the building. The predictor of a link model is loaded anew, so that its weights may change.
+        Map of the building. The predictor of a link model is loaded again, so that its weights may change.
     predictor : None, "map", "paper", path or Predictor
-        None is the shipped default. On a complete map it is not used.
+        As in `predict_map`.
     trace_settings : TraceSettings, optional
-        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls on complete maps, and on
-        others with a predictor that was trained on such paths.
+        Without diffuse reflection, and on meshes without diffraction.
     scene_settings : SceneSettings, optional
-        Where the material of walls is unknown, complete links are averaged over its candidates before any measurement,
-        as by `LinkModel`, unless a call gives constants of materials.
+        Where the material of walls is unknown, complete links are averaged over its candidates, unless a call gives
+        constants of materials.
 
     Raises
     ------
     MapError, SettingsError, PredictorError, BackendError
-        As `predict_map`, for paths that only rays find, or for paths through walls on a map that is not complete,
-        without a predictor that was trained on such paths.
+        As `predict_map`; also for paths that only rays find, or for paths through walls on an incomplete map with a
+        predictor that was not trained on such paths.
 
     Examples
     --------
-    By the direct path, the gain rises by 20 / ln(10) / 2 dB for each metre that the transmitter comes nearer from 2 m:
+    At a distance of 2 m the gain of the direct path changes by 20 / ln(10) / 2 dB per metre:
 
     >>> import numpy as np
     >>> import sionna_partial as sp
@@ -309,12 +296,10 @@ class DifferentiableScene:
         self.partial = self.simulation.partial
         if self.partial.obstacle is not None:
             raise MapError(
-                "scene has obstacles below the ceiling, which smooth lengths in walls do not know: give "
-                "dataclasses.replace(partial, obstacle=None)."
+                "scene has obstacles below the ceiling, which have no gradients: give it with obstacle=None."
             )
         remedy = (
-            "the default prediction through walls has no gradients on a map that is not complete: give "
-            "TraceSettings(refraction=False), or a predictor that was trained on paths through walls."
+            "on incomplete maps give TraceSettings(refraction=False), or a predictor trained on paths through walls."
         )
         require(self.partial.is_complete or not model.by_mean_losses, "refraction", True, remedy)
         self.predictor = Predictor.load(model.asked)
@@ -324,12 +309,12 @@ class DifferentiableScene:
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Names of the M radio materials, in the order of the arguments of `DifferentiableLinks`."""
+        """Return the names of the M radio materials, in the order of the arguments of `DifferentiableLinks`."""
         return self.simulation.materials
 
     @property
     def weights(self) -> list[Any]:
-        """Variables of the networks that predict."""
+        """Return the variables of the networks."""
         names = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
@@ -354,23 +339,17 @@ class DifferentiableScene:
         return DifferentiableLinks(self, self.simulation.paths(one_transmitter(tx), rx, progress=progress))
 
     @cached_property
-    def smooth_unknown(self) -> SmoothLengths:
-        """Lengths in unknown cells."""
-        return SmoothLengths(self.partial, CellState.UNKNOWN)
-
-    @cached_property
-    def smooth_walls(self) -> SmoothLengths:
-        """Lengths in cells of known walls."""
-        return SmoothLengths(self.partial, CellState.WALL)
+    def _smooth(self) -> dict[CellState, SmoothLengths]:
+        return {kind: SmoothLengths(self.partial, kind) for kind in (CellState.UNKNOWN, CellState.WALL)}
 
 
 class DifferentiableLinks:
-    """Links from one transmitter to N receivers, traced once: their distribution as a function (see the module).
+    """Links from one transmitter to N receivers, traced once; a call returns their distribution.
 
     Attributes
     ----------
     base : PathParameters
-        Values at which they were traced; its fields are the arguments of a call.
+        Values of the arguments of a call in the trace.
     """
 
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
@@ -386,22 +365,18 @@ class DifferentiableLinks:
         thickness_m: Any = None,
         frequency_hz: Any = None,
     ) -> LinkDistribution:
-        """Evaluate the distribution; nothing is traced again.
+        """Evaluate the distribution without a new trace.
 
-        Call it eagerly, not within `tf.function`. What is not given is as it was traced, and costs no derivatives.
+        Arguments that are not given keep their traced values and take no time for derivatives.
 
         Parameters
         ----------
         tx_m : (3,) tensor, optional
             Transmitter position [m].
         relative_permittivity, conductivity_s_m, thickness_m : (M,) tensors, optional
-            Value of each of the scene's materials; [S/m] and [m].
+            Values of the scene's materials; [S/m] and [m].
         frequency_hz : () tensor, optional
             Carrier frequency of the trace [Hz]; ITU materials follow it.
-
-        Returns
-        -------
-        LinkDistribution
 
         Raises
         ------
@@ -435,16 +410,13 @@ class DifferentiableLinks:
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
 
     def _tensor(self, name: str, value: Any) -> Any:
-        """Check one argument, and return it as a float64 tensor."""
         require(tf.executing_eagerly(), name, value, "call links eagerly, not within tf.function.")
         tensor = tf.cast(tf.convert_to_tensor(value, dtype_hint=tf.float64), tf.float64)
         shape = getattr(self.base, name).shape
         require(tensor.shape == shape, name, value, f"give a tensor of shape {shape}.")
         low, high = _LIMITS[name]
-        numbers = tensor.numpy()
-        require(
-            bool(((numbers >= low) & (numbers <= high)).all()), name, value, f"give numbers in [{low:g}, {high:g}]."
-        )
+        inside = bool(((tensor >= low) & (tensor <= high)).numpy().all())
+        require(inside, name, value, f"give numbers in [{low:g}, {high:g}].")
         return tensor
 
     @cached_property
@@ -452,7 +424,6 @@ class DifferentiableLinks:
         return _Legs(self._scene.partial, self._paths)
 
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
-        """Sum (N,) over the paths to each receiver."""
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
@@ -471,26 +442,25 @@ class DifferentiableLinks:
         return mean_db, tf.sqrt(tf.tensordot(prior, (gains_db - mean_db) ** 2, 1) + RESIDUAL_DB**2)
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
-        """Return the gain, and what derives from the transmitter position alone, None being where it was."""
+        """Return the features that depend on transmitter position (None: as traced) and gain alone."""
         numeric, rx_m = feature_values(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
         if tx_m is None:
             return numeric
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(scene.smooth_unknown, numeric["unobserved_distance_m"], base, ends)
+        unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
         return numeric | {
             "distance_m": distance_m,
             "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
-            "walled_m": moved_lengths_m(scene.smooth_walls, numeric["walled_m"], base, ends),
+            "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
         }
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
-        """Return what derives from the indirect paths, whose power (P,) and vertices (P, D, 3) are those now."""
         legs = self._legs
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
-            unobserved_m = legs.moved_m(self._scene.smooth_unknown, tx_m, vertices_m)
+            unobserved_m = legs.moved_m(self._scene._smooth[CellState.UNKNOWN], tx_m, vertices_m)
         indirect, gains_db = tf.gather(power, legs.paths), []
         for length_m in ATTENUATION_LENGTHS_M:
             kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else attenuation(legs.unobserved_m, 0.0)
@@ -500,7 +470,6 @@ class DifferentiableLinks:
         return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
     def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
-        """Evaluate the networks that read maps and paths: see `distribution`."""
         ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
         columns = link_inputs(numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
@@ -510,7 +479,7 @@ class DifferentiableLinks:
         return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi))
 
     def _maps(self, tx_m: Any) -> list[Any]:
-        """Return the outputs (1, ...) of the map networks around the transmitter: linear around where it was."""
+        """Return the outputs (1, ...) of the map networks, linear around the traced transmitter."""
         networks = self._scene.networks
         if not reads_maps(networks):
             return []
@@ -522,18 +491,17 @@ class DifferentiableLinks:
 
     @cached_property
     def _windows(self) -> NDArray[np.float32]:
-        """Windows around the transmitter, and around positions to the right, left, top and bottom of it."""
+        """Return windows around the transmitter and around positions to the right, left, top and bottom."""
         steps_m = WINDOW_STEP_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         return map_windows(self._scene.partial, self.base.tx_m[:2] + steps_m).astype(np.float32)
 
 
 class _Legs:
-    """The straight legs of the Q indirect paths: what moves with the transmitter, and how much of it is unobserved.
+    """The straight legs of the Q indirect paths, and their lengths in unknown cells.
 
-    `paths` are their numbers (Q,), `rx` their receivers (Q,), `unobserved_m` their lengths in unknown cells as traced
-    (Q,) [m], also of links that a complete map encloses, which are not used, and `strongest` is the strongest of
-    them to each receiver (N,), -1 where there is none. Legs join nodes, which are numbered in this order: the
-    transmitter, the receivers, and all vertices, path by path.
+    `paths` (Q,) are numbers of paths, `rx` (Q,) their receivers, `unobserved_m` (Q,) their traced lengths in unknown
+    cells [m], `strongest` (N,) the strongest path to each receiver, -1 for none. Legs join nodes, numbered in this
+    order: transmitter, receivers, vertices path by path.
     """
 
     def __init__(self, partial: PartialMap, paths: PathSet) -> None:
@@ -556,7 +524,7 @@ class _Legs:
         self.strongest[self.rx[weakest_first]] = weakest_first
 
     def moved_m(self, lengths: SmoothLengths, tx_m: Any, vertices_m: Any) -> Any:
-        """Return the length (Q,) in unknown cells with the transmitter at `tx_m`, and vertices (P, D, 3) now [m]."""
+        """Return the lengths (Q,) in unknown cells for a transmitter at `tx_m` and vertices (P, D, 3) [m]."""
         vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
         nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
@@ -565,17 +533,12 @@ class _Legs:
 
 
 def _gain_db(power: Any) -> Any:
-    """Gain (N,) of power, at least -150 dB; there it does not change."""
-    floor = 10.0 ** (GAIN_FLOOR_DB / 10.0)
-    return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, floor))
+    """Return the gain (N,) of a power, at least -150 dB, where its derivative is 0."""
+    return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0)))
 
 
 def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Evaluate power (P,) and vertices (P, D, 3) of paths, 0 where there are none, for float64 tensors.
-
-    They are `given` for fields of `PathParameters`; the others are as the paths were traced. There are first
-    derivatives only.
-    """
+    """Return power (P,) and vertices (P, D, 3), 0 where there are none, for `given` float64 `PARAMETERS`."""
 
     @tf.custom_gradient
     def evaluate(*tensors: Any) -> tuple[tuple[Any, Any], Callable[..., list[Any]]]:
@@ -602,8 +565,7 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
 
     if not given:
         return tf.constant(paths.power), tf.constant(np.nan_to_num(paths.vertices_m))
-    power, vertices_m = evaluate(*given.values())
-    return power, vertices_m
+    return evaluate(*given.values())
 
 
 def _pulled(slopes: Floats, upstream: Any) -> Any:
@@ -618,10 +580,9 @@ def _once_only(slopes: Any) -> Any:
 
 
 def moved_lengths_m(lengths: SmoothLengths, exact_m: Floats, base: tuple[Floats, Floats], ends: tuple[Any, Any]) -> Any:
-    """Return lengths (N,) that change from exact ones as smooth ones do while the ends of their segments move.
+    """Return lengths (N,) in cells of one kind that change in proportion to smooth ones when the segments move.
 
-    Exact lengths [m] are those in cells of one kind at the ends `base` (N, 3), and `ends` are the present ones [m].
-    Lengths that were 0 stay so.
+    `exact_m` [m] are the lengths at the ends `base` (N, 3), and `ends` are the present ones [m]. Lengths of 0 remain 0.
     """
 
     @tf.custom_gradient

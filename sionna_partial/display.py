@@ -1,4 +1,4 @@
-"""Display of results at a prompt and in a notebook, and of the progress of long work."""
+"""Display of results at a prompt and in a notebook, and of progress."""
 
 import sys
 from base64 import b64encode
@@ -14,25 +14,23 @@ from sionna_partial.checks import CountProgress, Progress, require, shown
 from sionna_partial.resources import optional_packages
 
 LONGEST = 240
-"""Length of the longest line [characters]."""
 
 THUMBNAIL_PX = 640
-"""Largest width of a picture [pixels]."""
 
 _FEW = 4
 
 WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
-"""Time until a bar of a call appears, of a command, and between two lines of a command without a terminal [s]."""
+"""Delay of a bar in a call and in a command, and time between lines of a command without a terminal [s]."""
 
 
 def later(name: str) -> Any:
-    """Return a function of a later room, as "plots.style:plot_map", whose module is imported by no result."""
+    """Return a function of a later room, such as "plots.style:plot_map", that is imported when it is called."""
     with optional_packages():
         return resolve_name(f"sionna_partial.{name}")
 
 
 def picture_html(line: str, plot: str, value: object) -> str:
-    """Return HTML of a line and of the figure that a function makes of a value."""
+    """Return HTML of a line and of a figure of a value."""
     png = later("plots.style:figure_png")(later(plot)(value), width_px=THUMBNAIL_PX)
     return f'<code>{escape(line)}</code><br><img src="data:image/png;base64,{b64encode(png).decode()}">'
 
@@ -44,7 +42,6 @@ def _one_line(value: Any) -> str:
 
 
 def _brief(value: Any) -> str:
-    """Return small values as they are, arrays by type and shape, and others by type and length."""
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         return f"{value.dtype} {value.shape}" if value.size > _FEW else _brief(value.tolist())
     if isinstance(value, float):
@@ -59,7 +56,7 @@ def _brief(value: Any) -> str:
 
 
 class Shown:
-    """Base of dataclasses that are shown in one line."""
+    """Base of dataclasses with a repr of one line."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -67,7 +64,7 @@ class Shown:
 
 
 class Pictured(Shown):
-    """Base of those that notebooks show with a picture, made by a function that the class names as `plot`."""
+    """Base of dataclasses that notebooks show with the picture of the function named by `plot`."""
 
     _plot: ClassVar[str]
 
@@ -81,10 +78,10 @@ class Pictured(Shown):
 
 @contextmanager
 def reporting(progress: Progress | bool | None, *, command: bool = False) -> Iterator[Progress]:
-    """Open what work reports to: a callable itself, nothing for False, and else a bar with the time left.
+    """Open the receiver of progress reports: a callable itself, none for False, else a bar with the time left.
 
-    The bar appears when the work takes longer than 2 s; without a terminal or a notebook there is none. A `command`
-    has it after 0.1 s, and prints a line a minute without a terminal.
+    The bar appears after 2 s in terminals and notebooks; a `command` shows it after 0.1 s, and prints a line a minute
+    without a terminal.
     """
     if callable(progress):
         yield progress
@@ -101,10 +98,7 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
 
 @contextmanager
 def counting(progress: CountProgress | bool | None, unit: str, *, command: bool = False) -> Iterator[CountProgress]:
-    """Open the same for things (`unit`, in the plural) that are counted.
-
-    Those that were done at the first report do not count for the rate.
-    """
+    """Open a receiver of counts of `unit` (plural); the count of the first report is not part of the rate."""
     if callable(progress):
         yield progress
         return
@@ -122,13 +116,13 @@ def counting(progress: CountProgress | bool | None, unit: str, *, command: bool 
 
 
 def part_of(report: Progress, low: float, high: float) -> Progress:
-    """Return what reports a part of the work, from one fraction to another."""
+    """Return a receiver for a part of the work, from one fraction to another."""
     return lambda fraction, message: report(low + (high - low) * fraction, message)
 
 
 @contextmanager
 def _bar(progress: object, command: bool, **options: Any) -> Iterator[Any]:
-    """Open a bar of tqdm, which stays when the work is done, and vanishes before an error."""
+    """Open a bar of tqdm that remains when the work is done, and vanishes before an error."""
     require(progress is None or isinstance(progress, bool), "progress", progress, "give True, False or a callable.")
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     drawn = sys.stderr.isatty() or hasattr(shell, "kernel")

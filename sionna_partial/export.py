@@ -22,31 +22,30 @@ from sionna_partial.plots.style import figure_png
 from sionna_partial.resources import optional_packages
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
-"""Variables in CSV and GeoTIFF; `wall_parts` is for pictures alone."""
+"""Variables in CSV and GeoTIFF; only pictures need `wall_parts`."""
 
 MAX_BYTES, MAX_ARRAY_BYTES = 500_000_000, 4_000_000_000
-"""Largest file that is read, and size of all its arrays [bytes]."""
+"""Largest file that is read, and largest size of its arrays [bytes]."""
 
 LINK_STATES = ("link_state", "partial_link_state")
 
 
 def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
-    """Write a coverage map, in the format that the suffix names. Equal maps give equal files.
+    """Write a coverage map in the format of the suffix. Equal maps give equal files.
 
     ======== ==========================================================================================
-    `.nc`    NetCDF 4 (CF conventions), everything: `xarray.load_dataset` returns an equal Dataset.
-    `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN where no receiver stands;
-             local metres, no coordinate reference system; the settings as tags. Bands of several transmitters are
-             named "transmitter:variable".
-    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty where no receiver stands. Several
+    `.nc`    NetCDF 4 (CF conventions) of the whole Dataset.
+    `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN without receiver; local
+             metres, no coordinate reference system; settings as tags. Bands of several transmitters are named
+             "transmitter:variable".
+    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty without receiver. Several
              transmitters have a first column tx.
     `.png`   The picture of `plot_coverage`.
-    `.html`  A page for the browser, which needs no network: the layers, the values under the pointer, and
-             P(gain > threshold) with a slider; of several transmitters a choice, and the best server.
-    `.yaml`  ROS map_server map in `raw` mode, with a `.pgm` of the same stem: an occupancy grid whose value, 0 to 98,
-             is the probability of outage in percent; unknown (-1) where no receiver stands and in cells that the map
-             does not know. A static layer of nav2 keeps a robot where it has a link (parameters: `docs/live.md`). One
-             transmitter; for several, save `network_map`.
+    `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold)
+             with a slider, and for several transmitters a choice and the best server.
+    `.yaml`  ROS map_server map in `raw` mode with a `.pgm`: occupancy 0 to 98 is the probability of outage in
+             percent; unknown (-1) without receiver and in unknown cells. A static layer of nav2 keeps a robot where
+             it has a link (`docs/live.md`). One transmitter; for several, save `network_map`.
     ======== ==========================================================================================
 
     Parameters
@@ -59,15 +58,14 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     SettingsError
-        For a Dataset that is no coverage map, or several transmitters as `.yaml`.
+        For anything but a coverage map, or several transmitters as `.yaml`.
     OutputError
-        For another suffix, or if writing fails; nothing half written is left behind.
+        For another suffix, or if writing fails; no partial file remains.
 
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
-    >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
+    >>> coverage = sp.predict_map(sp.make_home(3), (2.0, 3.0, 1.5), spacing_m=0.5)
     >>> sp.save_coverage(coverage, "coverage.nc")
     >>> sp.save_coverage(coverage, "coverage.csv")
     """
@@ -93,19 +91,19 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     Returns
     -------
     xarray.Dataset
-        Equal to the one that was saved, with ``coverage.radio`` (`plot`, `save`, `probability_above`, `at`).
+        Equal to the saved one.
 
     Raises
     ------
     SettingsError
-        If the file cannot be read, or holds something else.
+        If the file cannot be read, or contains other data.
 
     Examples
     --------
     >>> import sionna_partial as sp
     >>> coverage = sp.load_coverage("coverage.nc")  # that save_coverage wrote
-    >>> coverage.sizes["x"]
-    8
+    >>> coverage.attrs["spacing_m"]
+    0.5
     """
     content = read_bytes(path, "path", SettingsError, MAX_BYTES)
     try:
@@ -120,7 +118,7 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
 def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`), `.png` or `.yaml`.
 
-    The latter is a ROS map, as by `save_coverage`, of the probability that all transmitters are in outage.
+    The `.yaml` is a ROS map of the probability that all transmitters are in outage, see `save_coverage`.
 
     Parameters
     ----------
@@ -132,9 +130,9 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     Raises
     ------
     SettingsError
-        For a Dataset that is no network map.
+        For anything but a network map.
     OutputError
-        For another suffix, or if writing fails; nothing half written is left behind.
+        For another suffix, or if writing fails; no partial file remains.
 
     Examples
     --------
@@ -161,7 +159,6 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
 
 
 def _target(path: str | os.PathLike[str], formats: Collection[str]) -> tuple[Path, str]:
-    """Return a path that can be written and its suffix, which must be one of `formats`."""
     target = output_path(path)
     if target.suffix.lower() not in formats:
         raise OutputError(f"path = '{target}' has the suffix '{target.suffix}': choose one of {', '.join(formats)}.")
@@ -209,7 +206,7 @@ def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES
 
 
 def _bands(coverage: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
-    """Return variables by name, and by transmitter; link states are NaN where no receiver stands."""
+    """Return variables by name and by transmitter; link states are NaN where no receiver can be."""
     bands = {}
     for name in names:
         layer = coverage[name].astype(np.float32)
@@ -245,7 +242,7 @@ def _encode_table(table: Any) -> bytes:
 
 
 def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
-    """Write the YAML and its PGM of a probability; if one cannot be written, neither is."""
+    """Write the YAML and PGM of a probability, both or none."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
     quantity = {"quantity": f"probability of outage in percent, at most {MAX_COST}; 255 where unknown or no receiver"}

@@ -15,19 +15,12 @@ from sionna_partial.resources import PREDICTORS_FOLDER, demo_homes
 from sionna_partial.tracing.engine import REMEDY, engine_fault
 
 LIBRARIES = ("sionna-rt", "mitsuba", "drjit", "tensorflow-cpu", "keras", "numpy")
-"""PyPI packages whose versions matter in a report; the others are named where they are missing."""
+"""PyPI packages whose versions are reported; others only if they are missing."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
-
-    Parameters
-    ----------
-    name, value : str
-    remedy : str
-        The remedy; "" if all is well.
-    """
+    """A line of the report; the remedy is "" if all is well."""
 
     name: str
     value: str
@@ -35,7 +28,7 @@ class Finding:
 
 
 def findings() -> Iterator[Finding]:
-    """Look at the platform, LLVM, the libraries and the shipped data, one after the other."""
+    """Yield findings on platform, LLVM, libraries and shipped data."""
     yield Finding("sionna-partial", __version__)
     yield _python()
     yield Finding("processor", _processor_name())
@@ -75,7 +68,6 @@ def _llvm() -> Iterator[Finding]:
 
 
 def _fast_engine() -> Finding:
-    """Report whether the fast engine runs, which leans on internal parts of Sionna RT."""
     try:
         fault = engine_fault()
     except (ImportError, SionnaPartialError) as error:

@@ -1,4 +1,4 @@
-"""Signals that end a process, folders that are removed with it, its cores, and where compiled code is cached."""
+"""Signals, temporary folders, cores and the cache of compiled code."""
 
 import contextlib
 import fcntl
@@ -21,16 +21,15 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-"""Signals that end the command line."""
 
 GRACE_S = 1.0
-"""Time that native code has to return before the process ends without it [s]."""
+"""Time for native code to return before the process ends [s]."""
 
 NEW_FOLDER = ".new-sionna_partial_"
-"""Beginning of the names of own folders that are not locked yet."""
+"""Prefix of own folders that are not locked yet."""
 
 UNLOCKED_S = 60.0
-"""Age from which on such a folder is a killed process's [s]."""
+"""Age at which an unlocked folder is known to be of a killed process [s]."""
 
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
@@ -40,7 +39,7 @@ _cleanups: list[Callable[[], object]] = []
 
 @contextmanager
 def cleaned_up(cleanup: Callable[[], object]) -> Iterator[None]:
-    """Call `cleanup` in the end, also where a signal ends the process before."""
+    """Call `cleanup` at the end, also if a signal ends the process."""
     _cleanups.append(cleanup)
     try:
         yield
@@ -51,7 +50,7 @@ def cleaned_up(cleanup: Callable[[], object]) -> Iterator[None]:
 
 
 def end_process(code: int) -> None:
-    """Clean up, and end without unwinding: native code that is interrupted would abort."""
+    """Clean up and exit without unwinding: interrupted native code would abort."""
     while _cleanups:  # first what stops other threads, which may add some
         with suppress(Exception):
             _cleanups.pop(0)()
@@ -59,7 +58,7 @@ def end_process(code: int) -> None:
 
 
 def end_at_signals() -> None:
-    """Let signals end this process, even while native code runs; those that are ignored stay so."""
+    """Let signals end this process even in native code; ignored signals remain ignored."""
 
     def end(number: int, _: object = None) -> None:
         with suppress(OSError):
@@ -82,7 +81,7 @@ def end_at_signals() -> None:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Hold signals back: an interrupted import of a native library, or move of files, stays half done."""
+    """Delay signals, which would interrupt an import of a native library or a move of files."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -102,9 +101,9 @@ def signals_held() -> Iterator[None]:
 
 @contextmanager
 def own_folder(parent: Path, prefix: str) -> Iterator[Path]:
-    """Make a folder in `parent`, and remove it in the end, as well as new parents that stay empty.
+    """Make a folder in `parent`, and remove it at the end with new parents that are empty.
 
-    Those that processes of this machine have left there are removed, too: each is locked while its process lives.
+    Folders of killed processes of this machine are removed, too: a folder is locked while its process lives.
     """
     mine = prefix + hashlib.sha256(socket.gethostname().encode()).hexdigest()[:8]
     made = [folder for folder in (parent, *parent.parents) if not folder.exists()]
@@ -147,10 +146,7 @@ def core_count() -> int:
 
 
 def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """Yield ``function(item)`` for all items in their order, computed by one thread a core.
-
-    No more than two results a core wait to be taken, which bounds the memory.
-    """
+    """Yield ``function(item)`` in the order of the items, computed by a thread per core, at most two items ahead."""
     waiting: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(core_count()) as pool:
         try:
@@ -166,9 +162,9 @@ def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> It
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return numba's decorator; code is cached where that can be, at last in a temporary folder.
+    """Return numba's decorator with a cache, if necessary in a temporary folder.
 
-    Division by zero gives infinity or NaN as in NumPy: the checks that Python has take time in every loop.
+    Division by zero gives infinity or NaN as in NumPy: Python's checks take time in every loop.
     """
     import numba
 
@@ -188,10 +184,9 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _outdated_by_others(compiled: Any) -> Any:
-    """Let cached code be of no use after a change of any compiled module: numba looks at the function's own alone.
+    """Invalidate cached code when any compiled module changes: numba checks only the module of the function.
 
-    It would call what other modules have been, and fail where a type that it takes has moved. Code that a full disk
-    does not take is not cached.
+    A full disk only prevents caching.
     """
 
     def save_overload(*arguments: Any) -> None:
@@ -206,7 +201,6 @@ def _outdated_by_others(compiled: Any) -> Any:
 
 @cache
 def _compiled_sources() -> str:
-    """Hash of all modules of this package that have compiled functions."""
     package, total = Path(__file__).parent, hashlib.sha256()
     for path in sorted(package.rglob("*.py")):
         source = path.read_bytes()
@@ -216,7 +210,7 @@ def _compiled_sources() -> str:
 
 
 def _private_folder() -> str:
-    """Return a folder that nobody else can write to, as cached code is run; "" if there is none."""
+    """Return a folder that only this user can write to, because cached code is executed; "" if there is none."""
     with suppress(OSError):
         folder = Path(tempfile.gettempdir()) / f"sionna-partial-numba-{os.getuid()}"
         folder.mkdir(0o700, exist_ok=True)

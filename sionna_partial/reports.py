@@ -29,7 +29,7 @@ _MISSING = "-"
 
 
 def summary(evaluation: Evaluation) -> str:
-    """Return accuracy and gain error on test homes, a column for each stage, as Markdown that fits a terminal."""
+    """Return accuracy and gain error on test homes, a column per stage, as Markdown."""
     tables = []
     for receivers, title in _WHERE.items():
         rows = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
@@ -61,7 +61,7 @@ def markdown(evaluation: Evaluation) -> str:
 
 
 def as_json(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the report as JSON has it: null where there is no finite value."""
+    """Return the report for JSON, with null for values that are not finite."""
     return {
         "predictor": evaluation.predictor,
         "sha256": evaluation.fingerprint,
@@ -100,7 +100,7 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, names: int = 1) -> str:
-    """Return a Markdown table with aligned columns: the first `names` to the left, figures to the right."""
+    """Return an aligned Markdown table: the first `names` columns to the left, figures to the right."""
     cells = [list(header), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     sides = [str.ljust] * names + [str.rjust] * (len(widths) - names)
@@ -110,7 +110,6 @@ def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, name
 
 
 def _differences(evaluation: Evaluation) -> Iterable[str]:
-    """Sections on paired differences."""
     for receivers, where, first in (("indoor", "indoors", "predictor"), ("anywhere", "anywhere", "with indoor model")):
         rows = [each for each in evaluation.differences if each.receivers == receivers]
         if rows:
@@ -120,7 +119,6 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
 
 
 def _by_stage(rows: Sequence[Row]) -> str:
-    """Tabulate accuracy and gain error, a line for each model and a column for each stage."""
     stages, models = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "model"))
     found = {(row.model, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
     header = ["accuracy, RMSE", *(stage_name(stage) for stage in stages)]

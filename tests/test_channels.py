@@ -3,7 +3,7 @@
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -162,19 +162,18 @@ class TestTransfer:
             xr.testing.assert_equal(found, expected)
 
 
-CASES = [
-    (0, ("iso", "V"), ("iso", "V")),
-    (1, ("iso", "VH"), ("dipole", "cross")),
-    (2, ("tr38901", "VH"), ("hw_dipole", "V")),
-    (3, ("tr38901", "cross"), ("complex", "VH")),
-]
-
-
 class TestAgainstStock:
     """Sionna RT rounds delays, and with them phases at 28 GHz, to single precision: so do we."""
 
-    @pytest.mark.parametrize("normalize_delays", [True, False])
-    @pytest.mark.parametrize(("depth", "tx", "rx"), CASES)
+    @pytest.mark.parametrize(
+        ("depth", "tx", "rx", "normalize_delays"),
+        [
+            (0, ("iso", "V"), ("iso", "V"), False),
+            (1, ("iso", "VH"), ("dipole", "cross"), True),
+            (2, ("tr38901", "VH"), ("hw_dipole", "V"), True),
+            (3, ("tr38901", "cross"), ("complex", "VH"), False),
+        ],
+    )
     def test_every_response(
         self, room_xml: Path, depth: int, tx: tuple[str, str], rx: tuple[str, str], normalize_delays: bool
     ) -> None:
@@ -300,12 +299,6 @@ class TestEveryPath:
             assert [links.cir().paths.sum(), links.cir().power_tolerance_db] == [len(links.a), 0.1]
         assert sum("channels lack paths" in message for message in caplog.messages) == 1
 
-    def test_written_channels_have_every_path(self, tmp_path: Path) -> None:
-        sp.save_channels(self.links(), tmp_path / "channels.nc")
-        found = sp.load_channels(tmp_path / "channels.nc")
-        assert found.paths.sum() == len(self.links(power_tolerance_db=0.0).a)
-        assert found.power_tolerance_db == 0.0
-
 
 class TestResponses:
     def test_links_are_numbered_by_transmitter_and_receiver(self, several: sp.TracedLinks) -> None:
@@ -320,13 +313,6 @@ class TestResponses:
         np.testing.assert_array_equal(found, several.delay_s[later][several.path_rx[later] == 0])
         assert np.isnan(channels.delay_s.values[2]).all()
         assert not channels.a.values[5].any()
-
-    def test_blocks_change_nothing(self, several: sp.TracedLinks, monkeypatch: pytest.MonkeyPatch) -> None:
-        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "dipole", "VH")}
-        whole = [several.cir(synthetic_array=each, **arrays) for each in (True, False)]
-        monkeypatch.setattr("sionna_partial.channels.responses.BLOCK_BYTES", 16 * 16 * 5)
-        for each, synthetic_array in zip(whole, (True, False), strict=True):
-            np.testing.assert_array_equal(several.cir(synthetic_array=synthetic_array, **arrays).a, each.a)
 
     @pytest.mark.parametrize("synthetic_array", [True, False])
     def test_sums_over_paths(self, several: sp.TracedLinks, synthetic_array: bool) -> None:
@@ -360,18 +346,20 @@ class TestResponses:
             many.beam_gains(np.eye(64), **arrays)
 
     @pytest.mark.parametrize("synthetic_array", [True, False])
-    def test_blocks_of_values_change_nothing(
+    def test_blocks_change_nothing(
         self, several: sp.TracedLinks, monkeypatch: pytest.MonkeyPatch, synthetic_array: bool
     ) -> None:
-        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "iso", "VH")}
+        arrays = {"tx_array": array_of(2, 2), "rx_array": array_of(1, 2, "dipole", "VH")}
         options = {**arrays, "synthetic_array": synthetic_array}
         calls = (
+            lambda: several.cir(**options).a,
             lambda: several.cfr(np.arange(7) * 1e6, **options).h,
             lambda: several.taps(1e8, -2, 9, **options).h,
             lambda: several.beam_gains(np.eye(4), **arrays).gain_db,
         )
         whole = [call().to_numpy() for call in calls]
-        monkeypatch.setattr("sionna_partial.channels.responses.WORK_BYTES", 1)
+        monkeypatch.setattr(responses, "BLOCK_BYTES", 16 * 16 * 5)
+        monkeypatch.setattr(responses, "WORK_BYTES", 1)
         for before, call in zip(whole, calls, strict=True):
             np.testing.assert_allclose(call().to_numpy(), before, rtol=1e-5, atol=1e-12)
 
@@ -387,28 +375,17 @@ class TestResponses:
         ("call", "message"),
         [
             (lambda links: links.cir(tx_array="8x8"), "tx_array = '8x8' is not allowed: give a sionna.rt.PlanarArray"),
-            (lambda links: links.cir(rx_orientation_rad=(0, 0)), "rx_orientation_rad = .* or .N, 3. for the 3 ends"),
             (lambda links: links.cir(tx_orientation_rad=(0, np.nan, 0)), "tx_orientation_rad = .* give three angles"),
             (lambda links: links.cir(synthetic_array=1), "synthetic_array = 1 is not allowed: give True or False"),
-            (lambda links: links.cir(memory_gb=0), "memory_gb = 0 is not allowed"),
             (lambda links: links.cfr([28e9]), "frequencies_hz = .* below the carrier of 2.8e.10 Hz"),
-            (lambda links: links.cfr([]), "frequencies_hz = .* relative to the carrier"),
             (lambda links: links.taps(0.0), r"bandwidth_hz = 0.0 is not allowed: give a number in \(0, 1e\+12\]"),
             (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
-            (lambda links: links.taps(1e6, 0.5), "l_min = 0.5 is not allowed"),
             (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
-            *(
-                (lambda links, weight=weight: links.beam_gains([[weight]]), r"codebook = .* weights up to 1e\+06, one")
-                for weight in (np.nan, np.inf, 1e30, 1e308 + 1e308j)
-            ),
+            (lambda links: links.beam_gains([[np.nan]]), r"codebook = .* weights up to 1e\+06, one"),
+            (lambda links: links.beam_gains([[1e308 + 1e308j]]), r"codebook = .* weights up to 1e\+06, one"),
             (lambda links: links.beam_gains([[1]], "x"), "rx_codebook = 'x' is not numeric"),
-            (lambda links: sp.dft_codebook(0, 8), "rows = 0 is not allowed"),
             (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
-            (lambda links: sp.dft_codebook(8, 8, 3), "polarisations = 3 is not allowed"),
-            (
-                lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(),
-                "transfer = .* traced for one polarisation; trace the links with trace_links",
-            ),
+            (lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(), "transfer = .* one polarisation"),
         ],
     )
     def test_refused(self, several: sp.TracedLinks, call: Callable[[Any], object], message: str) -> None:
@@ -490,16 +467,6 @@ class TestSpreads:
         assert np.isnan(one_link((1e-8, 10.0, 0.3, 1)).spreads().k_factor_db).all()
         assert np.isnan(one_link().spreads().to_array()).all()
 
-    def test_several_transmitters(self, several: sp.TracedLinks) -> None:
-        assert several.spreads().delay_spread_s.dims == ("tx", "rx")
-
-
-def of_receivers(channels: xr.Dataset) -> Iterator[tuple[Any, Any]]:
-    """Impulse responses of each receiver, as generators for `CIRDataset` yield them."""
-    for rx in range(channels.sizes["rx"]):
-        one = channels.isel(rx=[rx])
-        yield one.a.to_numpy(), one.tau.to_numpy().astype(np.float32)
-
 
 class TestFiles:
     ARRAYS: ClassVar = {"tx_array": (2, 2, "iso", "VH"), "rx_array": (1, 2)}
@@ -508,8 +475,7 @@ class TestFiles:
     def options(self) -> dict[str, Any]:
         return {name: array_of(*shape) for name, shape in self.ARRAYS.items()}
 
-    @pytest.mark.parametrize("synthetic_array", [True, False])
-    @pytest.mark.parametrize("suffix", [".nc", ".h5", ".zarr"])
+    @pytest.mark.parametrize(("suffix", "synthetic_array"), [(".nc", False), (".h5", True), (".zarr", True)])
     def test_links_as_sionna_has_them(
         self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any], suffix: str, synthetic_array: bool
     ) -> None:
@@ -551,13 +517,6 @@ class TestFiles:
         found, every = (sp.load_channels(tmp_path / name) for name in ("some.nc", "all.nc"))
         xr.testing.assert_equal(found, every.isel(tx=[1]))
 
-    def test_equal_bytes(self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
-        for number in range(3):
-            sp.save_channels(several, tmp_path / f"{number}.nc")
-            time.sleep(0.4)  # HDF5 writes seconds down
-        assert len({file.read_bytes() for file in tmp_path.iterdir()}) == 1
-
     def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
         links = links_of(1)
         sp.save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
@@ -568,19 +527,9 @@ class TestFiles:
         sp.save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
         assert sp.load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
 
-    def test_in_the_data_set_of_sionna(self, several: sp.TracedLinks, tmp_path: Path) -> None:
-        """Runs where the whole of Sionna is installed, not its ray tracer alone."""
-        cir_dataset = pytest.importorskip("sionna.phy.channel").CIRDataset
-        sp.save_channels(several, tmp_path / "channels.nc", tx_array=array_of(2, 2))
-        found = sp.load_channels(tmp_path / "channels.nc")
-        sizes = (found.sizes[name] for name in ("rx_ant", "tx", "tx_ant", "path", "time"))
-        a, tau = cir_dataset(lambda: of_receivers(found), 3, 1, *sizes)()
-        assert a.shape == (3, 1, 1, 2, 4, found.sizes["path"], 1)
-        powers = (np.abs(np.asarray(a)) ** 2).reshape(3, -1).sum(axis=1)
-        np.testing.assert_allclose(np.sort(powers), np.sort((np.abs(found.a) ** 2).sum(found.a.dims[1:])), rtol=1e-5)
-        np.testing.assert_allclose(np.sort(np.ravel(tau)), np.sort(np.ravel(found.tau)), rtol=1e-6)
-
-    def test_progress_of_blocks(self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_blocks_equal_bytes_and_progress(
+        self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         fractions: list[float] = []
         sp.save_channels(several, tmp_path / "whole.nc")
         monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
@@ -588,23 +537,9 @@ class TestFiles:
         xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "parts.nc"))
         assert fractions[-1] == 1.0
         assert len({*fractions}) == 7
-
-    @pytest.mark.parametrize(
-        ("name", "error", "message"),
-        [
-            ("channels.mat", OutputError, r"has the suffix '.mat': choose one of .zarr, .nc, .h5"),
-            ("there.zarr", OutputError, "is there already: remove it, or choose another name"),
-            ("folder.nc", OutputError, "this path is a folder"),
-        ],
-    )
-    def test_paths_that_are_refused(
-        self, several: sp.TracedLinks, tmp_path: Path, name: str, error: type[Exception], message: str
-    ) -> None:
-        (tmp_path / "there.zarr").mkdir()
-        (tmp_path / "folder.nc").mkdir()
-        with pytest.raises(error, match=message):
-            sp.save_channels(several, tmp_path / name)
-        assert len([*tmp_path.iterdir()]) == 2
+        time.sleep(1.1)  # HDF5 writes seconds down
+        sp.save_channels(several, tmp_path / "again.nc")
+        assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "parts.nc").read_bytes()
 
     @pytest.mark.parametrize(
         ("call", "message"),
@@ -613,23 +548,23 @@ class TestFiles:
             (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
             (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels.tx = 'missing' .* or what their cir"),
             (lambda path, links: sp.save_channels(links.cir()[{"link": [1, 2, 3]}], path), "3 links' is not allowed"),
-            (lambda path, links: sp.save_channels(links.cir().real, path), "channels.a = .*float32.* give links with"),
             (lambda path, links: sp.save_channels(links.cfr([0])[{"frequency": 0}], path), "channels.h = .*give links"),
             (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
             (lambda path, links: sp.save_channels(one_link(), path), "channels = '1 links' .* none has a path"),
-            (lambda path, links: sp.load_channels(path), "channels.nc' cannot be read"),
-            (lambda path, links: sp.load_channels(path.with_suffix(".zarr")), "channels.zarr' cannot be read"),
             (lambda path, links: sp.load_channels(path.with_suffix(".mat")), "path = .*mat' is not allowed: give a"),
             (
                 lambda path, links: sp.load_channels(path.with_name("text.nc")),
                 "text.nc' cannot be read .*save_channels",
             ),
+            (lambda path, links: sp.save_channels(links, path.with_suffix(".mat")), "'.mat': choose one of .zarr"),
+            (lambda path, links: sp.save_channels(links, path.parent / "x.zarr"), "is there already: remove it, or"),
             (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
         ],
     )
     def test_refused(self, several: sp.TracedLinks, tmp_path: Path, call: Callable[..., object], message: str) -> None:
         (tmp_path / "text.nc").write_text("no NetCDF")
         xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
-        with pytest.raises(SettingsError, match=message):
+        (tmp_path / "x.zarr").mkdir()
+        with pytest.raises((SettingsError, OutputError), match=message):
             call(tmp_path / "channels.nc", several)
-        assert not (tmp_path / "channels.nc").exists()
+        assert {each.name for each in tmp_path.rglob("*")} == {"text.nc", "other.nc", "x.zarr"}

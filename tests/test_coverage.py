@@ -36,12 +36,6 @@ def quickly_predicted(*arguments, **options):
 
 
 @pytest.fixture(scope="module")
-def anywhere():
-    """The map of `coverage` for receivers that may be outside."""
-    return predicted(map_of(PICTURE), spacing_m=0.25, receivers="anywhere")
-
-
-@pytest.fixture(scope="module")
 def complete():
     """Coverage of the home when all of it is known."""
     return predict_map(map_of(COMPLETE), TX, spacing_m=0.25)
@@ -61,7 +55,7 @@ def test_receivers_are_the_centres_of_a_grid_from_the_lower_left_corner_and_vali
     assert set(np.unique(state)) == set(CellState)
 
 
-def test_all_documented_variables_are_there_as_cf_has_them_and_missing_exactly_where_no_receiver_stands(coverage):
+def test_variables_have_cf_attributes_and_are_missing_exactly_where_no_receiver_is(coverage):
     assert set(coverage.data_vars) == set(ATTRIBUTES)
     valid = coverage["valid"].to_numpy()
     for name, layer in coverage.data_vars.items():
@@ -70,13 +64,11 @@ def test_all_documented_variables_are_there_as_cf_has_them_and_missing_exactly_w
             np.testing.assert_array_equal(np.isnan(layer), ~valid, err_msg=name)
         if name.endswith("link_state"):
             assert set(np.unique(layer.to_numpy()[valid])) <= set(LinkState)
-    assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
-    assert coverage["link_state"].attrs["flag_meanings"] == "outage los nlos no_receiver"
-    for name, layer in coverage.variables.items():
         flags = layer.attrs.get("flag_values", ())
         assert "long_name" in layer.attrs, name
         assert len(flags) or "units" in layer.attrs or name == "wall_parts"
         assert len(flags) == len(layer.attrs.get("flag_meanings", "").split())
+    assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
 
 
 def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
@@ -104,56 +96,35 @@ def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
     np.testing.assert_allclose(found["p_los"] + found["p_nlos"] + found["p_outage"], 1.0, atol=1e-6)
 
 
-def test_line_of_sight_has_the_gain_of_friis_and_what_reflections_add(coverage):
-    los = coverage["partial_link_state"].to_numpy() == LinkState.LOS
-    friis_db = 20.0 * np.log10(299_792_458.0 / 28e9 / (4.0 * np.pi * coverage["distance_m"]))
-    excess_db = coverage["partial_gain_db"] - friis_db
-    assert los.any()
-    assert excess_db.to_numpy()[los].min() > -1e-3
-    assert excess_db.to_numpy()[los].max() < 3.0
-
-
-class TestReceiversAnywhere:
-    def test_outside_is_mixed_in_as_outage_and_attributes_say_so(self, coverage, anywhere):
-        for name in ("p_los", "p_nlos"):
-            np.testing.assert_allclose(anywhere[name], coverage["p_indoor"] * coverage[name], rtol=1e-5, atol=1e-7)
-        np.testing.assert_allclose(anywhere["p_outage"], 1.0 - anywhere["p_los"] - anywhere["p_nlos"], atol=1e-6)
-        gains_db = (-150.0, anywhere["gain_los_mean_db"], anywhere["gain_nlos_mean_db"])
-        mean_db = sum(anywhere[p] * gain for p, gain in zip(("p_outage", "p_los", "p_nlos"), gains_db, strict=True))
-        np.testing.assert_allclose(anywhere["gain_mean_db"], np.maximum(mean_db, -150.0), rtol=1e-5)
-        for name in ("p_indoor", "partial_gain_db", "gain_los_mean_db", "gain_nlos_std_db"):
-            np.testing.assert_array_equal(anywhere[name], coverage[name])
-        assert coverage.attrs["receivers"] == "indoor"
-        assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
-        assert anywhere.attrs["receivers"] == "anywhere"
-        assert anywhere["link_state"].attrs["long_name"].endswith(", of a receiver that may be outdoors, in outage")
-
-    def test_on_a_complete_map_outside_is_outage_for_certain(self, complete):
-        anywhere = predict_map(map_of(COMPLETE), TX, spacing_m=0.25, receivers="anywhere")
-        valid, free = complete["valid"].to_numpy(), (complete["cell_state"] == CellState.FREE).to_numpy()
-        outside = valid & ~free
-        assert outside.any()
-        assert (complete["p_outage"].to_numpy()[outside] < 1.0).any()
-        assert (anywhere["p_outage"].to_numpy()[outside] == 1.0).all()
-        assert (anywhere["gain_mean_db"].to_numpy()[outside] == -150.0).all()
-        for name in ("p_los", "p_outage", "gain_mean_db", "link_state"):
-            np.testing.assert_array_equal(anywhere[name].to_numpy()[free], complete[name].to_numpy()[free])
+def test_outside_is_mixed_in_as_outage_and_attributes_say_so(coverage):
+    anywhere = predicted(map_of(PICTURE), spacing_m=0.25, receivers="anywhere")
+    for name in ("p_los", "p_nlos"):
+        np.testing.assert_allclose(anywhere[name], coverage["p_indoor"] * coverage[name], rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(anywhere["p_outage"], 1.0 - anywhere["p_los"] - anywhere["p_nlos"], atol=1e-6)
+    gains_db = (-150.0, anywhere["gain_los_mean_db"], anywhere["gain_nlos_mean_db"])
+    mean_db = sum(anywhere[p] * gain for p, gain in zip(("p_outage", "p_los", "p_nlos"), gains_db, strict=True))
+    np.testing.assert_allclose(anywhere["gain_mean_db"], np.maximum(mean_db, -150.0), rtol=1e-5)
+    for name in ("p_indoor", "partial_gain_db", "gain_los_mean_db", "gain_nlos_std_db"):
+        np.testing.assert_array_equal(anywhere[name], coverage[name])
+    assert [each.attrs["receivers"] for each in (coverage, anywhere)] == ["indoor", "anywhere"]
+    assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
 
 
 def test_on_a_complete_map_the_trace_is_the_answer(complete):
     assert map_of(COMPLETE).is_complete
-    valid = complete["valid"].to_numpy()
-    for state, name in ((LinkState.LOS, "p_los"), (LinkState.NLOS, "p_nlos"), (LinkState.OUTAGE, "p_outage")):
-        np.testing.assert_array_equal(
-            complete[name].to_numpy()[valid], (complete["partial_link_state"] == state).to_numpy()[valid]
-        )
+    valid, free = complete["valid"] == 1, complete["cell_state"] == CellState.FREE
+    for state in LinkState:
+        found = complete[f"p_{state.name.lower()}"]
+        np.testing.assert_array_equal(found, (complete["partial_link_state"] == state).where(valid))
     np.testing.assert_array_equal(complete["link_state"], complete["partial_link_state"])
     np.testing.assert_array_equal(complete["gain_mean_db"], complete["partial_gain_db"])
-    assert float(complete["gain_std_db"].max()) == 0.0
-    assert float(complete["unobserved_distance_m"].max()) == 0.0
-    free = (complete["cell_state"] == CellState.FREE).to_numpy()
-    np.testing.assert_array_equal(complete["p_indoor"].to_numpy()[valid], free[valid])
+    assert complete["gain_std_db"].max() == complete["unobserved_distance_m"].max() == 0.0
+    np.testing.assert_array_equal(complete["p_indoor"], free.where(valid))
     assert complete.attrs["predictor_sha256"] == ""
+    anywhere = predict_map(map_of(COMPLETE), TX, spacing_m=0.25, receivers="anywhere")
+    assert (complete["p_outage"].where(valid & ~free) < 1.0).any()
+    for name, outside in (("p_los", 0.0), ("p_outage", 1.0), ("gain_mean_db", -150.0), ("link_state", 0)):
+        np.testing.assert_array_equal(anywhere[name], complete[name].where(free, outside).where(valid))
 
 
 def test_a_transmitter_behind_the_walls_of_a_complete_map_is_predicted():
@@ -174,32 +145,26 @@ def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered():
         assert np.isfinite(coverage["gain_mean_db"]).all()
 
 
-def test_no_receiver_stands_at_the_transmitter():
+def test_no_receiver_is_at_the_transmitter_or_where_friis_exceeds_0_db():
     coverage = quickly_predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5)
-    at_tx = ~coverage["valid"].to_numpy()
-    assert at_tx.sum() == 1
+    assert (~coverage["valid"]).sum() == 1
     assert np.isnan(coverage["gain_mean_db"].sel(x=1.75, y=2.25))
     assert coverage["cell_state"].sel(x=1.75, y=2.25) == CellState.UNKNOWN
     assert quickly_predicted(unknown_map(), (1.75, 2.25, 1.6), spacing_m=0.5)["valid"].all()
-
-
-def test_at_low_frequencies_friis_stays_below_0_db():
-    coverage = predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=30e6))
-    distance_m = np.hypot(coverage["x"] - 1.75, coverage["y"] - 2.25)
-    np.testing.assert_array_equal(coverage["valid"], (distance_m >= 9.99308 / (4 * np.pi)).transpose("y", "x"))
+    low = predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5, trace_settings=TraceSettings(frequency_hz=30e6))
+    distance_m = np.hypot(low["x"] - 1.75, low["y"] - 2.25)
+    np.testing.assert_array_equal(low["valid"], (distance_m >= 9.99308 / (4 * np.pi)).transpose("y", "x"))
 
 
 def test_receivers_within_a_centimetre_of_a_wall_are_masked():
     state = np.zeros((6, 6), dtype=np.uint8)
     state[:, 3] = CellState.WALL
     coverage = quickly_predicted(PartialMap(state, 0.5), (0.6, 0.6), spacing_m=0.2)
-    x = coverage["x"].to_numpy()
-    near_m = np.maximum(1.5 - x, x - 2.0)
-    np.testing.assert_array_equal(coverage["valid"].to_numpy().all(axis=0), near_m > 0.01)
-    assert 1.5 in np.round(x, 9)
+    near_m = np.maximum(1.5 - coverage["x"], coverage["x"] - 2.0)
+    np.testing.assert_array_equal(coverage["valid"].all("y"), near_m > 0.01)
 
 
-@pytest.mark.parametrize("spacing_m", [0.2, 0.3, 0.7, 1.0, 1.1, 1.6, 3.4])
+@pytest.mark.parametrize("spacing_m", [0.3, 1.1, 3.4])
 def test_receivers_fill_the_map_and_wall_parts_cover_every_wall_and_nothing_far_from_one(spacing_m):
     state = (np.random.default_rng(round(10 * spacing_m)).random((7, 9)) < 0.2).astype(np.uint8)
     state[0, 0] = CellState.FREE
@@ -231,13 +196,6 @@ def test_a_path_is_read(coverage, tmp_path):
     xr.testing.assert_identical(predict_map(tmp_path / "map.yaml", TX, spacing_m=0.25), coverage)
     with pytest.raises(MapError, match="missing"):
         predict_map(tmp_path / "missing.yaml", TX)
-
-
-def test_a_predictor_is_used_as_it_is():
-    mine = replace(shipped("paper"), name="mine")
-    coverage, by_name = (predicted(map_of(PICTURE), spacing_m=0.5, predictor=each) for each in (mine, "paper"))
-    assert coverage.attrs["predictor"] == "mine"
-    xr.testing.assert_equal(coverage, by_name)
 
 
 @pytest.mark.parametrize(
@@ -278,60 +236,30 @@ def test_settings_reach_the_tracer_and_the_attributes():
     xr.testing.assert_identical(of_map, coverage)
 
 
-def test_progress_grows_to_1():
-    calls = []
-    predicted(map_of(PICTURE), spacing_m=0.5, progress=lambda share, message: calls.append((share, message)))
-    shares = [share for share, _ in calls]
-    assert shares == sorted(shares)
-    assert shares[-1] == 1.0
-    assert all(message for _, message in calls)
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
         ({"tx": (50.0, 3.6)}, PositionError, r"tx = \(50\.0, 3\.6, 1\.5\) is outside the map"),
-        ({"tx": (-0.25, 3.6)}, PositionError, r"tx = .* is inside a wall"),
-        ({"tx": (0.6, float("nan"))}, PositionError, r"tx = .* is not finite"),
-        ({"tx": (0.6, 3.6, 9.0)}, PositionError, r"tx = .* is not between floor and ceiling"),
-        ({"tx": "here"}, PositionError, r"tx = 'here' is not numeric"),
         ({"tx": (("a", "b"))}, PositionError, r"tx = \('a', 'b'\) is not numeric"),
-        ({"rx_height_m": 0.0}, SettingsError, r"rx_height_m = 0\.0 is not allowed"),
         ({"rx_height_m": 3.0}, SettingsError, r"rx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
-        ({"rx_height_m": float("nan")}, SettingsError, r"rx_height_m = nan is not allowed"),
-        ({"spacing_m": 0.0}, SettingsError, r"spacing_m = 0\.0 is not allowed"),
         ({"spacing_m": float("inf")}, SettingsError, r"spacing_m = inf is not allowed"),
         ({"spacing_m": 9.0}, SettingsError, r"spacing_m = 9\.0 .* the map is 6 x 4 m; give 4 or less"),
-        (
-            {"receivers": "outdoor"},
-            SettingsError,
-            "receivers = 'outdoor' is not allowed: choose one of indoor, any",
-        ),
+        ({"spacing_m": 0.05, "scene": unknown_map(400, 600)}, SettingsError, "makes 24,000,000 .*; give 0.19 or more"),
+        ({"receivers": "outdoor"}, SettingsError, "receivers = 'outdoor' is not allowed: choose one of indoor, any"),
         ({"memory_gb": 0.1}, MemoryLimitError, r"memory_gb = 0\.1 .* receivers on a map of 96 cells"),
-        *(
-            (
-                {name: wrong},
-                SettingsError,
-                rf"{name} = {wrong} is not allowed: give {kind}\(\.\.\.\), or None",
-            )
-            for name, kind in (("scene_settings", "SceneSettings"), ("trace_settings", "TraceSettings"))
-            for wrong in (5, {})
-        ),
         (
-            {"trace_settings": TraceSettings(frequency_hz=1e6)},
-            PositionError,
-            r"every receiver is within 23\.9 m of the transmitter.* frequency_hz = 1e\+06: give a higher frequency",
-        ),
-        (
-            {"spacing_m": 0.05, "scene": unknown_map(400, 600)},
+            {"scene_settings": {}},
             SettingsError,
-            r"spacing_m = 0\.05 .* makes 24,000,000 receivers, more than 2,000,000; give 0\.19 or more",
+            r"scene_settings = {} is not allowed: give SceneSettings\(\.\.\.\), or",
+        ),
+        ({"trace_settings": 5}, SettingsError, r"trace_settings = 5 is not allowed: give TraceSettings\(\.\.\.\), or"),
+        (
+            {"trace_settings": TraceSettings(1e6)},
+            PositionError,
+            r"every receiver is within 23\.9 m .* frequency_hz = 1e",
         ),
         (
-            {
-                "trace_settings": TraceSettings(frequency_hz=60e9),
-                "scene_settings": SceneSettings(Material(itu="brick")),
-            },
+            {"trace_settings": TraceSettings(60e9), "scene_settings": SceneSettings(Material(itu="brick"))},
             SettingsError,
             r"frequency_hz = 60000000000\.0 .* 'brick'",
         ),
@@ -351,13 +279,9 @@ def test_bad_input_is_refused_before_any_work(arguments, error, message):
         (lambda data: data.drop_attrs(), "coverage lacks transmitter_m, spacing_m, frequency_hz"),
         (lambda data: data.transpose("x", "y"), "coverage lacks p_los"),
         (lambda data: data.isel(x=slice(0, 0)), "coverage lacks receivers"),
-        (lambda data: data.drop_vars("x"), "coverage lacks x:"),
         (lambda data: data["p_los"], "coverage is of type DataArray"),
-        (lambda data: data.drop_attrs().assign_coords(tx="a"), "coverage lacks transmitter_m"),
         (lambda data: data * 1.0, r"coverage\.observed = .*float"),
-        (lambda data: data.astype(str), r"coverage\.p_los = "),
         (lambda data: data.assign_attrs(spacing_m="x"), r"coverage\.spacing_m = 'x'"),
-        (lambda data: data.assign_attrs(frequency_hz=None), r"coverage\.frequency_hz = None"),
         (lambda data: data.assign_attrs(transmitter_m=[1.0, math.nan, 1.5]), r"coverage\.transmitter_m = "),
     ],
 )
@@ -368,17 +292,22 @@ def test_what_is_no_coverage_map_is_named(coverage, spoil, message):
 
 
 def test_the_answer_does_not_depend_on_the_blocks():
-    whole, in_blocks = (predicted(map_of(PICTURE), spacing_m=0.12, memory_gb=gb) for gb in (2.0, 1.062))
+    fractions = []
+    whole = predicted(map_of(PICTURE), spacing_m=0.12)
+    in_blocks = predicted(
+        map_of(PICTURE), spacing_m=0.12, memory_gb=1.062, progress=lambda done, _: fractions.append(done)
+    )
+    assert fractions == sorted(fractions)
+    assert fractions[-1] == 1.0
     assert whole["valid"].sum() > 1000
     for name in ATTRIBUTES:
         np.testing.assert_allclose(in_blocks[name], whole[name], rtol=1e-5, atol=1e-5, err_msg=name)
 
 
 class TestAccessor:
-    def test_probability_above_is_that_of_the_mixture(self, coverage):
+    def test_probability_above_is_of_the_mixture(self, coverage, complete):
         above = coverage.radio.probability_above(-70.0)
         assert above.dims == ("y", "x")
-        assert above.units == "1"
         los, nlos = (
             coverage[f"p_{state}"]
             * norm.sf(-70.0, coverage[f"gain_{state}_mean_db"], coverage[f"gain_{state}_std_db"] + 1e-9)
@@ -386,20 +315,11 @@ class TestAccessor:
         )
         valid = (coverage["valid"] & (coverage["gain_los_std_db"] > 0.0)).to_numpy()
         assert np.allclose(above.to_numpy()[valid], (los + nlos).to_numpy()[valid], atol=1e-5)
-        assert ((above > 0.01) & (above < 0.99)).any()
         assert np.array_equal(np.isnan(above), ~coverage["valid"])
-
-    def test_an_outage_has_150_db(self, coverage):
-        valid = coverage["valid"].to_numpy()
-        at_floor = coverage.radio.probability_above(-150.0).to_numpy()[valid]
-        outage = coverage["p_outage"].to_numpy()[valid]
-        assert (at_floor <= 1.0 - outage + 1e-6).all()
-        assert outage.max() > 0.5
-
-    def test_without_uncertainty_it_is_a_step(self, complete):
-        above = complete.radio.probability_above(-75.0).to_numpy()
-        expected = (complete["gain_mean_db"] > -75.0).where(complete["valid"].astype(bool))
-        assert np.array_equal(above, expected, equal_nan=True)
+        assert coverage["p_outage"].max() > 0.5
+        assert not (coverage.radio.probability_above(-150.0) > 1.0 - coverage["p_outage"] + 1e-6).any()
+        step = (complete["gain_mean_db"] > -75.0).where(complete["valid"] == 1)
+        assert np.array_equal(complete.radio.probability_above(-75.0), step, equal_nan=True)
 
     def test_power_and_snr_are_gains_and_a_link_budget(self, coverage, several):
         power, snr = coverage.radio.power(eirp_dbm=23.0, rx_gain_db=2.0), coverage.radio.snr(bandwidth_hz=20e6)
@@ -448,9 +368,9 @@ class TestAccessor:
             (lambda radio: radio.power(eirp_dbm=[1.0, 2.0]), "eirp_dbm"),
             (lambda radio: radio.power(rx_gain_db=np.nan), "rx_gain_db = nan"),
             (lambda radio: radio.snr(bandwidth_hz=0.0), "bandwidth_hz = 0"),
-            (lambda radio: radio.rate("wifi5"), "standard = 'wifi5'"),
-            (lambda radio: radio.snr(bandwidth_hz=1e-300), "bandwidth_hz = 1e-300"),
             (lambda radio: radio.area(-67.0, probability=1.1), "probability = 1.1"),
+            (lambda radio: radio.probability_above(-151.0), "threshold_db = -151.0 is not allowed"),
+            (lambda radio: radio.probability_above(True), "threshold_db = True is not allowed"),
         ],
     )
     def test_link_budgets_are_checked(self, coverage, call, message):
@@ -460,15 +380,14 @@ class TestAccessor:
     @pytest.mark.parametrize(
         ("standard", "frequency_hz", "bandwidth_hz", "message"),
         [
+            ("wifi5", 5e9, 80e6, "standard = 'wifi5'"),
             (
-                "wifi6",
-                28e9,
+                "wifi7",
+                60e9,
                 80e6,
-                "frequency_hz = 28000000000.0 is not allowed: wifi6 is defined at 1 to 7.125 GHz: choose",
+                "frequency_hz = 60000000000.0 is .* wifi7 is defined at 1 to 7.25 GHz: choose",
             ),
-            ("wifi7", 60e9, 80e6, "wifi7 is defined at 1 to 7.25 GHz"),
             ("nr", 10e9, 100e6, "nr is defined at 0.41 to 7.125 and 24.25 to 71 GHz"),
-            ("wifi6", 5e9, 320e6, "channels of wifi6 at 5 GHz are 2e.07, 4e.07, 8e.07, 1.6e.08 Hz wide"),
             ("wifi6", 2.4e9, 80e6, "channels of wifi6 at 2.4 GHz are 2e.07, 4e.07 Hz wide"),
             ("wifi7", 5.2e9, 320e6, "channels of wifi7 at 5.2 GHz"),
             ("nr", 28e9, 1.0, "channels of nr at 28 GHz are 5e.07 to 2e.09 Hz wide"),
@@ -481,30 +400,20 @@ class TestAccessor:
 
     def test_at_is_the_nearest_receiver(self, coverage):
         here = coverage.radio.at(0.7, 3.1)
-        assert abs(float(here.x) - 0.7) <= 0.125
-        assert abs(float(here.y) - 3.1) <= 0.125
+        assert max(abs(here.x - 0.7), abs(here.y - 3.1)) <= 0.125
         assert here.p_los.item() == coverage.p_los.sel(x=here.x, y=here.y).item()
-        for x, y, message in (
-            (5.1, 3.0, r"x = 5.1 is not on the map: give a number of metres in -1 to 5 m"),
-            (0.0, np.nan, r"y = nan is not on the map: give a number of metres in 2 to 6 m"),
-            ("0", 3.0, r"x = '0' is not on the map"),
-        ):
-            with pytest.raises(PositionError, match=message):
-                coverage.radio.at(x, y)
+        with pytest.raises(PositionError, match=r"x = 5.1 is not on the map: give a number of metres in -1 to 5 m"):
+            coverage.radio.at(5.1, 3.0)
+        with pytest.raises(PositionError, match=r"y = nan is not on the map: give a number of metres in 2 to 6 m"):
+            coverage.radio.at(0.0, np.nan)
 
     def test_several_transmitters(self, several):
         above = several.radio.probability_above(-70.0)
         for tx in several["tx"]:
             assert np.array_equal(above.sel(tx=tx), several.sel(tx=tx).radio.probability_above(-70.0), equal_nan=True)
         assert several.radio.at(0.7, 3.1).p_los.sizes == {"tx": 2}
+        assert len(several.radio.plot().axes) > 3
         assert repr(several.radio) == "<coverage: 24 x 16 receivers, 0.25 m apart, 2 transmitters, 28 GHz>"
-
-    def test_plot_and_save(self, coverage, tmp_path):
-        assert len(coverage.radio.plot().axes) > 3
-        coverage.radio.save(tmp_path / "coverage.nc")
-        loaded = load_coverage(tmp_path / "coverage.nc")
-        assert loaded.identical(coverage)
-        assert loaded.radio.at(0.7, 3.1).identical(coverage.radio.at(0.7, 3.1))
 
     def test_values_that_are_assigned_later_count(self, coverage):
         before = coverage.radio.power(eirp_dbm=20.0)["power_mean_dbm"]
@@ -518,11 +427,6 @@ class TestAccessor:
         arguments = {"probability_above": [-90.0], "at": [0.0, 0.0], "rate": ["nr"], "area": [-67.0]}.get(call, [])
         with pytest.raises(SettingsError, match="coverage lacks "):
             getattr(other.radio, call)(*arguments)
-
-    @pytest.mark.parametrize("threshold", [np.nan, "low", True, -151.0])
-    def test_thresholds_are_refused(self, coverage, threshold):
-        with pytest.raises(SettingsError, match=r"threshold_db = .* is not allowed"):
-            coverage.radio.probability_above(threshold)
 
 
 @pytest.mark.parametrize("content", [None, b"", b"no NetCDF file", b"\x89HDF\r\n\x1a\n" + bytes(64)])
@@ -539,10 +443,7 @@ def test_other_files_are_not_loaded(tmp_path, content):
 
 def test_unnamed_transmitters_are_counted_from_one():
     partial, here, far = map_of(PICTURE), (0.6, 3.6, 1.5), (900.0, 1.0, 1.5)
-    names, tx_m = transmitter_positions(partial, [here, here])
-    assert (names, len(tx_m)) == (["tx1", "tx2"], 2)
+    assert transmitter_positions(partial, [here, here])[0] == ["tx1", "tx2"]
     for tx, name in (([here, far], "tx2"), ({"hall": here, "door": far}, "door")):
         with pytest.raises(PositionError, match=rf"^{name} = \(900\.0, .* is outside the map"):
             transmitter_positions(partial, tx)
-    with pytest.raises(PositionError, match=r"^tx2 = \(900\.0, .* is outside the map"):
-        trace_links(partial, [here, far], [(0.8, 3.6, 1.5)])

@@ -97,14 +97,6 @@ class TestValues:
         assert_same(here, expected, rtol=1e-6, atol=1e-9)
         assert_same(links(**{name: getattr(links.base, name) for name in PARAMETERS}), here, atol=1e-4)
 
-    def test_arguments_may_be_of_any_kind(self, links_of):
-        links = links_of("partial", "paper")
-        tx_m = TX_M + 0.01
-        kinds = (tx_m, tx_m.tolist(), tf.constant(tx_m), tf.Variable(tx_m), tf.constant(tx_m, tf.float64))
-        found = [links(tx_m=kind).gain_mean_db.numpy() for kind in kinds]
-        assert all(np.array_equal(one, found[0]) for one in found)
-        np.testing.assert_allclose(links(tx_m=tf.constant(tx_m, tf.float32)).gain_mean_db, found[0], atol=1e-4)
-
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     def test_moved_as_a_new_trace(self, predictor, links_of):
         """Nearer than where it was for all but one, as the networks have kinks, and much nearer for some."""
@@ -202,12 +194,6 @@ class TestSlopes:
                 (slope * along).sum() for slope, along in zip(slopes, along_gradient, strict=True)
             ) == pytest.approx(expected, rel=0.03)
 
-    def test_trace_of_a_complete_map_needs_no_weights(self, links_of):
-        links = links_of("complete")
-        with tf.GradientTape() as tape:
-            value = tf.reduce_sum(links().gain_mean_db)
-        assert set(tape.gradient(value, links._scene.weights)) == {None}
-
     @pytest.mark.parametrize("predictor", ["paper", "map"])
     def test_weights_are_those_that_answer(self, predictor):
         scene = scene_of("partial", predictor)
@@ -220,27 +206,15 @@ class TestSlopes:
         assert None not in tape.gradient(value, scene.weights)
 
 
-class TestSecondUse:
-    def test_map_from_a_file(self, tmp_path, links_of):
-        folder = sp.export_scene(MAPS["partial"], tmp_path / "scene")
-        scene = sp.DifferentiableScene(folder, predictor="paper", trace_settings=TRACE, scene_settings=SCENE)
-        assert len(scene.materials) == len(links_of("partial", "paper").base.thickness_m) == 1
-        assert_same(scene.links(TX_M, RX_M)(), links_of("partial", "paper")(), rtol=1e-6, atol=1e-9)
-
-
 class TestErrors:
     @pytest.mark.parametrize(
         ("name", "value", "remedy"),
         [
             ("tx_m", [1.0, 2.0], r"give a tensor of shape \(3,\)\."),
-            ("tx_m", [[1.0, 2.0, 3.0]], r"give a tensor of shape \(3,\)\."),
             ("tx_m", [1.0, float("nan"), 1.0], r"give numbers in \[-1e\+09, 1e\+09\]\."),
-            ("relative_permittivity", 2.0, r"give a tensor of shape \(1,\)\."),
             ("relative_permittivity", [0.9], r"give numbers in \[1, 1e\+06\]\."),
             ("conductivity_s_m", [-1.0], r"give numbers in \[0, 1e\+09\]\."),
-            ("thickness_m", [11.0], r"give numbers in \[0, 10\]\."),
             ("frequency_hz", [28e9], r"give a tensor of shape \(\)\."),
-            ("frequency_hz", 28.0, r"give numbers in \[1e\+06, 1e\+12\]\."),
         ],
     )
     def test_shape_and_range(self, name, value, remedy, links_of):
@@ -273,6 +247,7 @@ class TestErrors:
 
     def test_positions(self, links_of):
         scene = links_of("partial", "paper")._scene
+        assert len(scene.materials) == 1
         with pytest.raises(PositionError, match=r"tx has shape \(1, 3\): give one transmitter"):
             scene.links(TX_M[None], RX_M)
 
@@ -317,19 +292,16 @@ class TestMovedPaths:
         np.testing.assert_array_equal(paths.base.tx_m, before)
         np.testing.assert_allclose(tape.gradient(value, tx_m), paths.transmitter_slopes(paths.base)[0].sum(axis=0))
 
-    @pytest.mark.parametrize("at_once", [True, False])
-    def test_jacobian(self, paths, at_once):
+    def test_jacobian(self, paths):
         given = variables(paths, *PARAMETERS)
         with tf.GradientTape(persistent=True) as tape:
             power, vertices_m = moved_paths(paths, {name: tf.identity(each) for name, each in given.items()})
-        options = {"experimental_use_pfor": at_once}
-        found, slopes = tape.jacobian(power, given, **options), paths.slopes(paths.base)
+        found, slopes = tape.jacobian(power, given), paths.slopes(paths.base)
         for name, each in found.items():
             assert each.shape == (len(paths), *getattr(paths.base, name).shape)
             np.testing.assert_allclose(np.reshape(each, slopes[name].shape), slopes[name], rtol=1e-12)
-        if at_once:
-            of_vertices = tape.jacobian(vertices_m, given["tx_m"], **options)
-            np.testing.assert_allclose(of_vertices, paths.transmitter_slopes(paths.base)[1], rtol=1e-12)
+        of_vertices = tape.jacobian(vertices_m, given["tx_m"])
+        np.testing.assert_allclose(of_vertices, paths.transmitter_slopes(paths.base)[1], rtol=1e-12)
 
     def test_a_part_of_the_paths(self, paths):
         """TensorFlow hands back derivatives of single entries in another form."""
@@ -411,22 +383,14 @@ class TestMovedLengths:
         lengths = SmoothLengths(partial, CellState.UNKNOWN)
         start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
         smooth_m = lengths(start, end)
-        moved = tf.constant(end + np.array([0.25, 0.0, 0.0]))
-        grown_m = lengths(start, moved.numpy()) - smooth_m
-        assert grown_m > 0.2
-        for times, pace in ((0.5, 0.5), (2.0, 2.0), (3.9, 3.9), (4.1, STEEPEST), (100.0, STEEPEST)):
-            exact_m = times * smooth_m
-            found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
-            np.testing.assert_allclose(found_m, exact_m + pace * grown_m, rtol=1e-12)
-
-    def test_no_length_is_negative(self, partial):
-        lengths = SmoothLengths(partial, CellState.UNKNOWN)
-        start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
-        near = tf.constant(np.array([[1.5, 1.0, 1.5]]))
-        for times in (0.5, 1.0, 50.0):
-            exact_m = times * lengths(start, end)
-            found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), near))
-            assert found_m.numpy()[0] >= 0.0
+        for step_m in (0.25, -3.0):
+            moved = tf.constant(end + np.array([step_m, 0.0, 0.0]))
+            grown_m = lengths(start, moved.numpy()) - smooth_m
+            assert abs(grown_m) > 0.2
+            for times, pace in ((0.5, 0.5), (2.0, 2.0), (3.9, 3.9), (4.1, STEEPEST), (100.0, STEEPEST)):
+                exact_m = times * smooth_m
+                found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
+                np.testing.assert_allclose(found_m, np.maximum(exact_m + pace * grown_m, 0.0), rtol=1e-12)
 
     def test_complete_map_and_no_segments(self):
         complete = sp.PartialMap(np.pad(np.zeros((8, 8), dtype=np.uint8), 1, constant_values=1), 0.5)
@@ -464,34 +428,15 @@ class TestOfParts:
             assert values.dtype == tf.float64
             np.testing.assert_allclose(values.numpy(), getattr(expected, field.name), rtol=1e-12, err_msg=field.name)
 
-    def test_no_spread_has_no_slope(self):
-        """A square root has an infinite one at 0, which times 0 is NaN."""
-        certain, mean_db = tf.constant([[0.0], [1.0], [0.0]], tf.float64), tf.constant([[-80.0]] * 3, tf.float64)
-        with tf.GradientTape(persistent=True) as tape:
-            tape.watch(mean_db)
-            found = of(certain, mean_db, tf.zeros_like(mean_db))
-        assert found.gain_std_db.numpy().tolist() == [0.0]
-        assert tape.gradient(found.gain_std_db, mean_db).numpy().ravel().tolist() == [0.0, 0.0, 0.0]
-        assert tape.gradient(found.gain_mean_db, mean_db).numpy().ravel().tolist() == [0.0, 1.0, 0.0]
-
 
 class TestCoverage:
     @pytest.mark.parametrize("softness_db", [0.0, 3.0])
     def test_as_scipy(self, softness_db):
         parts = random_parts()
         found = of(*parts).coverage(THRESHOLD_DB, softness_db).numpy()
-        spread = np.hypot(parts[2], softness_db)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            fractions = stats.norm.sf(THRESHOLD_DB, parts[1], spread)
-        fractions = np.where(spread > 0.0, fractions, parts[1] > THRESHOLD_DB)
-        np.testing.assert_allclose(found, (parts[0][1:] * fractions[1:]).sum(axis=0), rtol=1e-10, atol=1e-14)
+        fractions = fractions_above(parts[1], np.hypot(parts[2], softness_db))
+        np.testing.assert_allclose(found, (parts[0][1:] * fractions).sum(axis=0), rtol=1e-10, atol=1e-14)
         assert ((found >= 0.0) & (found <= 1.0)).all()
-
-    def test_step_without_spread(self):
-        means_db = [[-150.0] * 3, [-99.0, -100.0, -101.0], [-150.0] * 3]
-        certain = of(np.repeat([[0.0], [1.0], [0.0]], 3, axis=1), means_db, np.zeros((3, 3)))
-        assert certain.coverage(THRESHOLD_DB).numpy().tolist() == [1.0, 0.0, 0.0]
-        np.testing.assert_allclose(certain.coverage(THRESHOLD_DB, 1.0), stats.norm.cdf([1.0, 0.0, -1.0]), rtol=1e-12)
 
     @pytest.mark.parametrize("softness_db", [0.0, 3.0])
     def test_slopes(self, softness_db):
@@ -509,11 +454,11 @@ class TestCoverage:
             density = np.where(spread > 0.0, stats.norm.pdf(THRESHOLD_DB, means_db, spread), 0.0)
         np.testing.assert_allclose(of_mean[1:], (probabilities * density)[1:], rtol=1e-9, atol=1e-15)
         assert not of_mean[0].any()
-        np.testing.assert_allclose(of_probability[1:] @ np.ones(200), of_fractions(means_db, spread), rtol=1e-9)
+        np.testing.assert_allclose(of_probability[1:], fractions_above(means_db, spread), rtol=1e-9)
 
 
-def of_fractions(means_db, spread):
-    """Return the sum over links of the probability of a gain above the threshold, given LOS and given NLOS."""
+def fractions_above(means_db, spread):
+    """Return the probability (2, N) of a gain above the threshold, given LOS and given NLOS."""
     with np.errstate(divide="ignore", invalid="ignore"):
         fractions = stats.norm.sf(THRESHOLD_DB, means_db, spread)
-    return np.where(spread > 0.0, fractions, means_db > THRESHOLD_DB)[1:].sum(axis=1)
+    return np.where(spread > 0.0, fractions, means_db > THRESHOLD_DB)[1:]

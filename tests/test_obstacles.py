@@ -65,6 +65,11 @@ class TestMap:
         with pytest.raises(MapError, match=r"height_m = .* is not allowed: give a number of metres"):
             hall().with_obstacle_height(height_m)  # type: ignore[arg-type]
 
+    def test_more_heights_than_a_byte_counts(self) -> None:
+        partial = replace(low(), obstacle_heights_m=tuple(0.1 + 0.001 * k for k in range(255)))
+        with pytest.raises(MapError, match="obstacle_heights_m has 256 entries: give at most 255"):
+            partial.with_obstacle_height(2.0)
+
 
 class TestFiles:
     @pytest.mark.parametrize("name", ["map.yaml", "map.npz", "scene"])

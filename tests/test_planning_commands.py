@@ -68,22 +68,20 @@ def test_calibrate(measured: Path, tmp_path: Path) -> None:
     assert f"wrote {out / 'calibrated.npz'}" in result.output
 
 
-def test_unusable_measurements_are_one_line(measured: Path, tmp_path: Path) -> None:
-    (tmp_path / "bad.csv").write_text(f"{HEADER}\n1,1,1.5,3,3,1.5,loud\n")
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        (["1,1,1.5,3,3,1.5,loud"], "line 2: gain_db = 'loud' is not a number: correct the line"),
+        (["1,1,1.5,3,3,1.5,-70", "1,1,1.5,3,2,1.5,-70"], "has 2 usable links of 2, fewer than 10"),
+    ],
+)
+def test_unusable_measurements_are_one_line(rows: list[str], message: str, measured: Path, tmp_path: Path) -> None:
+    (tmp_path / "bad.csv").write_text("\n".join([HEADER, *rows, ""]))
     result = run("calibrate", measured / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
     assert result.exit_code == 2
-    assert "error: measurements = " in result.output
-    assert "line 2: gain_db = 'loud' is not a number: correct the line" in result.output
-    assert not (tmp_path / "out").exists()
-
-
-def test_too_few_measurements(measured: Path, tmp_path: Path) -> None:
-    few = (measured / "measured.csv").read_text().splitlines()[:6]
-    (tmp_path / "few.csv").write_text("\n".join(few) + "\n")
-    result = run("calibrate", measured / "room.yaml", "--measurements", tmp_path / "few.csv", "--out", tmp_path / "out")
-    assert result.exit_code == 2
-    assert "has 5 usable links of 5, fewer than 10" in result.output
+    assert message in result.output
     assert "Traceback" not in result.output
+    assert not (tmp_path / "out").exists()
 
 
 def test_options_arrive(measured: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -124,21 +122,8 @@ def test_worst_tenth(map_path: Path, tmp_path: Path) -> None:
     assert "\nthe worst tenth of the receivers is predicted at " in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["--threshold", 3], "error: threshold_db = 3.0 is not allowed: give a number in (-150, 0]."),
-        (["--height", 9], "error: tx_height_m = 9.0 is not allowed: give a number in (0, 3]."),
-    ],
-)
-def test_errors_are_one_line(options: list[object], message: str, map_path: Path, tmp_path: Path) -> None:
-    result = run("place", map_path, "--out", tmp_path / "place", *options)
+def test_errors_are_one_line(map_path: Path, tmp_path: Path) -> None:
+    result = run("place", map_path, "--out", tmp_path / "place", "--threshold", 3)
     assert result.exit_code == 2
-    assert result.stderr.splitlines()[-1] == message
+    assert result.stderr.splitlines()[-1] == "error: threshold_db = 3.0 is not allowed: give a number in (-150, 0]."
     assert not (tmp_path / "place").exists()
-
-
-def test_unknown_objective(map_path: Path, tmp_path: Path) -> None:
-    result = run("place", map_path, "--out", tmp_path / "place", "--objective", "best")
-    assert result.exit_code == 2
-    assert "'best' is not one of 'coverage', 'percentile'" in result.stderr

@@ -66,20 +66,8 @@ class TestPlotPlacement:
         assert "worst tenth at" in figure.axes[0].get_title()
         assert figure.axes[1].get_ylabel() == "mean path gain [dB]"
 
-    def test_all_of_it_is_in_the_picture(self, placement: TransmitterPlacement, figure: Figure) -> None:
-        axis = figure.axes[0]
-        (x0, x1), (y0, y1) = axis.get_xlim(), axis.get_ylim()
-        for x, y, _ in (*placement.starts_m, *placement.trajectory_m):
-            assert x0 < x < x1
-            assert y0 < y < y1
-
     def test_equal_placements_are_equal_pictures(self, placement: TransmitterPlacement, figure: Figure) -> None:
         assert figure_png(figure) == figure_png(plot_placement(placement))
-
-    def test_something_else(self) -> None:
-        message = "placement = 'dict' is not allowed: give what place_transmitter returned"
-        with pytest.raises(SettingsError, match=message):
-            plot_placement({})  # type: ignore[arg-type]
 
 
 CONCRETE, BRICK = sp.Material(5.24, 0.6), sp.Material(3.9, 0.04)
@@ -139,12 +127,9 @@ def test_a_picture_for_each_material() -> None:
     assert [axis.get_title() for axis in figure.axes] == ["Search", "Links", "Material 0", "Material 1"]
 
 
-@pytest.mark.parametrize(
-    ("undetermined", "note"),
-    [((), ""), (("permittivity", "conductivity"), "; the measurements cannot determine permittivity, conductivity")],
-)
-def test_title_says_what_is_not_known(undetermined: tuple[str, ...], note: str) -> None:
-    title = plot_calibration(calibrated(undetermined=undetermined)).get_suptitle()
+def test_title_says_what_is_not_known() -> None:
+    title = plot_calibration(calibrated(undetermined=("permittivity", "conductivity"))).get_suptitle()
+    note = "; the measurements cannot determine permittivity, conductivity"
     assert title == f"Material from 18 of 20 measured links, noise 2.9 dB{note}"
 
 
@@ -173,14 +158,14 @@ class TestPlotStages:
                 expected = [[row.stage, getattr(row.metrics, name)] for row in rows]
                 np.testing.assert_array_equal(lines[answer].get_xydata(), expected)
 
-    def test_of_training_homes_only_the_predictor(self, evaluation, stages):
-        labels = [line.get_label() for line in stages.axes[0].get_lines()]
-        assert [label for label in labels if "training" in label] == ["predictor, training homes"]
-        assert len(labels) == len({row.model for row in evaluation.select(receivers="indoor")}) + 1
-
-    def test_every_line_has_a_colour_of_its_own(self, stages):
-        lines = stages.axes[0].get_lines()
-        assert len({line.get_color() for line in lines if "training" not in line.get_label()}) == len(lines) - 1
+    def test_lines_of_test_homes_and_of_the_predictor_on_training_homes(self, evaluation, stages):
+        lines = {line.get_label(): line.get_color() for line in stages.axes[0].get_lines()}
+        assert [label for label in lines if "training" in label] == ["predictor, training homes"]
+        assert (
+            len({*lines.values()})
+            == len(lines) - 1
+            == len({row.model for row in evaluation.select(receivers="indoor")})
+        )
 
     def test_nothing_to_draw(self, evaluation):
         rows = tuple(row for row in evaluation.rows if row.receivers == "anywhere")
@@ -197,6 +182,21 @@ def calibration(error=0.0, links=100):
 
 
 class TestPlotReliability:
+    @pytest.mark.parametrize(
+        ("plot", "message"),
+        [
+            (plot_placement, "placement = 'dict' is not allowed: give what place_transmitter returned"),
+            (sp.plot_network_placement, "place_transmitters"),
+            (plot_calibration, "calibration = 'dict'"),
+            (sp.plot_exploration, "exploration = 'dict' is not allowed: give what explore_trajectory"),
+            (sp.plot_next_views, "views = 'dict'"),
+            (plot_reliability, re.escape("stages = {} is not allowed: give at least one")),
+        ],
+    )
+    def test_other_values_are_refused(self, plot, message):
+        with pytest.raises(SettingsError, match=message):
+            plot({})
+
     def test_a_column_for_each_stage(self):
         figure = plot_reliability({0: calibration(), 50: calibration(0.1), 200: calibration(0.2)})
         titles = [axis.get_title() for axis in figure.axes if axis.get_title()]
@@ -210,11 +210,3 @@ class TestPlotReliability:
         (bars,) = below.patches
         np.testing.assert_allclose(bars.get_data().values, np.linspace(0.5, 1.5, PIT_BINS))
         assert bars.get_data().edges[[0, -1]].tolist() == [0.0, 1.0]
-
-    def test_no_disc_without_links(self):
-        above = plot_reliability({0: calibration(links=0)}).axes[0]
-        assert len(above.collections[0].get_offsets()) == 0
-
-    def test_nothing_to_draw(self):
-        with pytest.raises(SettingsError, match=re.escape("stages = {} is not allowed: give at least one")):
-            plot_reliability({})

@@ -20,7 +20,6 @@ OFFSET_DB = -35.0
 
 
 def flat() -> sp.PartialMap:
-    """Return four rooms in a row, complete, with a door in none of their walls."""
     cells = np.zeros((34, 98), dtype=np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, 24, 25, 48, 49, 72, 73, -2, -1]] = sp.CellState.WALL
     return sp.PartialMap(cells, resolution_m=0.1)

@@ -1,4 +1,4 @@
-"""Files of a window: uploaded maps, whose names are not trusted, and downloads of an answer."""
+"""Uploaded maps, whose names are not trusted, and downloads."""
 
 import re
 import tempfile
@@ -28,7 +28,7 @@ from sionna_partial.maps.ros_map import read_ros_map
 from sionna_partial.plots.coverage_plot import report_pdf
 
 MOST_BYTES = 200_000_000
-"""Size of the files that are uploaded together [bytes]."""
+"""Largest upload [bytes]."""
 
 _IMAGES, _SHEETS = (".pgm", *PICTURE_SUFFIXES), (".yaml", ".yml")
 
@@ -36,11 +36,9 @@ MAP_SUFFIXES = (
     *(*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES),
     *VACUUM_SUFFIXES,
 )
-"""Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
+"""Suffixes of maps; a ROS map comes with its image, or as a zip of both."""
 
 UPLOADED_SUFFIXES = (*MAP_SUFFIXES, *_IMAGES, ".zip")
-"""Files that can be uploaded for a map."""
-
 
 FILES = {
     "png": "coverage.png",
@@ -51,29 +49,20 @@ FILES = {
     "pdf": "report.pdf",
     "project": "project.zip",
 }
-"""Kinds of files that can be downloaded, and their names."""
+"""Downloads: kind and file name."""
 
 
 def uploaded_map(files: Sequence[tuple[str, bytes]]) -> PartialMap:
-    """Read a map of files (name, content); warnings of its reader are logged.
-
-    Raises
-    ------
-    MapError
-        If it cannot be read.
-    """
+    """Read a map from files (name, content), or raise a MapError; the reader's warnings are logged."""
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
         path = stored_map(files, Path(folder))
         return read_ros_map(path, confined=True) if path.suffix in _SHEETS else load_map(path)
 
 
 def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
-    """Write an uploaded map, or a picture, under names of ours: of the names of its files only the suffixes count.
+    """Write an uploaded map or picture under our own file names; only the suffixes are kept.
 
-    Raises
-    ------
-    MapError
-        For other files than a map of `MAP_SUFFIXES`, or more than `MOST_BYTES`.
+    Other files than one map of `MAP_SUFFIXES`, or more than `MOST_BYTES` unzipped, raise a MapError.
     """
     if len(files) == 1 and PurePath(files[0][0]).suffix.lower() == ".zip":
         files = _unzipped(files[0][1])
@@ -97,7 +86,6 @@ def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
 
 
 def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
-    """Return the files of a zip, which may not unpack to more than `MOST_BYTES`."""
     try:
         return [*unzipped(content, MOST_BYTES).items()]
     except ValueError as error:
@@ -112,10 +100,7 @@ def coverage_file(
     threshold_dbm: float,
     heading: Sequence[str] = (),
 ) -> bytes:
-    """Return a file of one of `FILES` of a coverage; a ROS map is a zip, of several transmitters of their network.
-
-    `heading` is for the report.
-    """
+    """Return the content of one of `FILES`; a ROS map is a zip. `heading` is for the report."""
     if kind == "pdf":
         return report_pdf(coverage, eirp_dbm, threshold_dbm, heading)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:

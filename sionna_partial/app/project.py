@@ -1,4 +1,4 @@
-"""Projects: map, transmitters, settings and measurements of a window in one file; what is read is not trusted."""
+"""Projects: map, transmitters, settings and measurements of a window in one file, which is not trusted."""
 
 import json
 import tempfile
@@ -23,7 +23,7 @@ _ARRAYS = ("tx", "rx", "gain_db", "std_db")
 
 @dataclass(frozen=True)
 class Project:
-    """State of a window; a map alone has neither transmitters nor settings."""
+    """State of a window."""
 
     partial: PartialMap
     title: str
@@ -33,7 +33,7 @@ class Project:
 
 
 def project_file(project: Project) -> bytes:
-    """Return a project as a zip of an `.npz` map and a JSON."""
+    """Return a zip of an `.npz` map and a JSON."""
     measured = project.measured
     record = {
         "version": _VERSION,
@@ -48,12 +48,9 @@ def project_file(project: Project) -> bytes:
 
 
 def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
-    """Read a project of uploaded files (name, content); None if they are something else.
+    """Read a project from uploaded files (name, content); None for other files.
 
-    Raises
-    ------
-    SionnaPartialError
-        If it was not saved by the app, or has values that are not allowed.
+    A damaged project, or values out of range, raise a SionnaPartialError.
     """
     if len(files) != 1 or PurePath(files[0][0]).suffix.lower() != ".zip":
         return None
@@ -94,3 +91,26 @@ def _measured_record(measured: Measurements) -> dict[str, Any]:
     arrays = {name: getattr(measured, name) for name in _ARRAYS}
     listed = {name: None if values is None else values.tolist() for name, values in arrays.items()}
     return {**listed, "sensitivity_db": measured.sensitivity_db}
+
+
+def script(project: Project, python_map: Sequence[str]) -> str:
+    """Return the Python lines that compute the coverage of a project, whose map some lines read."""
+    settings, transmitters = project.settings or RadioSettings(), project.transmitters.values()
+    powers, antennas = [each.eirp_dbm for each in transmitters], [each.antenna for each in transmitters]
+    trace = [f"frequency_hz={settings.frequency_hz!r}"]
+    trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
+    given = [f"rx_height_m={settings.rx_height_m!r}", f"spacing_m={settings.spacing_m!r}"]
+    given += [f"trace_settings=sp.TraceSettings({', '.join(trace)})"]
+    given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
+    given += ['measurements="measured.csv"'] if project.measured is not None else []
+    if any(each != Antenna() for each in antennas):
+        given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
+    tx_m = {name: each.position_m for name, each in project.transmitters.items()}
+    lines = [
+        *("import sionna_partial as sp", "", *python_map, f"tx = {tx_m!r}"),
+        *("coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"),
+        f"power = coverage.radio.power(eirp_dbm={powers!r})",
+        f"area = coverage.radio.area({settings.threshold_dbm!r}, eirp_dbm={powers!r})",
+        'coverage.radio.save("coverage.nc")',
+    ]
+    return "\n".join(lines) + "\n"

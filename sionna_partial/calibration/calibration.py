@@ -1,4 +1,4 @@
-"""Materials from measured gains, with their uncertainty: map + measurements -> MaterialCalibration."""
+"""Calibration of materials: map + measured gains -> materials with uncertainty."""
 
 from __future__ import annotations
 
@@ -41,77 +41,74 @@ from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, nearest_m, simulation_of
 
 DETERMINED = 0.35
-"""Largest standard deviation of a parameter that counts as determined, as a fraction of its prior."""
+"""Largest standard deviation of a determined parameter, as a fraction of its prior."""
 
 _log = logging.getLogger(__name__)
 
 
 LEAST_OFFSET_DB, FEWEST_DIRECT = 6.0, 3
-"""Median error of links in line of sight that no material explains [dB], and number of them that show it."""
+"""Median error of LOS links that no material explains [dB], and number of links that show it."""
 
 _NUMBERS = (
     *("permittivity", "permittivity_std", "conductivity_s_m", "conductivity_std_s_m", "loss", "noise_db", "offset_db"),
 )
 
 FEWEST_LINKS = 10
-"""Smallest number of usable measured links."""
 
 OBSERVED_FRACTION = 0.5
-"""Smallest fraction of a link's power on paths that run wholly through observed space, for a link that is used."""
+"""Smallest fraction of a used link's power on paths through observed space."""
 
 OUTAGE = "measured outage"
-"""Reason why a link is left out before anything is traced."""
+"""Reason for omitting a link before the trace."""
 
 _NO_MATERIAL = "that shows a material: measure links that walls reflect, and trace with max_depth of 1 or more."
 
 _REFLECTING = Material(10.0, 1.0)
-"""Material with which paths are found: everything reflects well, so that none is missing for a better material."""
+"""Material of the trace that finds paths: everything reflects well, so that no path is missing for a better material.
+"""
 
 
 @read_only
 @dataclass(frozen=True, eq=False)
 class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
-    """Materials that explain measured gains, and their uncertainty.
+    """Materials fitted to measured gains, and their uncertainty.
 
-    The parameters of a scene of one material are numbers. On a map with M materials they are arrays (M,): the material
-    of floor, ceiling and all other walls, and `scene.wall_materials`, or `scene.mesh.materials`, without unused ones.
+    Parameters of a single material are numbers, otherwise arrays (M,): the material of floor, ceiling and all other
+    walls, then `scene.wall_materials`; or `scene.mesh.materials`, without unused ones.
 
     Parameters
     ----------
     permittivity, conductivity_s_m : float or (M,) float64 array
-        Real relative permittivity, and conductivity [S/m]. They do not depend on the frequency.
+        Real relative permittivity, and conductivity [S/m], constant over frequency.
     permittivity_std, conductivity_std_s_m : float or (M,) float64 array
-        Their standard deviations about these values, given the measurements.
+        Posterior standard deviations.
     undetermined : tuple of str
-        Parameters that the measurements hardly determine: "permittivity", "conductivity", or
-        "conductivity[2]" of a mesh.
+        Parameters that the measurements hardly determine: "permittivity", or "conductivity[2]" of a mesh.
     loss : (K,) float64 array
-        Negative logarithm of the posterior density for each link, at the start and after each step.
+        Negative logarithm of the posterior density per link, at the start and after each step.
     noise_db : float
-        Standard deviation of the measurements' noise [dB], as found.
+        Estimated standard deviation of the noise [dB].
     offset_db : float
-        Offset of the measured gains of links in line of sight [dB], if it is too large to come from the material. It
-        comes from transmit power and antennas, and is subtracted from all gains. Otherwise 0.
+        Offset of measured LOS gains [dB], subtracted from all gains; 0 unless it is too large for any material.
     used : (N,) bool array
-        Mask of the measured links that were used.
+        Mask of the used links.
     left_out : dict of str to int
-        Number of links that were left out, by reason.
+        Number of omitted links by reason.
     gain_db, gain_before_db, gain_after_db : (N,) float64 arrays
-        Gain of the measured links: as measured, less the offset, and as traced with the start's and with the
-        calibrated materials [dB].
+        Measured gain less the offset, and traced gain with the initial and the calibrated materials [dB].
     start, materials : tuple of M Material
-        Materials at the start and at the end of the search.
+        Initial and calibrated materials.
     posteriors : tuple of M Posterior
-        Distribution of each material, given the measurements: arrays `permittivity`, `conductivity_s_m` [S/m] and
-        `weight` (K,), which sums to 1.
+        Posterior of each material: arrays (K,) `permittivity`, `conductivity_s_m` [S/m] and `weight`, which sums to 1.
     scene : PartialMap
         The map with the calibrated materials, for `predict_map`.
     trace_settings : TraceSettings
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -142,7 +139,7 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
     def reflection_loss_db(
         self, angle_deg: ArrayLike, polarisation: Polarisation = "te", *, which: int = 0
     ) -> tuple[Floats, Floats]:
-        """Return the loss of a reflection off the calibrated material, and its standard deviation.
+        """Return the loss of a reflection at the calibrated material, and its standard deviation.
 
         Parameters
         ----------
@@ -151,7 +148,7 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
         polarisation : {"te", "tm"}
             "te" applies to vertical antennas at walls.
         which : int
-            The material.
+            Number of the material.
 
         Returns
         -------
@@ -195,35 +192,33 @@ def calibrate_materials(
     seed: int | None = None,
     progress: Progress | bool | None = None,
 ) -> MaterialCalibration:
-    """Find the permittivity and the conductivity of walls, floor and ceiling from measured path gains.
+    """Estimate permittivity and conductivity of walls, floor and ceiling from measured path gains.
 
-    Paths are traced once, and Sionna RT evaluates the sum of their powers for any material. The whole plane of
-    permittivity and conductivity is searched, so that the result does not depend on the start; then Newton's method
-    follows the derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their
-    posterior mean: where the measurements determine little, the most probable material would follow the noise. The
+    Paths are traced once; Sionna RT evaluates their power for any material. The whole plane of permittivity and
+    conductivity is searched, so that the result does not depend on the start, and refined by Newton's method with
+    derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their posterior mean. The
     thickness is fixed.
 
-    Repeated measurements of a link, both ends in the same cubes of 1 cm, are averaged. Links of a partial map are used
-    where the line of sight, or half of the power without one, runs through observed space. Outages contain no
-    information on the material. The likelihood, the prior and their limits are explained in `docs/calibration.md`.
+    Repeated measurements (both ends in the same cubes of 1 cm) are averaged. Links of a partial map are used if the
+    line of sight, or half of the NLOS power, is in observed space; outages are not used. `docs/calibration.md` explains
+    likelihood, prior and limits.
 
-    Predictions from measurements (`predict_map`) do not need it below 24 GHz: they average over materials by their
-    evidence, which suits tens of powers with an unknown offset. Calibrate from a hundred or more path gains, where
-    reflections are to be right, or channels and gradients are wanted, which have one material.
+    `predict_map` with measurements does not need a calibration below 24 GHz, as it averages over materials. Calibrate
+    with a hundred or more path gains if reflections matter, or for channels and gradients.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        Map of the building, complete or partial.
+        Map of the building.
     measurements : Measurements, mapping, data frame, Dataset or path of a CSV
-        With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB] (see `measurements_of`).
+        `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB] (see `measurements_of`).
     start : Material, optional
-        Start of the search; its thickness is kept. By default the material of the scene.
+        Initial material, also its thickness; by default the material of the scene.
     trace_settings : TraceSettings, optional
-        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls.
+        Without diffuse reflection, and on meshes without diffraction.
     scene_settings : SceneSettings, optional
     seed : int, optional
-        Seed of the rays that find the paths of a mesh, in place of that in `trace_settings`. Nothing else is drawn.
+        Seed of the rays on meshes, replaces the one in `trace_settings`.
     progress : bool or callable, optional
         As in `predict_map`.
 
@@ -234,19 +229,19 @@ def calibrate_materials(
     Raises
     ------
     MeasurementError
-        For measurements that are damaged, of which too few are usable on this map, in which nothing is reflected, or
-        of more than 3,000 links.
+        For damaged measurements, too few usable links, no reflections, or more than 3,000 links.
     PositionError
         For a position outside the map, inside a wall, or not between floor and ceiling.
     SettingsError
-        For a frequency that a material does not cover, settings of another kind, or paths that only rays find.
+        For a frequency that a material does not cover, or paths that only rays find.
     BackendError
         If LLVM or Sionna RT cannot be used.
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -314,7 +309,7 @@ def calibrate_materials(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Steps to the most probable materials, the materials taken, and their posteriors; deviations are (2, M)."""
+    """Steps to the most probable materials, the chosen materials, and their posteriors; deviations are (2, M)."""
 
     steps: list[Point]
     point: Point
@@ -323,7 +318,7 @@ class _Fit:
 
 
 def _has_offset(target: MaterialTarget, start: Sequence[Material]) -> bool:
-    """Return whether links in line of sight are off by more than reflections can change their gains."""
+    """Return whether LOS links are off by more than reflections can change their gains."""
     if target.is_direct.sum() < FEWEST_DIRECT:
         message = "%d links in line of sight do not show an offset of all measured gains: calibrate with path gains"
         _log.warning(message, target.is_direct.sum())
@@ -333,7 +328,7 @@ def _has_offset(target: MaterialTarget, start: Sequence[Material]) -> bool:
 
 
 def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float, report: Progress) -> _Fit:
-    """Search the plane of each material, then follow the slopes from the best fringes."""
+    """Search the plane of each material, then descend from the best fringes."""
     values = [[max(each.relative_permittivity, 1.001), max(each.conductivity_s_m, 1e-6)] for each in start]
     begin = target.at(np.transpose(values))
     rounds = [*range(len(start))] * (1 if len(start) == 1 else 2)
@@ -354,8 +349,7 @@ def _fit(target: MaterialTarget, start: Sequence[Material], frequency_hz: float,
 def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats) -> Floats:
     """Return the standard deviations (2, M) of permittivities and conductivities.
 
-    A posterior is of one material while the others stay as they are. Where there are others, the curvature of all
-    together gives a lower bound.
+    A posterior is of one material with the others fixed; the joint curvature gives a lower bound.
     """
     own = np.stack(
         [
@@ -371,7 +365,6 @@ def _deviations(point: Point, posteriors: Sequence[Posterior], curvature: Floats
 
 
 def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
-    """Parameters that the measurements hardly determine, and a message for each."""
     prior, undetermined = prior_posterior(), {}
     for which, (posterior, material) in enumerate(zip(fit.posteriors, start, strict=True)):
         offsets = {"permittivity": 0.0, "conductivity": 0.1 * lossless_scale_s_m(2.0, material.thickness_m)}
@@ -390,7 +383,7 @@ def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
 
 @dataclass(frozen=True)
 class MeasuredBuilding:
-    """A map, and the custom materials by the names that they have in its scene."""
+    """A map, and its custom materials by their names in the scene."""
 
     partial: PartialMap
     start: dict[str, Material]
@@ -403,9 +396,9 @@ class MeasuredBuilding:
     def paths(
         self, measured: Measurements, trace_settings: TraceSettings, scene_settings: SceneSettings, report: Progress
     ) -> LinkPaths:
-        """Find the paths of the measured links, and keep those that may have some power.
+        """Find the paths of the measured links that may have relevant power.
 
-        They are traced from those ends of which there are fewer. Sionna RT's diffraction is not reciprocal.
+        The ends that are fewer transmit, except with diffraction, which is not reciprocal in Sionna RT.
         """
         traced = [*self.start.values()]  # what reflects all lets nothing through
         if not trace_settings.through_walls:
@@ -438,7 +431,7 @@ class MeasuredBuilding:
 
 
 def require_positions(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
-    """Check that radios can stand at the measured positions, and that there are enough."""
+    """Check that radios can be at the measured positions, and that there are enough."""
     partial.require_positions("tx", measured.tx, least=0)
     partial.require_positions("rx", measured.rx, least=0)
     distance_m, limit_m = np.linalg.norm(measured.tx - measured.rx, axis=1), nearest_m(frequency_hz)
@@ -454,7 +447,7 @@ def require_positions(partial: PartialMap, measured: Measurements, frequency_hz:
 def start_materials(
     partial: PartialMap, start: Material | None, scene_settings: SceneSettings, frequency_hz: float
 ) -> dict[str, Material]:
-    """Return the materials of a scene by their names there, with constants in place of formulas."""
+    """Return the materials of a scene by their names there, with constants instead of formulas."""
     materials = partial.environment.scene_materials(scene_settings.traced_material)
     materials = {name: start or each for name, each in materials.items()}
     for material in materials.values():
@@ -463,7 +456,7 @@ def start_materials(
 
 
 def custom_material(material: Material, frequency_hz: float) -> Material:
-    """Put constants in place of formulas."""
+    """Return a material with constants instead of formulas."""
     permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     return Material(float(permittivity), float(conductivity_s_m), material.thickness_m)
 
@@ -471,7 +464,7 @@ def custom_material(material: Material, frequency_hz: float) -> Material:
 def usable_links(
     partial: PartialMap, paths: LinkPaths, measured: Measurements, repeats: NDArray[np.int64]
 ) -> tuple[Bools, dict[str, int]]:
-    """Find the links (N,) from which materials can be determined, and count the other measurements by reason."""
+    """Return which links (N,) determine materials, and count the others by reason."""
     count, ones = len(measured), np.ones(len(paths.columns))
     power = paths.power(4.0 * ones, 0.1 * ones)
     found = paths.paths

@@ -1,11 +1,11 @@
-"""The posterior distribution of materials, given measured gains: errors of gains, prior, descent and search.
+"""Posterior of materials, given measured gains: errors of gains, prior, search and descent.
 
-Most links are off by the noise of the measurement alone, which is normal [dB]. Some without line of sight are stronger,
-because of paths that the map does not show, and some weaker, because of obstacles: an exponential is added there.
+Most links deviate by normal noise [dB]. Links without line of sight may be stronger, because of paths that the map does
+not show, or weaker, because of obstacles: an exponential is added.
 
-Slabs of little loss interfere with themselves: over the refractive index, the loss of a reflection has fringes, half a
-wavelength over the thickness apart. So the plane of index and conductivity is searched as a whole, on cells finer than
-the fringes, before anything follows a slope. Cells that matter are divided until one can integrate over them.
+Slabs of low loss interfere with themselves: over the refractive index, the loss of a reflection has fringes of half a
+wavelength over the thickness. The plane of index and conductivity is therefore searched on cells finer than the fringes
+before a descent; relevant cells are divided for integration.
 """
 
 import itertools
@@ -25,28 +25,29 @@ from sionna_partial.tracing.power import VACUUM_F_M, reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
 MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)
-"""Values of the parameters of GainErrors among which the most probable are chosen."""
+"""Candidates for the parameters of GainErrors."""
 
 MISSED_DB, BLOCKED_DB = 8.0, 12.0
-"""Mean of how much stronger links with missed paths are, and how much weaker links with blocked paths [dB]."""
+"""Mean excess of links with missed paths, and mean loss of links with blocked paths [dB]."""
 
 STRAY_FRACTION = 0.01
-"""Fraction of links with a line of sight that are off either way, and smallest fraction of the others."""
+"""Fraction of LOS links that deviate either way, and smallest fraction of the others."""
 
 EXPECTED_NOISE_DB, NOISE_SPREAD, MEAN_FRACTION = 3.0, 0.7, 0.5
 """Prior: median of the noise [dB], standard deviation of its logarithm, and mean of the fractions."""
 
 LOSSLESS = np.array([[1.0], [0.0]])
-"""Relative permittivity and conductivity [S/m] of the vacuum; what exceeds them is positive and has a logarithm."""
+"""Relative permittivity and conductivity [S/m] of the vacuum; the excess of a material is positive and has a logarithm.
+"""
 
 INCOMPLETE_WEIGHT = 0.35
-"""Power of the likelihood on maps that are not complete. Paths that such a map misses have errors in common, which make
-links contain less than if each was independent; with this weight 90 % intervals cover on procedural homes."""
+"""Power of the likelihood on incomplete maps, where the errors of links are correlated; 90 % intervals then cover on
+procedural homes."""
 
 PRIOR_MEDIAN, PRIOR_SPREAD = np.array([[2.5], [0.15]]), np.array([[0.9], [1.8]])
-"""Prior: median of permittivity less 1 and of conductivity [S/m], and standard deviation of their logarithms. 95 % of
-materials are between 1.4 and 16, and 0.004 and 5 S/m. The building materials of ITU-R P.2040-3 at 28 GHz are between
-1.5 and 7.1, and 0.04 and 0.63 S/m."""
+"""Prior: median of permittivity less 1 and of conductivity [S/m], and standard deviation of their logarithms: 95 %
+between 1.4 and 16, and 0.004 and 5 S/m (building materials of ITU-R P.2040-3 at 28 GHz: 1.5 to 7.1, and 0.04 to 0.63
+S/m)."""
 
 IMPEDANCE_OHM = 376.73
 """Impedance of the vacuum."""
@@ -55,40 +56,39 @@ LOWEST_GAIN_DB = -300.0
 """Predicted gain of a link whose paths all vanish [dB]."""
 
 TYPICAL_DEG, TYPICAL_LOSS_DB = np.arange(0.0, 80.0, 2.5), 30.0
-"""Angles of incidence at which reflections are compared [degrees], and the largest loss that counts [dB]."""
+"""Angles of incidence at which reflections are compared [degrees], and the largest relevant loss [dB]."""
 
 INDEX_RANGE, FINE_INDEX = (1.01, 6.0), 3.4
-"""Refractive indices that are searched, and the one up to which fringes are resolved."""
+"""Range of searched refractive indices, and the index up to which fringes are resolved."""
 
 FRINGE_CELLS, FINEST_FRINGE_CELLS, COARSE_CELLS = 14, 60, 29
-"""Number of cells to a fringe when the search begins, and where it ends; number of cells where there are no fringes."""
+"""Cells per fringe at the begin and end of the search; cells where there are no fringes."""
 
 SPLIT_FRACTION, HEAVY_FRACTION, MOST_CELLS = 0.004, 0.02, 600
-"""Fraction of the posterior above which a cell is divided until it is small, and above which it is divided in any case;
-number of cells that division may add."""
+"""Fraction of the posterior above which a cell is divided until it is small, and in any case; number of added cells."""
 
 MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
-"""Number of fringes whose minima are searched, of steps to each, and of fringes that are followed to the end."""
+"""Number of fringes with a search for minima, of steps in each, and of fringes that are descended to the end."""
 
 CELLS_A_REPORT = 64
-"""Number of cells after which progress is reported."""
+"""Number of cells between reports of progress."""
 
 KEPT_FRACTION = 0.96
-"""Fraction of the power of each link that the kept paths have, for each of `EXTREMES`."""
+"""Fraction of the power of each link that the kept paths have, for all `EXTREMES`."""
 
 EXTREMES = tuple((permittivity, loss) for permittivity in (1.2, 3.0, 8.0, 30.0) for loss in (0.0, 0.03, 3.0))
-"""Materials between which any other lies: relative permittivity, and its imaginary part."""
+"""Extreme materials: relative permittivity, and its imaginary part."""
 
 
 @dataclass(frozen=True, eq=False)
 class LinkPaths:
-    """P paths of N measured links, as functions of the materials that are sought.
+    """P paths of N measured links, as functions of unknown materials.
 
     Parameters
     ----------
     paths : PathSet
     columns : (M,) int array
-        Materials of the scene that are sought.
+        Unknown materials of the scene.
     link : (P,) int64 array
         Link of each path.
     """
@@ -103,22 +103,22 @@ class LinkPaths:
         return self.paths.is_direct
 
     def of_links(self, chosen: Bools) -> "LinkPaths":
-        """Return the paths of the links of a mask (N,), which are counted anew."""
+        """Return the paths of the links in a mask (N,), renumbered."""
         kept = chosen[self.link]
         return LinkPaths(self.paths.kept(kept), self.columns, (np.cumsum(chosen) - 1)[self.link[kept]])
 
     def power(self, permittivity: Floats, conductivity_s_m: Floats) -> Floats:
-        """Evaluate |a|^2 of each path (P,) for M relative permittivities and conductivities [S/m]."""
+        """Return |a|^2 of each path (P,) for M relative permittivities and conductivities [S/m]."""
         return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
 
     def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
-        """Evaluate |a|^2 of each path (P,), and differentiate it (P, 2 M): by permittivities, then conductivities."""
+        """Return |a|^2 of each path (P,), and its derivatives (P, 2 M) by permittivities, then conductivities."""
         parameters = self._parameters(permittivity, conductivity_s_m)
         slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
         return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
 
     def strong(self) -> Bools:
-        """Find the paths (P,) that have `KEPT_FRACTION` of the power of their link for some of `EXTREMES`."""
+        """Return which paths (P,) have `KEPT_FRACTION` of the power of their link for some of `EXTREMES`."""
         strong, ones = np.zeros(len(self.link), dtype=bool), np.ones(len(self.columns))
         scale_s_m = 2.0 * np.pi * float(self.paths.base.frequency_hz) * VACUUM_F_M
         for permittivity, loss in EXTREMES:
@@ -134,13 +134,12 @@ class LinkPaths:
 
 
 def link_gains_db(power: Floats, link: NDArray[np.int64], links: int) -> Floats:
-    """Gain of N links [dB] from the power of their paths (P,); -inf where there is none."""
+    """Return the gain of N links [dB] from the power of their paths (P,); -inf without paths."""
     with np.errstate(divide="ignore"):
         return 10.0 * np.log10(np.bincount(link, weights=power, minlength=links))
 
 
 def _strongest(link: NDArray[np.int64], power: Floats, fraction: float) -> Bools:
-    """Find the strongest paths (P,) of each link that have a fraction of its power together."""
     order = np.lexsort((-power, link))
     total = np.bincount(link, weights=power)
     before = np.cumsum(power[order]) - power[order] - (np.cumsum(total) - total)[link[order]]
@@ -151,7 +150,7 @@ def _strongest(link: NDArray[np.int64], power: Floats, fraction: float) -> Bools
 
 @dataclass(frozen=True)
 class GainErrors:
-    """Density of measured less predicted gains; the fractions are of links without line of sight.
+    """Density of measured less predicted gains; fractions are of NLOS links.
 
     Parameters
     ----------
@@ -164,12 +163,12 @@ class GainErrors:
     blocked_fraction: float
 
     def penalty(self) -> float:
-        """Negative logarithm of the prior, up to a constant."""
+        """Return the negative logarithm of the prior, up to a constant."""
         spread = math.log(self.noise_db / EXPECTED_NOISE_DB) / NOISE_SPREAD
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
     def curve(self, error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[Floats, Floats, Floats]:
-        """Negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
+        """Return the negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
         noise_db = np.sqrt(self.noise_db**2 + np.asarray(variance))
         parts = _log_densities(error_db, noise_db)
         fraction = _fractions(is_direct, self.missed_fraction, self.blocked_fraction)
@@ -197,7 +196,7 @@ _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[GainErrors, float]:
     """Return the most probable density of errors (N,) [dB], and its negative log likelihood with the prior's.
 
-    The variance [dB^2] is the variance of each mean of repeated measurements, beyond the noise of the link.
+    The variance [dB^2] of means of repeated measurements is in addition to the noise of the link.
     """
     noise_db = np.sqrt(NOISES_DB[:, None] ** 2 + np.asarray(variance))
     densities = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
@@ -212,7 +211,7 @@ def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) ->
 
 
 def _fractions(is_direct: Bools, missed: float, blocked: float) -> Floats:
-    """Fractions (3, N) of noise alone, of missed and of blocked paths; none is 0."""
+    """Return the fractions (3, N) of noise alone, missed and blocked paths; none is 0."""
     stray = STRAY_FRACTION / 2.0
     off = np.where(is_direct, stray, np.maximum([[missed], [blocked]], stray))
     return np.stack([1.0 - off.sum(axis=0), *off])
@@ -222,11 +221,11 @@ _MIXTURES = [
     np.stack([_fractions(np.array([direct]), *fractions)[:, 0] for fractions in chosen])
     for direct, chosen in ((True, _ALL_FRACTIONS[:1]), (False, _ALL_FRACTIONS))
 ]
-"""Fractions of noise alone, of missed and of blocked paths: with a line of sight (1, 3), and without (15, 3)."""
+"""Fractions of noise alone, missed and blocked paths: LOS (1, 3), and NLOS (15, 3)."""
 
 
 def _log_densities(error_db: Floats, noise_db: float | Floats) -> Floats:
-    """Logarithms (3, ..., N) of the densities of noise alone, and with an exponential added either way."""
+    """Return the logarithms (3, ..., N) of the densities of noise alone, and with an exponential added either way."""
     parts = [-0.5 * (error_db / noise_db) ** 2 - np.log(noise_db * math.sqrt(2.0 * math.pi))]
     for error, mean_db in ((error_db, MISSED_DB), (-error_db, BLOCKED_DB)):
         ratio = noise_db / mean_db
@@ -237,7 +236,7 @@ def _log_densities(error_db: Floats, noise_db: float | Floats) -> Floats:
 
 @dataclass(frozen=True)
 class Point:
-    """Materials, and how well they explain the measurements.
+    """Materials and their misfit.
 
     Parameters
     ----------
@@ -251,7 +250,7 @@ class Point:
 
     @property
     def logs(self) -> Floats:
-        """Logarithms (2, M) of permittivity less 1, and of conductivity [S/m]."""
+        """Return the logarithms (2, M) of permittivity less 1, and of conductivity [S/m]."""
         return np.log(self.values - LOSSLESS)
 
 
@@ -265,15 +264,15 @@ class Posterior(Shown):
 
     @property
     def values(self) -> Floats:
-        """Permittivity and conductivity (2, K)."""
+        """Return permittivity and conductivity (2, K)."""
         return np.stack([self.permittivity, self.conductivity_s_m])
 
     def deviation(self, values: Floats, best: float) -> float:
-        """Root mean square of how far values (K,) are from the best one."""
+        """Return the root mean square deviation of values (K,) from the best one."""
         return float(np.sqrt(self.weight @ (values - best) ** 2))
 
     def typical(self, thickness_m: float, frequency_hz: float) -> Floats:
-        """Return the values (2,) whose reflection losses are nearest to the mean; the most probable may be far off."""
+        """Return the values (2,) whose reflection losses are nearest to the posterior mean."""
         loss_db = reflection_loss_db(
             self.permittivity[:, None], self.conductivity_s_m[:, None], thickness_m, frequency_hz, TYPICAL_DEG
         )
@@ -281,7 +280,7 @@ class Posterior(Shown):
         return self.values[:, int(np.argmin(((limited_db - self.weight @ limited_db) ** 2).sum(axis=1)))]
 
     def interval(self, values: Floats, fraction: float = 0.95) -> tuple[float, float]:
-        """Central fraction of values (K,)."""
+        """Return the limits of the central fraction of values (K,)."""
         order = np.argsort(values, kind="stable")
         rank = np.cumsum(self.weight[order]) - 0.5 * self.weight[order]
         low, high = np.interp((0.5 - 0.5 * fraction, 0.5 + 0.5 * fraction), rank, values[order])
@@ -289,9 +288,9 @@ class Posterior(Shown):
 
 
 class MaterialTarget:
-    """Misfit of materials to measured gains (N,) [dB] of links that all have a path; weight is the likelihood's.
+    """Misfit of materials to measured gains (N,) [dB] of links with paths; `weight` is the power of the likelihood.
 
-    With `has_offset` all gains have an unknown offset, which links in line of sight show.
+    With `has_offset` all gains have an unknown offset, estimated from LOS links.
     """
 
     has_offset = False
@@ -308,19 +307,19 @@ class MaterialTarget:
         return Point(values, self.weight * loss + prior_loss(values), errors)
 
     def offset_db(self, power: Floats) -> float:
-        """Return by how much links in line of sight were measured above their gains [dB], in the median."""
+        """Return the median excess of measured over predicted gains of LOS links [dB]."""
         return float(np.median((self.gain_db - self.gains_db(power))[self.is_direct]))
 
     def errors_db(self, power: Floats) -> Floats:
-        """Measured gains less those from the power of the paths (P,), without the offset (N,) [dB]."""
+        """Return measured less predicted gains, without the offset (N,) [dB]."""
         return self.gain_db - self.gains_db(power) - (self.offset_db(power) if self.has_offset else 0.0)
 
     def gains_db(self, power: Floats) -> Floats:
-        """Gains (N,) [dB] from the power of the paths (P,)."""
+        """Return the gains (N,) [dB] from the power of the paths (P,)."""
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
 
     def slopes(self, point: Point) -> tuple[Floats, Floats]:
-        """Gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
+        """Return gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
         link, count = self.paths.link, len(self.gain_db)
         power, slopes = self.paths.slopes(*point.values)
         total = np.maximum(np.bincount(link, weights=power, minlength=count), 1e-30)
@@ -336,9 +335,9 @@ class MaterialTarget:
 
 
 def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: int = 30) -> tuple[list[Point], Floats]:
-    """Follow the slopes to a minimum of the loss, by Newton's method with damping (Levenberg and Marquardt).
+    """Minimise the loss by Newton's method with damping (Levenberg and Marquardt).
 
-    Returns the start with each step that made the loss smaller, and the curvature (2 M, 2 M) at the last.
+    Returns the start and all steps that reduced the loss, and the curvature (2 M, 2 M) at the last.
     """
     steps, damping = [start], 1e-3
     gradient, curvature = target.slopes(start)
@@ -362,12 +361,12 @@ def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: 
 
 
 def prior_loss(values: Floats) -> float:
-    """Return the negative logarithm of the prior density of the logarithms of materials (2, M), up to a constant."""
+    """Return the negative logarithm of the prior density of log materials (2, M), up to a constant."""
     return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
 
 
 def prior_posterior() -> Posterior:
-    """Return the prior of a material, as a posterior without measurements."""
+    """Return the prior of a material as a posterior."""
     spread = np.linspace(-3.0, 3.0, 31)
     values = LOSSLESS + PRIOR_MEDIAN * np.exp(PRIOR_SPREAD * np.reshape(np.meshgrid(spread, spread), (2, -1)))
     weight = np.outer(np.exp(-0.5 * spread**2), np.exp(-0.5 * spread**2)).ravel()
@@ -375,15 +374,14 @@ def prior_posterior() -> Posterior:
 
 
 def lossless_scale_s_m(index: float, thickness_m: float) -> float:
-    """Conductivity that attenuates by 8.7 dB through a slab and back [S/m]."""
+    """Return the conductivity that attenuates by 8.7 dB through a slab and back [S/m]."""
     return index / (IMPEDANCE_OHM * thickness_m)
 
 
 class _Plane:
-    """The plane of one material, the others staying as they are; evaluated points are kept.
+    """The plane of one material, the others fixed; evaluated points are kept.
 
-    Cells of it are (4, K) arrays: refractive index and logarithm of the conductivity at the centre, and the widths in
-    both.
+    Cells are (4, K) arrays: refractive index and log conductivity at the centre, and the widths in both.
     """
 
     def __init__(self, target: MaterialTarget, start: Point, which: int, report: Progress) -> None:
@@ -391,7 +389,7 @@ class _Plane:
         self._points: dict[tuple[float, float], Point] = {}
 
     def evaluate(self, cells: Floats, begin: float, end: float) -> Floats:
-        """Return the cells, and report progress from `begin` to `end`."""
+        """Evaluate cells, with progress from `begin` to `end`."""
         values = np.repeat(self._start.values[None], cells.shape[1], axis=0)
         values[:, 0, self._which], values[:, 1, self._which] = cells[0] ** 2, np.exp(cells[1])
         for first in range(0, len(values), CELLS_A_REPORT):
@@ -402,22 +400,20 @@ class _Plane:
         return cells
 
     def points(self, cells: Floats) -> list[Point]:
-        """Points at the centres of evaluated cells."""
         return [self._points[centre] for centre in map(tuple, cells[:2].T)]
 
     def losses(self, cells: Floats) -> Floats:
-        """Losses (K,) of evaluated cells."""
         return np.array([each.loss for each in self.points(cells)])
 
     def fractions(self, cells: Floats) -> Floats:
-        """Fraction (K,) of the posterior in each cell; the measure is the logarithm of permittivity less 1."""
+        """Return the fraction (K,) of the posterior in each cell, measured in log(permittivity - 1)."""
         loss = self.losses(cells)
         area = cells[2] * cells[3] * 2.0 * cells[0] / (cells[0] ** 2 - 1.0)
         mass: Floats = np.exp(loss.min() - loss) * area
         return mass / mass.sum()
 
     def best(self, cells: Floats, fringe: float, most: int) -> list[Point]:
-        """Return the best points, each in a fringe of its own, at most so many."""
+        """Return at most `most` best points, each in a different fringe."""
         found: list[int] = []
         for number in np.argsort(self.losses(cells), kind="stable"):
             if all(abs(cells[0, number] - cells[0, other]) > 0.5 * fringe for other in found):
@@ -430,7 +426,7 @@ class _Plane:
 def search(
     target: MaterialTarget, start: Point, which: int, thickness_m: float, frequency_hz: float, report: Progress
 ) -> tuple[list[Point], Posterior]:
-    """Search the plane of one material: its best points, each in a fringe of its own, and its posterior."""
+    """Search the plane of one material: its best points in different fringes, and its posterior."""
     fringe = SPEED_OF_LIGHT_M_S / (2.0 * frequency_hz * thickness_m)
     plane = _Plane(target, start, which, report)
     cells = plane.evaluate(_first_cells(thickness_m, fringe), 0.0, 0.7)
@@ -464,7 +460,7 @@ def search(
 
 
 def _coarser_neighbours(cells: Floats, chosen: Bools) -> Bools:
-    """Find which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may go on in them."""
+    """Return which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may continue there."""
     distance = np.abs(cells[:2, :, None] - cells[:2, None, chosen])
     own, other = cells[2:, :, None], cells[2:, None, chosen]
     near = (distance < 0.51 * (own + other)).all(axis=0)
@@ -472,7 +468,6 @@ def _coarser_neighbours(cells: Floats, chosen: Bools) -> Bools:
 
 
 def _divided(cells: Floats, index_parts: int, log_parts: int) -> Floats:
-    """Cut each cell into parts."""
     along, across = (np.arange(parts) - 0.5 * (parts - 1) for parts in (index_parts, log_parts))
     index, log, width, height = cells[:, :, None, None] / np.array([1, 1, index_parts, log_parts])[:, None, None, None]
     parts = np.broadcast_arrays(index + width * along[:, None], log + height * across, width, height)
@@ -480,7 +475,7 @@ def _divided(cells: Floats, index_parts: int, log_parts: int) -> Floats:
 
 
 def _first_cells(thickness_m: float, fringe: float) -> Floats:
-    """Cover the plane: fine in the index where slabs interfere with themselves, coarse where they absorb the wave."""
+    """Return cells of the plane: fine in the index where slabs interfere with themselves, coarse where they absorb."""
     scale = lossless_scale_s_m(2.0, thickness_m)
     levels = np.log(scale * np.array([0.03, 0.5, 1.4, 3.0, 6.0, 15.0, 50.0, 300.0, 1e4, 1e7]))
     edges = np.concatenate([levels[:1] - 2.0, 0.5 * (levels[1:] + levels[:-1]), levels[-1:] + 2.0])

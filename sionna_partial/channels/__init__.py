@@ -1,1 +1,1 @@
-"""Channels of links: antenna arrays, responses in delay and frequency, beams, spreads, files."""
+"""Channels of links: responses of antenna arrays, beams, spreads, files."""

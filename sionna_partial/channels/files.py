@@ -1,4 +1,4 @@
-"""Channels to files and back: NetCDF, HDF5 and Zarr, in the layouts that link simulators read."""
+"""Channel files: NetCDF, HDF5 and Zarr, in the layouts that link simulators read."""
 
 import math
 import os
@@ -45,15 +45,15 @@ _AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
     **{"a": ("c", ((*_PAIR, "path"),)), "delay_s": ("f", (("link", "path"), (*_PAIR, "path")))},
     "h": ("c", ((*_PAIR, "frequency"), (*_PAIR, "tap"))),
 }
-"""Kinds of dtypes, and choices of axes, of the variables of channels."""
+"""Kinds of dtypes, and allowed axes, of the variables of channels."""
 
 _ATTRIBUTES = ("frequency_hz", "power_tolerance_db", "synthetic_array", "normalize_delays", "bandwidth_hz")
 
 CHUNK_BYTES = 50_000_000
-"""Size of the coefficients that are written together, which bounds the memory."""
+"""Size of the coefficients that are written together [bytes]."""
 
 MAX_BYTES = 2**44
-"""Largest file that is opened [bytes]; only the used parts are read."""
+"""Largest file that is opened [bytes]; only used parts are read."""
 
 
 def save_channels(
@@ -69,34 +69,34 @@ def save_channels(
 
     ============ =================================================================================================
     `"sionna"`   `a` (rx, rx_ant, tx, tx_ant, path, time) and `tau` (rx, tx, path) [s], or with the antennas as `a`, -1
-                 where there is no path: as a generator of Sionna's `CIRDataset` yields them. Responses have `h` (rx,
+                 where there is no path: as from a generator of Sionna's `CIRDataset`. Responses have `h` (rx,
                  rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
                  no path, of one transmitter.
     ============ =================================================================================================
 
-    Positions of both ends are there too. A `.nc` or `.h5` file is NetCDF 4, which any HDF5 library reads.
+    Files include the positions of both ends. A `.nc` or `.h5` file is NetCDF 4, which any HDF5 library reads.
 
     Parameters
     ----------
     channels : TracedLinks or xarray.Dataset
-        Links, whose impulse responses are computed while they are written, or what `cir`, `cfr` or `taps` returned.
+        Links, whose impulse responses are computed block by block, or the result of `cir`, `cfr` or `taps`.
     path : path-like
-        A `.zarr` folder, which must not be there yet, or a `.nc` or `.h5` file.
+        A new `.zarr` folder, or a `.nc` or `.h5` file.
     layout : {"sionna", "deepmimo"}
     memory_gb : float
         Memory limit for the coefficients of a link [GB].
     progress : bool or callable, optional
         As in `predict_map`.
     **options
-        Arguments of `TracedLinks.cir`, for links.
+        For links: arguments of `TracedLinks.cir`.
 
     Raises
     ------
     SettingsError
-        As `TracedLinks.cir`, for a Dataset of another kind, or several transmitters in the layout of DeepMIMO.
+        As `TracedLinks.cir`; for another Dataset, or several transmitters in the layout of DeepMIMO.
     OutputError
-        For another suffix, a folder that is there, or if writing fails; nothing half written is left behind.
+        For another suffix, an existing folder, or if writing fails; no partial file remains.
 
     Examples
     --------
@@ -130,7 +130,7 @@ def save_channels(
 
 
 def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
-    """Return where channels can be written in a layout."""
+    """Check suffix, layout and folder of a target."""
     require_choice("layout", layout, get_args(Layout))
     target = output_path(path)
     if target.suffix not in SUFFIXES:
@@ -142,29 +142,28 @@ def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
 
 
 def _require_zarr(path: Path) -> None:
-    """Raise an error where a `.zarr` folder needs a package that is not installed."""
     if path.suffix == ".zarr":
         with optional_packages():
             import_module("zarr")
 
 
 def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
-    """Open channels that `save_channels` wrote. They are read where they are used.
+    """Open channels that `save_channels` wrote; arrays are read when they are used.
 
     Parameters
     ----------
     path : path-like
-        A `.zarr` folder, or a `.nc` or `.h5` file. Open only files of people whom you trust.
+        A `.zarr` folder, or a `.nc` or `.h5` file, from a trusted source.
 
     Returns
     -------
     xarray.Dataset
-        With the arrays of its layout, which is an attribute.
+        Arrays of its layout, which is an attribute.
 
     Raises
     ------
     SettingsError
-        If it cannot be read, or holds something else.
+        If it cannot be read, or contains other data.
 
     Examples
     --------
@@ -196,7 +195,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
-    """Return impulse responses (tx, rx, rx_ant, tx_ant, path), computed when they are written, by some receivers."""
+    """Return impulse responses (tx, rx, rx_ant, tx_ant, path) that are computed when they are written."""
     each, receivers = arrays.paths, len(arrays.paths.rx)
     path_bytes = 8 * len(arrays.rx) * len(arrays.tx) * (1 if arrays.synthetic_array else 2)
     at_once = max(1, CHUNK_BYTES // max(1, arrays.most * path_bytes))
@@ -231,7 +230,7 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
 
 
 def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
-    """Return what `cir`, `cfr` or `taps` returned, with transmitters and receivers on axes of their own."""
+    """Return the result of `cir`, `cfr` or `taps` with transmitters and receivers on separate axes."""
     require(not options, "options", ", ".join(options), "these channels are computed: give them to cir, cfr or taps.")
     axes = _checked_axes(channels)
     tx, rx = (np.unique(channels[name]) for name in ("tx", "rx"))
@@ -260,7 +259,6 @@ def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
 
 
 def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
-    """Axes of the variables that `cir`, `cfr` or `taps` returned, or raise a SettingsError."""
     axes = {}
     for name in (*_OF_LINKS, *(_OF_PATHS if "a" in channels else ("h",))):
         kinds, choices = _AXES[name]
@@ -273,7 +271,6 @@ def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
 
 
 def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:
-    """Name and order the arrays as a layout has them."""
     table = table.assign_attrs(layout=layout)
     last = next(name for name in ("path", "frequency", "tap") if name in table.dims)
     if layout == "deepmimo":

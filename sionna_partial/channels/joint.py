@@ -1,8 +1,8 @@
-"""Gaussian latents, one for each link and draw, which links through the same unseen space share.
+"""Gaussian latents of links, correlated where links cross the same unknown cells.
 
-Every link is a weighted sum of one Gaussian field over the plane along its direct line, as in the network shadowing
-model of Agrawal and Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Transactions on
-Wireless Communications, 2009); unknown cells weigh most. Links whose lines cross the same unknown cells fail together.
+A latent is a weighted sum of a Gaussian field over the plane along the direct line, as in the network shadowing model
+of Agrawal and Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Transactions on Wireless
+Communications, 2009); unknown cells weigh most.
 """
 
 import math
@@ -20,14 +20,13 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
 
 DECORRELATION_M = 1.0
-"""Distance over which the field decorrelates: its correlation is exp(-(d / DECORRELATION_M)^2 / 2) [m]."""
+"""Decorrelation length of the field [m]: its correlation is exp(-(d / DECORRELATION_M)^2 / 2)."""
 
 KNOWN_WEIGHT = 0.1
-"""Weight of a known cell, in weights of an unknown one."""
+"""Weight of a known cell; unknown cells have weight 1."""
 
 OWN_VARIANCE = 0.1
-"""Fraction of a latent's variance that no other link shares. All three are near the maximum of the likelihood of
-pairs of link states on homes of `make_home` (`benchmarks/joint_links.py`)."""
+"""Fraction of a latent's variance that no other link shares. All three are fitted by `benchmarks/joint_links.py`."""
 
 _CELL_M, _MOST_CELLS = 0.35, 4096
 _POINTS = 48
@@ -41,12 +40,12 @@ class JointLatents:
     partial: PartialMap
 
     def correlation(self, tx_m: Floats, rx_m: Floats) -> Floats:
-        """Correlation (L, L) of the latents of links between `tx_m` (L, 3) and `rx_m` (L, 3) [m]."""
+        """Return the correlation (L, L) of the latents of links between `tx_m` (L, 3) and `rx_m` (L, 3) [m]."""
         smooth = np.concatenate([*self._smoothed(tx_m, rx_m)])
         return (1.0 - OWN_VARIANCE) * (smooth @ smooth.T) + OWN_VARIANCE * np.eye(len(smooth))
 
     def quantiles(self, tx_m: Floats, rx_m: Floats, count: int, seeds: list[list[int]]) -> Floats:
-        """Draw `count` times from F fields: quantiles (F, count, L) in (0, 1), evenly spread for each link."""
+        """Draw `count` quantiles (F, count, L) in (0, 1) from F fields, evenly spread for each link."""
         if not len(tx_m):
             return np.zeros((len(seeds), count, 0))
         draws = max(count, _FEWEST_DRAWS)
@@ -68,7 +67,7 @@ class JointLatents:
 
     @cached_property
     def _step(self) -> int:
-        """Edge of a cell of the field, in cells of the map."""
+        """Return the edge of a cell of the field, in cells of the map."""
         edge_m = max(_CELL_M, math.sqrt(self.partial.state.size / _MOST_CELLS) * self.partial.resolution_m)
         return max(1, math.ceil(edge_m / self.partial.resolution_m))
 
@@ -79,14 +78,13 @@ class JointLatents:
 
     @cached_property
     def _weight(self) -> Floats:
-        """Weights of the cells of the field (ny nx,)."""
         (ny, nx), step = self._shape, self._step
         padding = [(0, -count % step) for count in self.partial.shape]
         unknown = np.pad(self.partial.state == CellState.UNKNOWN, padding, constant_values=True)
         return KNOWN_WEIGHT + unknown.reshape(ny, step, nx, step).mean(axis=(1, 3)).ravel()
 
     def _smoothed(self, tx_m: Floats, rx_m: Floats) -> Iterator[Floats]:
-        """Weights on white noise in the cells of the field, of unit norm, for some links at a time."""
+        """Return the weights on white noise in the cells of the field, of unit norm, some links at a time."""
         edge_m = self._step * self.partial.resolution_m
         along = (np.arange(_POINTS)[:, None] + 0.5) / _POINTS
         limit = np.array(self._shape)[::-1] - 1
@@ -107,10 +105,9 @@ class JointLatents:
 
 
 def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -> tuple[States, Floats]:
-    """States and gains (n, ...) [dB] of predicted links (...) at quantiles of both.
+    """Return states and gains (n, ...) [dB] of predicted links (...) at quantiles of both.
 
-    The lowest quantiles of a link are its outages, the highest its LOS. The gain of each state has quantiles of its
-    own.
+    The lowest quantiles are outages, the highest LOS.
     """
     probabilities, means_db, stds_db = links.by_state
     p_outage = probabilities[LinkState.OUTAGE]
@@ -122,7 +119,7 @@ def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -
 
 
 def _evenly_spread(shared: Floats, rng: np.random.Generator, count: int) -> Floats:
-    """Quantiles (count, L) of latents with this shared part (L, draws)."""
+    """Return the quantiles (count, L) of latents with this shared part (L, draws)."""
     latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
     latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape, np.float32)
     rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]

@@ -1,8 +1,4 @@
-"""Channel responses of links with antenna arrays: paths + arrays -> impulse responses, frequency responses, taps.
-
-Large-scale parameters of links are computed, too: their spreads, K-factor and path loss; and the gains of pairs of
-beams.
-"""
+"""Channel responses of links with antenna arrays: impulse and frequency responses, taps, spreads and gains of beams."""
 
 import itertools
 import logging
@@ -31,30 +27,30 @@ if TYPE_CHECKING:
 _log = logging.getLogger(__name__)
 
 BLOCK_BYTES = 4_000_000
-"""Size of the coefficients that are computed together, which caches hold."""
+"""Size of coefficients that are computed together, to fit caches [bytes]."""
 
 WORK_BYTES = 100_000_000
-"""About the size of functions of delays, or of the beams of paths, that are computed together."""
+"""Approximate memory of functions of delays, or of beams of paths, that are computed together [bytes]."""
 
 UPRIGHT = 1e-3
-"""A diffraction is at a vertical edge if it changes the vertical part of the direction by less than this."""
+"""Largest change of the direction's vertical part at which an edge counts as vertical."""
 
 FIRST_TAP, MORE_TAPS = -6, 6
-"""First tap, and how many follow the longest path, where none are given: the sinc filter is 5 % at the sixth tap."""
+"""Default first tap, and number of taps after the longest path: the sinc filter is 5 % at the sixth tap."""
 
 PATHS_AT_ONCE = 20_000
-"""Number of paths whose beams are computed together at most, in no more than `WORK_BYTES`."""
+"""Largest number of paths with beams that are computed together."""
 
 _BEAM_BYTES, _PAIR_BYTES = 32, 48
-"""Memory of a beam of a path, and of a pair of beams of a link, while they are computed [bytes]."""
+"""Memory of a beam of a path, and of a pair of beams of a link [bytes]."""
 
 MAX_WEIGHT = 1e6
-"""Largest magnitude of a weight: powers are of single precision."""
+"""Largest magnitude of a weight: powers have single precision."""
 
 
 @dataclass(frozen=True)
 class ArrayPaths:
-    """The paths of all links between antenna arrays."""
+    """Paths of all links between antenna arrays."""
 
     paths: "TracedLinks"
     tx: Antennas
@@ -92,27 +88,27 @@ class ArrayPaths:
 
     @property
     def links(self) -> int:
-        """The number of links, T N."""
+        """Return the number of links, T N."""
         return len(self.paths.tx.reshape(-1, 3)) * len(self.paths.rx)
 
     @property
     def antennas(self) -> str:
-        """Numbers of antennas, for messages."""
+        """Return the numbers of antennas as text."""
         return f"{len(self.rx)} x {len(self.tx)} antennas"
 
     @cached_property
     def first(self) -> Indices:
-        """First path of each link, and the number of all paths: (links + 1,)."""
+        """Return the first path of each link, and the number of all paths: (links + 1,)."""
         return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
 
     @property
     def most(self) -> int:
-        """The largest number of paths of a link."""
+        """Return the largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
 
     @property
     def work_bytes(self) -> int:
-        """Size of the largest of the `blocks` while it is computed."""
+        """Return the memory of the largest of the `blocks`."""
         coefficients = max(BLOCK_BYTES // 16, len(self.rx) * len(self.tx) * self.most)
         return coefficients * (32 if self.synthetic_array else 80)
 
@@ -122,7 +118,7 @@ class ArrayPaths:
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
 
     def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, Indices]]:
-        """Yield some links at a time: links, their paths, and the first path of each link among these, with the end."""
+        """Yield slices of links, of their paths, and the first path of each link among these, with the end."""
         start = 0
         while start < self.links:
             stop = int(np.searchsorted(self.first, self.first[start] + paths_at_once, side="right")) - 1
@@ -132,7 +128,7 @@ class ArrayPaths:
             start = stop
 
     def blocks(self) -> Iterator["Block"]:
-        """Compute the coefficients, the paths of some links at a time."""
+        """Compute the coefficients of some links at a time."""
         for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
             yield self.block(*span)
 
@@ -159,7 +155,7 @@ class ArrayPaths:
         return phasors(per_second * delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
-        """Gains of paths from pattern to pattern (P, K_rx, K_tx), and phases at each position of both arrays."""
+        """Return gains from pattern to pattern (P, K_rx, K_tx), and phases at the positions of both arrays."""
         radians = 2.0 * np.pi * self.paths.trace_settings.frequency_hz / SPEED_OF_LIGHT_M_S
         at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
         return self._gains(rows), at_rx, at_tx
@@ -177,11 +173,11 @@ class ArrayPaths:
         return at_rx_m, self.tx.advance_m(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
 
     def _longer_m(self, rows: slice) -> Floats:
-        """By how much paths between antenna positions (P, A_rx, A_tx) are longer than between the centres [m].
+        """Return the extra length of paths between antenna positions (P, A_rx, A_tx) over the centres [m].
 
         A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
-        transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: around it the path is a
-        straight line too, in the unfolded half planes of both ends. At other edges and diffuse reflections it stays.
+        transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: the path is straight in
+        the unfolded half planes. Other edges and diffuse reflections keep their points.
         """
         unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
         rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
@@ -202,7 +198,7 @@ class ArrayPaths:
 
 
 def with_every_path(links: "TracedLinks") -> "TracedLinks":
-    """Return the links with the paths that the default tolerance left out; they are traced once for the same links."""
+    """Return the links with the paths that the default tolerance omits, traced once for the same links."""
     settings = links.trace_settings
     if links._partial is None:
         if settings.power_tolerance_db:
@@ -218,13 +214,12 @@ def with_every_path(links: "TracedLinks") -> "TracedLinks":
 
 @cache
 def _log_tolerance(tolerance_db: float) -> None:
-    """Log once that channels lack paths."""
     message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: trace with 0 for all"
     _log.info(message, tolerance_db)
 
 
 def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
-    """Return exp(j angle) of angles [rad], which are reduced to a turn in the precision that they have."""
+    """Return exp(j angle) of angles [rad], reduced to a turn in their own precision."""
     turn = angle.dtype.type(2.0 * np.pi)
     angle = (angle - turn * np.floor(angle * (angle.dtype.type(1.0) / turn))).astype(np.float32)
     found = np.empty(angle.shape, np.complex64)
@@ -245,7 +240,7 @@ def _after_shortest(delay_s: Floats, first: Indices) -> Floats:
 class Block:
     """Coefficients (P, antennas of rx, of tx) of the paths of some links, and delays of that shape or (P, 1, 1).
 
-    Paths of the i-th link are those from `first[i]` up to `first[i + 1]`.
+    The paths of link i are `first[i]` to `first[i + 1]`.
     """
 
     links: slice
@@ -254,7 +249,7 @@ class Block:
     delay_s: Floats
 
     def fill(self, a: NDArray[np.complex64], delay_s: Floats) -> None:
-        """Put them into arrays (links, paths, antennas of rx, of tx); the array of delays may be (links, paths)."""
+        """Fill arrays (links, paths, antennas of rx, of tx); the array of delays may be (links, paths)."""
         count = np.diff(self.first)
         link = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
@@ -264,11 +259,11 @@ class Block:
 
 @dataclass(frozen=True)
 class Unfolded:
-    """Maps of displacements of both ends of P paths, with the reflections unfolded.
+    """Displacements of both ends of P paths, with the reflections unfolded.
 
-    `before` (P, 3, 3) maps displacements of the transmitter through all reflections, or to the last that lies before
-    the point where a path is `split` (P,): diffracted or scattered. From there, `to_tx_m` and `to_rx_m` (P, 3) lead to
-    the images of both ends; `after` maps displacements of the receiver; `upright` (P,) is an edge.
+    `before` (P, 3, 3) maps displacements of the transmitter through all reflections, or up to the point where a path is
+    `split` (P,): diffracted or scattered. From there `to_tx_m` and `to_rx_m` (P, 3) lead to the images of both ends;
+    `after` maps displacements of the receiver; `upright` (P,): the edge is vertical.
     """
 
     before: Floats
@@ -313,7 +308,7 @@ class Unfolded:
         return cls(before, mirrored.transpose(0, 2, 1), to_tx_m, length_m[:, None] * leaving, split, upright)
 
     def longer_at_edges_m(self, split: Indices, rx_moved_m: Floats, tx_moved_m: Floats) -> Floats:
-        """By how much paths with numbers `split` are longer for displaced ends (P or 1, 3, A): (P, A_rx, A_tx) [m]."""
+        """Return the extra length (P, A_rx, A_tx) [m] of paths `split` for displaced ends (P or 1, 3, A)."""
 
         def from_edge(to_m: Floats, moved_m: Floats) -> tuple[Any, Any]:
             x, y, z = np.moveaxis(to_m[split, :, None] + moved_m, 1, 0)
@@ -330,7 +325,7 @@ class Unfolded:
 
 
 def cir(paths: "TracedLinks", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
-    """Impulse responses (`TracedLinks.cir`)."""
+    """See `TracedLinks.cir`."""
     arrays = ArrayPaths.of(paths, **options)
     pairs = len(arrays.rx) * len(arrays.tx)
     path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
@@ -354,7 +349,7 @@ _DELAY = {"long_name": "propagation delay, NaN where there is no path", "units":
 
 
 def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
-    """Frequency responses (`TracedLinks.cfr`)."""
+    """See `TracedLinks.cfr`."""
     arrays = ArrayPaths.of(paths, **options)
     remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
     offsets_hz = float_array("frequencies_hz", frequencies_hz, SettingsError, remedy)
@@ -380,7 +375,7 @@ def taps(
     memory_gb: float = MEMORY_GB,
     **options: Any,
 ) -> xr.Dataset:
-    """Taps (`TracedLinks.taps`)."""
+    """See `TracedLinks.taps`."""
     require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
     arrays = ArrayPaths.of(paths, **options)
     if l_max is None:
@@ -401,16 +396,13 @@ def taps(
 
 
 _VALUE_BYTES, _AXIS_BYTES = 48, 40
-"""Memory of a value of a function of a delay while it is computed, and of a value of an axis with its index [bytes]."""
+"""Memory of a value of a function of a delay, and of a value of an axis with its index [bytes]."""
 
 
 def _filtered(
     arrays: ArrayPaths, kernel: Callable[[Floats, slice], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
-    """Sum the paths of each link, weighted by a function of their delay: (links, A_rx, A_tx, size).
-
-    `kernel` returns some of the `size` values of delays (...,): (..., some).
-    """
+    """Sum the paths of each link, weighted by `kernel` of their delay: (links, A_rx, A_tx, size)."""
     pairs = len(arrays.rx) * len(arrays.tx)
     delays = max(1, arrays.most if arrays.synthetic_array else pairs)
     at_once = min(size, max(1, WORK_BYTES // (_VALUE_BYTES * delays)))
@@ -431,7 +423,7 @@ def _filtered(
 
 
 def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
-    """Return a Dataset of variables of links with their transmitters and receivers, and the settings as attributes."""
+    """Return a Dataset of variables with transmitters and receivers, and the settings as attributes."""
     each, count = arrays.paths, len(arrays.paths.rx)
     tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
     tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
@@ -446,7 +438,7 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
 
 
 def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float, work_bytes: int) -> None:
-    """Raise a MemoryLimitError if all links, and the work for them, would take more than `memory_gb`."""
+    """Raise a MemoryLimitError if all links with working memory take more than `memory_gb`."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     size_gb = (arrays.links * link_bytes + work_bytes) / 1e9
     if size_gb > memory_gb:
@@ -457,7 +449,7 @@ def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: fl
 
 
 def spreads(links: "TracedLinks") -> xr.Dataset:
-    """Large-scale parameters (`TracedLinks.spreads`)."""
+    """See `TracedLinks.spreads`."""
     link, power = links.path_link, np.abs(links.a) ** 2
 
     def total(values: Floats) -> Floats:
@@ -501,7 +493,7 @@ def beam_gains(
     memory_gb: float = MEMORY_GB,
     **antennas: Any,
 ) -> xr.Dataset:
-    """Gains of pairs of beams (`TracedLinks.beam_gains`)."""
+    """See `TracedLinks.beam_gains`."""
     arrays = ArrayPaths.of(paths, **antennas)
     at_tx = _weights("codebook", codebook, arrays.tx)
     at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, arrays.rx).conj()
@@ -539,7 +531,7 @@ def beam_gains(
 
 
 def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
-    """Weights (beams, patterns, positions) of a codebook (beams, antennas)."""
+    """Return the weights (beams, patterns, positions) of a codebook (beams, antennas)."""
     count = len(antennas)
     remedy = f"give (beams, {count}) weights up to {MAX_WEIGHT:g}, one for each antenna, as dft_codebook does."
     weights = real_array(name, codebook, SettingsError, remedy, kinds="iufc")
@@ -553,10 +545,10 @@ def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.c
 def _factors(
     arrays: ArrayPaths, rows: slice, at_rx: NDArray[np.complex64], at_tx: NDArray[np.complex64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Numbers of receive beams (P, M, B) and of transmit beams (P, M, C) whose products, over M, are powers of paths.
+    """Return factors of receive beams (P, M, B) and transmit beams (P, M, C): powers are their products, summed over M.
 
-    A path excites a beam by u_k at the receiver and v_k at the transmitter, for each pattern k of the receiver. The
-    power |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).
+    Pattern k of the receiver excites a beam by u_k at the receiver and v_k at the transmitter. The power
+    |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).
     """
     gains, rx, tx = arrays.plane_waves(rows)
     received = np.stack([rx @ each.T for each in at_rx.swapaxes(0, 1)], axis=1)

@@ -1,4 +1,4 @@
-"""Draws of the channels of links on a partial map: paths that are possible in the building."""
+"""Draws of the channels of links on a partial map."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ if TYPE_CHECKING:
     import xarray as xr
 
 UNSEEN = 255
-"""Interaction of paths through unseen space, in the place of Sionna RT's `InteractionType`."""
+"""Interaction of paths through unseen space, an extension of Sionna RT's `InteractionType`."""
 
 MOST_DRAWS = 10_000
 
 RANGE_DB = 30.0
-"""Traced paths that much weaker than the strongest indirect one of an uncertain link are left out [dB]."""
+"""Traced paths this much weaker than the strongest indirect one of an uncertain link are omitted [dB]."""
 
 _COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
 _NO_VERTICES = np.zeros((0, 1, 3))
@@ -53,15 +53,14 @@ _STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 class ChannelSamples(Shown):
     """n draws of the channels of links, from `sample_channels`.
 
-    Every draw is one building as it may be: links through the same unseen space are correlated. Powers, delays and
-    angles are drawn; the phase of whatever crosses the unseen is uniform, as 1 mm is 34 degrees at 28 GHz. Paths are
-    made when they are asked for, and are the same each time.
+    A draw is one possible building: links through the same unseen space are correlated. Powers, delays and angles are
+    drawn; phases through unseen space are uniform. Paths are computed on request, and are the same each time.
 
     Parameters
     ----------
     link_state : (n, N) or (n, T, N) uint8 array of LinkState
     gain_db : (n, N) or (n, T, N) float64 array
-        Omnidirectional path gain [dB], -150 in an outage.
+        Omnidirectional path gain [dB], -150 in outage.
     memory_gb : float
         Memory limit for all paths of `drawn` [GB].
     """
@@ -76,12 +75,12 @@ class ChannelSamples(Shown):
         return len(self.link_state)
 
     def links(self, draw: int) -> TracedLinks:
-        """Return one draw, as `trace_links` returns links; interactions are 255 where a path was not traced.
+        """Return the links of one draw; interactions are 255 where a path was not traced.
 
         Raises
         ------
         SettingsError
-            If there is no such draw.
+            For a number without a draw.
         """
         require_whole("draw", draw, 0, len(self) - 1)
         traced = self._draws.traced
@@ -90,12 +89,12 @@ class ChannelSamples(Shown):
 
     @cached_property
     def drawn(self) -> TracedLinks:
-        """All draws at once: the paths of draw k and transmitter t are of its transmitter ``k * T + t``.
+        """Return all draws: the paths of draw k and transmitter t have transmitter number ``k * T + t``.
 
         Raises
         ------
         MemoryLimitError
-            If they may take more than `memory_gb`: `links` takes the memory of some draws only.
+            If they may take more than `memory_gb`; `links` needs less.
         """
         traced = self._draws.traced
         tx_m = np.tile(traced.tx.reshape(-1, 3), (len(self), 1))
@@ -110,40 +109,36 @@ class ChannelSamples(Shown):
         return replace(traced, tx=tx_m, **columns)
 
     def cir(self, **options: Any) -> xr.Dataset:
-        """Return channel impulse responses as `TracedLinks.cir` does, along a first dimension "draw"."""
+        """Return channel impulse responses (see `TracedLinks.cir`) along a first dimension "draw"."""
         return self._by_draw(self.drawn.cir(**self._tiled(options)))
 
     def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> xr.Dataset:
-        """Return channel frequency responses as `TracedLinks.cfr` does, along a first dimension "draw"."""
+        """Return channel frequency responses (see `TracedLinks.cfr`) along a first dimension "draw"."""
         return self._by_draw(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
 
     def beam_gains(self, codebook: ArrayLike, rx_codebook: ArrayLike | None = None, **options: Any) -> xr.Dataset:
-        """Return gains of pairs of beams as `TracedLinks.beam_gains` does, along a first dimension "draw"."""
+        """Return gains of pairs of beams (see `TracedLinks.beam_gains`) along a first dimension "draw"."""
         return self._by_draw(self.drawn.beam_gains(codebook, rx_codebook, **self._tiled(options)))
 
     def spreads(self) -> xr.Dataset:
-        """Return delay and angular spreads as `TracedLinks.spreads` does, along a first dimension "draw".
+        """Return delay and angular spreads (see `TracedLinks.spreads`) along a first dimension "draw".
 
         Examples
         --------
         >>> import sionna_partial as sp
-        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-        >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-        >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(4.5, 1.5, 1.5)], n=20)
+        >>> samples = sp.sample_channels(sp.make_home(3), (2.0, 3.0, 1.5), [(3.0, 3.0, 1.5)], n=20)
         >>> samples.spreads().delay_spread_s.sizes["draw"]
         20
         """
         return self._by_draw(self.drawn.spreads())
 
     def _tiled(self, options: dict[str, Any]) -> dict[str, Any]:
-        """Repeat orientations of the transmitters for each draw."""
         orientation = options.get("tx_orientation_rad")
         if orientation is None or np.ndim(orientation) != 2:
             return options
         return {**options, "tx_orientation_rad": np.tile(orientation, (len(self), 1))}
 
     def _by_draw(self, found: xr.Dataset) -> xr.Dataset:
-        """Split the axis of links, or of transmitters, into draws and the links of a draw."""
         along = "link" if "link" in found.dims else "tx"
         if found.sizes[along]:
             folded = found.coarsen({along: found.sizes[along] // len(self)}).construct({along: ("draw", along)})
@@ -170,32 +165,31 @@ def sample_channels(
     memory_gb: float = MEMORY_GB,
     progress: Progress | bool | None = None,
 ) -> ChannelSamples:
-    """Draw the channels of links on a partial map n times: states, gains and paths.
+    """Draw states, gains and paths of links on a partial map n times.
 
-    Link state and gain of each link are drawn from what `predict_map` predicts, so that they agree with it; with 64
-    draws or more, states occur as often as predicted. Links have spatial latents in common (`JointLatents`), so that a
-    draw looks like one building: neighbours, and transmitters behind the same unseen wall, fail together. Given state
-    and gain, traced paths in observed space are there, others survive with a learned probability, and analogues from
-    procedural homes supply the rest (`PathModel`). On a complete map every draw is the trace.
+    State and gain of each link are drawn from the distribution of `predict_map`; with 64 draws or more, states occur as
+    often as predicted. Shared spatial latents (`JointLatents`) make a draw one possible building: links behind the same
+    unseen wall fail together. Given state and gain, a draw contains the traced paths in observed space, others with a
+    learned probability, and analogues from procedural homes (`PathModel`). On a complete map every draw is the trace.
 
     Parameters
     ----------
     scene : PartialMap or path
-        Map of the building, complete or partial.
+        Map of the building.
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].
     rx : (N, 3) array-like
         Receiver positions [m], indoors.
     n : int
-        Number of draws, up to 10,000.
+        Number of draws, at most 10,000.
     seed : int
-        Seed of the draws, at least 0: equal seeds give equal draws.
+        Seed of the draws, at least 0.
     predictor : None, "map", "paper", path or Predictor
-        As for `predict_map`.
+        As in `predict_map`.
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     memory_gb : float
-        Memory limit for the draws, and for all their paths where they are requested at once [GB].
+        Memory limit for the draws, and for all their paths together [GB].
     progress : bool or callable, optional
         As in `predict_map`.
 
@@ -206,7 +200,7 @@ def sample_channels(
     Raises
     ------
     MemoryLimitError
-        If the draws without their paths may take more than `memory_gb`; nothing was begun.
+        If the draws without their paths may take more than `memory_gb`.
     MapError, PositionError, SettingsError, PredictorError, BackendError
         As `trace_links` and `predict_map`.
 
@@ -243,7 +237,7 @@ def sample_channels(
 
 
 class _Draws:
-    """n draws of L links, transmitter by transmitter: `state` and `gain_db` (n, L), and their paths."""
+    """n draws of L links of all transmitters: `state` and `gain_db` (n, L), and their paths."""
 
     def __init__(
         self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
@@ -286,12 +280,12 @@ class _Draws:
         self._latest: tuple[int, dict[str, NDArray[Any]]] = -1, {}
 
     def all_paths(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of `TracedLinks` for the paths of all draws."""
+        """Return the columns of `TracedLinks` for all draws."""
         ordered = [self._ordered(block) for block in self._blocks]
         return self._with_vertices({name: np.concatenate([each.pop(name) for each in ordered]) for name in _COLUMNS})
 
     def paths_of(self, draw: int) -> dict[str, NDArray[Any]]:
-        """Return the columns of `TracedLinks` for the paths of a draw."""
+        """Return the columns of `TracedLinks` for one draw."""
         number = int(self._block_of_draw[draw])
         if self._latest[0] != number:
             self._latest = number, self._ordered(self._blocks[number])
@@ -303,17 +297,15 @@ class _Draws:
 
     @staticmethod
     def _with_vertices(columns: dict[str, NDArray[Any]]) -> dict[str, NDArray[Any]]:
-        """Add vertices, which are not drawn."""
         return {**columns, "vertices_m": np.broadcast_to(math.nan, (*columns["interactions"].shape, 3))}
 
     def _ordered(self, draws: Indices) -> dict[str, NDArray[Any]]:
-        """Columns of all paths of some draws."""
         parts = [*self._parts(draws, np.random.default_rng([self._seed, _REST, draws[0]]))]
         order = path_order(parts)
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Return the paths of some draws: of certain links, surviving and direct ones, and paths of analogues."""
+        """Return the paths of some draws: of certain links, surviving and direct ones, and of analogues."""
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
@@ -339,7 +331,7 @@ class _Draws:
         yield self._of_analogues(draws, analogue, left, rng)
 
     def _indirect(self) -> tuple[Indices, Indices, Floats]:
-        """Indirect traced paths of uncertain links that are not too weak, the number of the link of each, and power."""
+        """Return indirect traced paths of uncertain links within `RANGE_DB`, their link numbers and powers."""
         links = self._uncertain
         index = np.full(len(self._geometry.distance_m), -1)
         index[links] = np.arange(len(links))
@@ -351,7 +343,7 @@ class _Draws:
         return paths[kept], at[kept], power[kept]
 
     def _analogues(self, draws: Indices, state: States, gain_db: Floats, survivors: Floats) -> Indices:
-        """Analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
+        """Return analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):
             row, link = np.nonzero(state == each)
@@ -361,7 +353,7 @@ class _Draws:
         return analogue
 
     def _of_analogues(self, draws: Indices, analogue: Indices, power: Floats, rng: np.random.Generator) -> SolvedPaths:
-        """Paths of analogues (D, U) with a power in sum (D, U), mirrored at random for each link and draw."""
+        """Return paths of analogues (D, U) with total power (D, U), mirrored at random."""
         row, link = np.nonzero(power > 0.0)
         chosen, mirror = analogue[row, link], rng.choice([-1.0, 1.0], len(row))
         first, count = self._model.first[chosen], np.diff(self._model.first)[chosen]
@@ -384,7 +376,7 @@ class _Draws:
     def _copies(
         self, draw: Indices, paths: Indices, scale: Floats | None, rng: np.random.Generator | None
     ) -> SolvedPaths:
-        """Traced paths in some draws; what crosses the unseen has a random phase."""
+        """Return traced paths in some draws, with a random phase through unseen space."""
         columns = {name: getattr(self.traced, name).take(paths, axis=0) for name in _COLUMNS}
         if rng is not None and scale is not None:
             turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)
@@ -403,7 +395,7 @@ class _Draws:
         kind: Indices,
         rng: np.random.Generator,
     ) -> SolvedPaths:
-        """Paths that were not traced: angles are those from the direct line, and they keep the polarisation."""
+        """Return paths that were not traced, with angles from the direct line and unchanged polarisation."""
         geometry, depth = self._geometry, max(1, self.traced.interactions.shape[1])
         seen = (kind == 0) & (geometry.unobserved_m[link] == 0.0)
         amplitude = np.sqrt(power) * np.exp(2j * np.pi * np.where(seen, 0.0, rng.random(len(link))))

@@ -1,4 +1,4 @@
-"""Command line: one subcommand for each step from a map to its coverage, and from homes to a predictor."""
+"""Command line: subcommands from a map to its coverage, and from homes to a predictor."""
 
 import logging
 import os
@@ -22,7 +22,7 @@ from sionna_partial.resources import optional_packages
 
 
 class _ErrorLineGroup(TyperGroup):
-    """Reports an error that the user can fix in one line, with exit code 2."""
+    """Reports an error that the user can mend in one line, with exit code 2."""
 
     def invoke(self, ctx: Any) -> Any:
         """Run the subcommand."""
@@ -42,7 +42,7 @@ class _ErrorLineGroup(TyperGroup):
 
 
 class _WarningLine(logging.Handler):
-    """Writes warnings as one line each, to stderr as it is now."""
+    """Writes each warning as one line to the current stderr."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Write a record."""

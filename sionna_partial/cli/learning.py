@@ -1,4 +1,4 @@
-"""Subcommands of learning: dataset, train, evaluate."""
+"""Subcommands dataset, train and evaluate."""
 
 import itertools
 import shlex
@@ -23,10 +23,10 @@ from sionna_partial.settings import (
 )
 
 DEFAULT_HOMES = 100
-"""Number of procedural homes where no map is given."""
+"""Default number of procedural homes."""
 
 FIRST_SEED = 20_000
-"""Seed of the first of them: not one of those that the shipped predictor was trained on (`make predictor`)."""
+"""Seed of the first procedural home, outside the training seeds of the shipped predictor (`make predictor`)."""
 
 _DATASET_HELP = "Folder that `dataset` wrote, or several; homes may be in more than one."
 _STAGE_HELP = "Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."
@@ -66,6 +66,9 @@ def dataset(
     ] = False,
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     material: opt.MaterialText = "",
+    cir_paths: Annotated[
+        int, typer.Option(help="Also store impulse responses, of so many strongest paths of each link. 0: none.")
+    ] = DatasetSettings.cir_paths,
     workers: Annotated[
         int | None, typer.Option(help="Homes at a time on this machine. Default: one for each core.")
     ] = None,
@@ -90,6 +93,7 @@ def dataset(
         short_link_fraction=short_links,
         scene=SceneSettings(material=opt.parse_material(material) if material else None),
         trace=TraceSettings(frequency_hz=frequency),
+        cir_paths=cir_paths,
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
     seeds = range(first_seed, first_seed + count)

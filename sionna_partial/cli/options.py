@@ -1,4 +1,4 @@
-"""Options that subcommands share, what is made of them, and numbers and materials that are parsed from text."""
+"""Options shared by subcommands, and their parsers."""
 
 import functools
 import inspect
@@ -29,10 +29,10 @@ GROUPS = {
     "Map": ("strict", "resolution", "unit", "up", "height_band", "storey"),
     "Output": ("out", "formats", "memory"),
 }
-"""Options in groups, as the help of a command has them."""
+"""Groups of options in the help of a command."""
 
 UNITS_HZ = {"": 1.0, "hz": 1.0, "khz": 1e3, "mhz": 1e6, "ghz": 1e9}
-"""Units of frequencies in lower case."""
+"""Frequency units in lower case."""
 
 MAP_HELP = (
     "ROS map_server YAML, rosbag, exported scene folder, .npz, mesh, point cloud, DXF floor plan, IFC model, "
@@ -46,7 +46,7 @@ _MATERIAL_HELP = (
 
 
 def parse_frequency(text: str) -> float:
-    """Frequency [Hz] from a number, or from a number with a unit."""
+    """Return the frequency [Hz] of a number with or without a unit."""
     found = re.fullmatch(r"(.*?[\d.nf])\s*([kmg]?hz)?", str(text).strip().lower())
     if not found or not _is_number(found[1]):
         raise typer.BadParameter(f"{str(text)!r} is not a frequency: give hertz, or a number with its unit, as 5.2GHz.")
@@ -157,12 +157,12 @@ Mapper = Annotated[Fusion, typer.Option(help="Mapper that makes the map of readi
 
 
 def in_options(message: str) -> str:
-    """Return a message of the package with switches as the command line has them: --strict for strict=True."""
+    """Return a message with switches as on the command line: --strict for strict=True."""
     return re.sub(r"\b(strict)=True\b", r"--\1", message)
 
 
 class OnceCommand(TyperCommand):
-    """Groups its options in its help, and refuses an option that is given twice and is no list."""
+    """A command that groups its options in its help and refuses repeated options that are no lists."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options in their groups."""
@@ -188,7 +188,7 @@ class OnceCommand(TyperCommand):
 
 
 class TransmitterCommand(OnceCommand):
-    """Takes `--tx X Y` and `--tx X Y Z`: an option with two or three values."""
+    """A command that takes `--tx X Y` and `--tx X Y Z`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
         """Join the numbers after --tx to one value."""
@@ -196,7 +196,7 @@ class TransmitterCommand(OnceCommand):
 
 
 def join_numbers(args: Sequence[str], option: str) -> list[str]:
-    """Join the numbers that follow `option`, negative ones too, to the one value that a parser can take."""
+    """Join the numbers after `option`, also negative ones, to one value."""
     joined: list[str] = []
     rest = list(args)
     while rest:
@@ -214,7 +214,7 @@ def join_numbers(args: Sequence[str], option: str) -> list[str]:
 
 
 def parse_position(text: str) -> tuple[float, ...]:
-    """Transmitter position from "X Y" or "X Y Z" [m]."""
+    """Return the position [m] of "X Y" or "X Y Z"."""
     words = text.replace(",", " ").split()
     if len(words) not in (2, 3) or not all(map(_is_number, words)):
         raise typer.BadParameter(f"--tx {text!r} is not a position: give --tx X Y or --tx X Y Z in metres.")
@@ -222,7 +222,7 @@ def parse_position(text: str) -> tuple[float, ...]:
 
 
 def parse_material(text: str) -> Material:
-    """Return the material of a name, as of `Material.named`, or of "permittivity,conductivity,thickness"."""
+    """Return the material of a name (`Material.named`), or of "permittivity,conductivity,thickness"."""
     words = text.split(",")
     if len(words) == 1:
         return Material.named(text)
@@ -238,10 +238,7 @@ def parse_material(text: str) -> Material:
 def read_measurements(
     path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None, access_point: str | None = None
 ) -> Any:
-    """Read the file of --measurements, with headers as --column has them; None if there is none.
-
-    `tx` is the transmitter's position for a file without it.
-    """
+    """Read the file of --measurements with the headers of --column; `tx` is the position for a file without one."""
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
     if wrong is not None:
@@ -257,13 +254,13 @@ def read_measurements(
 
 
 def parse_antenna(text: str, azimuth_deg: float, downtilt_deg: float) -> Any:
-    """Antenna from the name of a pattern, or the path of an MSI file, and where it points."""
+    """Return an antenna from the name of a pattern or the path of an MSI file, and its orientation."""
     pattern = sp.load_antenna(text) if Path(text).suffix else text
     return sp.Antenna(pattern, azimuth_deg, downtilt_deg)
 
 
 def for_each(values: Sequence[Any], count: int) -> Sequence[Any]:
-    """Values of an option that is given once for all transmitters, or once for each."""
+    """Return the values of an option that is given once for all transmitters, or once for each."""
     if len(values) not in (1, count):
         raise typer.BadParameter(f"{len(values)} values for {count} transmitters: give one for all, or one for each.")
     return values if len(values) == count else [*values] * count
@@ -276,7 +273,7 @@ def settings_of(
     diffraction: Diffraction = True,
     through_walls: ThroughWalls = None,
 ) -> dict[str, Any]:
-    """Return settings of scene and trace by the names of arguments; with diffraction where it is the default."""
+    """Return settings of scene and trace by names of arguments, with diffraction where it is the default."""
     trace = TraceSettings(frequency, max_depth, None if diffraction else False, refraction=through_walls)
     return {
         "scene_settings": SceneSettings(material=parse_material(material) if material else None),
@@ -347,11 +344,11 @@ Settings = Annotated[dict[str, Any], settings_of]
 PartialMap = Annotated[Any, _read_map]
 PartialMapIfGiven = Annotated[Any, _read_map_if_given]
 Sensor = Annotated[SensorSettings, _sensor]
-"""Parameters of commands that combine options, see `with_options`."""
+"""Parameters of commands that combine options; see `with_options`."""
 
 
 def with_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Put the options of functions, as `Annotated[..., function]`, in place of parameters that these make."""
+    """Replace parameters that are `Annotated[..., function]` by the options of the function."""
     options: dict[str, inspect.Parameter] = {}
     makers: dict[str, Callable[..., Any]] = {}
     for name, parameter in inspect.signature(command).parameters.items():
@@ -376,7 +373,7 @@ def with_options(command: Callable[..., None]) -> Callable[..., None]:
 
 @contextmanager
 def reporting_to(folder: Path, message: str) -> Iterator[Progress]:
-    """Check that a folder can be written, and report the progress of the work whose files go there."""
+    """Check that a folder can be written, and report progress."""
     require_writable(folder)
     with reporting(None, command=True) as report:
         report(0.0, message)
@@ -384,6 +381,6 @@ def reporting_to(folder: Path, message: str) -> Iterator[Progress]:
 
 
 def print_files(folder: Path, names: Sequence[str]) -> None:
-    """Print the files that were written."""
+    """Print written files."""
     for name in names:
         typer.echo(f"wrote {folder / name}")

@@ -1,4 +1,4 @@
-"""Subcommands on site: calibrate, place, next, and predictions of a map that grows or is edited: live, app."""
+"""Subcommands calibrate, place, next, live and app."""
 
 import json
 from pathlib import Path
@@ -161,7 +161,6 @@ def next_views(
 
 
 def _table(result: "sp.MaterialCalibration") -> str:
-    """Tabulate the materials, and how well they explain the measurements."""
     numbers = result.record()
     lines = []
     for which, (found, start) in enumerate(zip(result.materials, result.start, strict=True)):

@@ -1,4 +1,4 @@
-"""Subcommands that predict: predict, network, channels, export-scene, explore, demo, info."""
+"""Subcommands predict, network, channels, export-scene, explore, demo and info."""
 
 import math
 import re
@@ -18,21 +18,19 @@ from sionna_partial.files import atomic_files, read_columns
 from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
-"""Formats of a coverage map."""
 
 FRAMES = 50
-"""About the number of frames in an animation."""
+"""Approximate number of frames of an animation."""
 
 COLUMNS = (("x", "y", "z"), ("x_m", "y_m", "z_m"), ("rx_x", "rx_y", "rx_z"))
-"""Columns of positions, by any of these names."""
+"""Accepted names for columns of positions."""
 
 ROWS_BY_COLUMNS = "ROWSxCOLUMNS"
 
 POWER_DBM, THRESHOLD_DBM = 20.0, -67.0
-"""Transmit power of a Wi-Fi access point, and the received power for which networks are planned [dBm]."""
+"""Default transmit power and required received power of Wi-Fi [dBm]."""
 
 PICTURE = "coverage.png"
-"""Picture of a coverage map."""
 
 
 @opt.with_options
@@ -111,19 +109,19 @@ def predict(
 
 
 class _Budget(NamedTuple):
-    """Transmit power, and received power that a receiver needs [dBm]."""
+    """Transmit power and required received power [dBm]."""
 
     power_dbm: float
     threshold_dbm: float
 
     @property
     def gain_db(self) -> float:
-        """Path gain that a receiver needs [dB]."""
+        """Return the required path gain [dB]."""
         return min(max(self.threshold_dbm - self.power_dbm, GAIN_FLOOR_DB), 0.0)
 
 
 def _budget(power: float | None, threshold: float | None) -> _Budget | None:
-    """Return the budget with defaults; None if nothing was given."""
+    """Return the budget with defaults; None without arguments."""
     for name, value in (("--power", power), ("--threshold", threshold)):
         if value is not None:
             require_number(name, value, -200.0, 200.0)
@@ -133,7 +131,7 @@ def _budget(power: float | None, threshold: float | None) -> _Budget | None:
 
 
 def _covered(coverage: Any, budget: _Budget) -> str:
-    """Return the covered fractions of each room, and in the last line of the floor, as a text."""
+    """Return lines with the covered fractions of the rooms, the last one for the floor."""
     area = coverage.radio.area(budget.threshold_dbm, eirp_dbm=budget.power_dbm)
     rows = zip(area.floor.values, area.fraction.values, strict=True)
     parts = [(name, "none" if math.isnan(fraction) else f"{100 * fraction:.0f} %") for name, fraction in rows]
@@ -377,10 +375,9 @@ def _parse_shape(name: str, text: str) -> tuple[int, int]:
 
 
 def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
-    """Return positions (N, 3) in free cells [m]."""
     import numpy as np
 
-    from sionna_partial.coverage.dataset import grid_axes
+    from sionna_partial.coverage.job import grid_axes
 
     x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
     grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])
@@ -388,7 +385,6 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
 
 
 def _read_positions(path: Path) -> list[tuple[float, ...]]:
-    """Read positions [m] from a CSV."""
     remedy = "give a CSV with the columns x,y,z in metres."
     found, _ = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
     names = next((names for names in COLUMNS if found.keys() >= {*names}), None)

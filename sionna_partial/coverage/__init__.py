@@ -1,1 +1,1 @@
-"""Predict coverage maps, and the networks and link budgets that follow from them."""
+"""Predict coverage maps, networks of transmitters and link budgets."""

@@ -1,10 +1,9 @@
-"""Coverage maps: the variables of the xarray.Dataset that `predict_map` returns, and its accessor."""
+"""Variables of the coverage maps of `predict_map`, and the accessor ``coverage.radio``."""
 
 import json
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 from os import PathLike
@@ -14,60 +13,56 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, number_of, require, require_names, require_number, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
 from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.antennas import MAX_GAIN_DBI
-from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.tracing.stock import MapPlane, planar_radio_map, stock_gain_db
 
 WALL_PARTS = 6
-"""`wall_parts` has a bit for each of 6 x 6 parts of each cell, so that pictures show walls thinner than a cell."""
+"""Number of parts of a cell along each axis, so that pictures show walls thinner than a cell."""
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
-
-MAX_RECEIVERS = 2_000_000
-"""Largest number of receivers of a coverage map: more is a unit error or a job to cut in pieces."""
 
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 """Positions [m] along the dimension "tx" of the maps of several transmitters."""
 
 ROOM = "room"
-"""Variable with the rooms of a map that has names of rooms: flags, 0 for none."""
+"""Variable with the room of each receiver: flags, 0 for none."""
 
 ANTENNA = "tx_antenna"
-"""Attribute of the map of one transmitter, coordinate along "tx" of several: its antenna."""
+"""Antenna: attribute for one transmitter, coordinate along "tx" for several."""
 
 _OF_ALL = ("observed", "cell_state", "wall_parts", ROOM)
 """Variables that do not depend on the transmitter."""
 
-_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
-
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
-"""Required attributes besides the position of the transmitter, and their lower limits."""
+"""Required attributes and their lower limits."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
-"""Values of probabilities, gains, standard deviations and lengths; reflections may take near links past 0 dB."""
+"""Ranges of probabilities, gains (reflections may exceed 0 dB near the transmitter), standard deviations and lengths.
+"""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
 
-def _flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+def flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
+    """Return the CF attributes of a variable with flags."""
     return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
 
 
-_LINK_FLAGS = _flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
-_CELL_FLAGS = _flags({state.name.lower(): state for state in CellState})
-_YES_NO = _flags({"no": 0, "yes": 1}, np.int8)
+_LINK_FLAGS = flags({**{state.name.lower(): state for state in LinkState}, "no_receiver": NO_RECEIVER})
+_CELL_FLAGS = flags({state.name.lower(): state for state in CellState})
+_YES_NO = flags({"no": 0, "yes": 1}, np.int8)
 
 ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "p_los": {"long_name": "probability of line of sight", "units": "1"},
@@ -94,65 +89,13 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
         "the cell holds a wall; row 0 has the smallest y, column 0 the smallest x.",
     },
 }
-"""The variables of a coverage map on (y, x), and their CF attributes."""
-
-
-@dataclass(frozen=True)
-class Receivers:
-    """Receivers at the centres of a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
-
-    x_m: Floats
-    y_m: Floats
-    cell_state: States
-    valid: Bools
-    rx_m: Floats
-
-
-def grid_receivers(
-    partial: PartialMap, tx_m: Floats, rx_height_m: float, spacing_m: float, frequency_hz: float
-) -> Receivers:
-    """Return the receivers, those that are too near a wall or one of the transmitters (T, 3) [m] masked."""
-    require_height(partial, "rx_height_m", rx_height_m)
-    x_m, y_m = grid_axes(partial, spacing_m)
-    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
-    limit_m = nearest_m(frequency_hz)
-    cell_state = partial.state_at(points)
-    far = np.ones(cell_state.shape, dtype=bool)
-    for each_m in tx_m:
-        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
-    valid = far & clear_of_walls(partial, points)
-    if not far.any() and limit_m > SHORTEST_M:
-        raise PositionError(
-            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
-            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
-        )
-    if not valid.any():
-        raise PositionError(
-            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
-            f"spacing_m = {spacing_m:g}, give a smaller one."
-        )
-    return Receivers(x_m, y_m, cell_state, valid, points[valid])
-
-
-def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
-    """Return the x (nx,) and y (ny,) of all cell centres that lie on the map [m]."""
-    low = partial.resolution_m / 10
-    require_number("spacing_m", spacing_m, low, 1e6)
-    x0, y0, x1, y1 = partial.bounds_m
-    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
-    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
-    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
-    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
-    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
-    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
-    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
-    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
+"""Variables on (y, x) and their CF attributes."""
 
 
 def link_columns(
     phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Return the values (N,) of each variable that depends on the links."""
+    """Return the values (N,) of the variables that depend on the links."""
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
@@ -167,7 +110,7 @@ def link_columns(
 
 @cache
 def _versions() -> str:
-    """Names and versions of the packages, read once: each look takes memory where a folder of `sys.path` changes."""
+    """Return names and versions of the packages; reading them takes memory, hence the cache."""
     versions = {}
     for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
         with suppress(PackageNotFoundError):
@@ -176,10 +119,7 @@ def _versions() -> str:
 
 
 def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, Any]:
-    """Return the global attributes on the origin of the numbers; without a model the trace predicts.
-
-    No time of day: equal input gives equal files.
-    """
+    """Return the global attributes; no time of day, so that equal input gives equal files."""
     partial, (trace_settings, scene_settings) = simulation.partial, simulation.resolved
     return {
         "Conventions": "CF-1.11",
@@ -201,43 +141,8 @@ def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, 
     }
 
 
-def coverage_map(
-    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
-) -> xr.Dataset:
-    """Put the values (N,) of the valid receivers, by name, on their grid, and add the layers of the map."""
-    layers: dict[str, NDArray[Any]] = {
-        "observed": receivers.cell_state != CellState.UNKNOWN,
-        "valid": receivers.valid,
-        "cell_state": receivers.cell_state,
-        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
-    }
-    for name, values in columns.items():
-        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
-        layers[name][receivers.valid] = values
-    axes = {
-        name: (
-            name,
-            values,
-            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
-            {"_FillValue": None},
-        )
-        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
-    }
-    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
-    if partial.room is not None:
-        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
-        names = {"none": 0}
-        for number, name in enumerate(partial.room_names, 1):
-            word = "_".join(name.split())
-            names[word if word and word not in names else f"{word}_{number}"] = number
-        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **_flags(names)}
-    for name in (*DISTRIBUTION, "link_state"):
-        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
-    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
-
-
 def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
-    """Add where the transmitter may be."""
+    """Add the posterior of the transmitter position."""
     axes = {
         f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
         for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
@@ -249,7 +154,7 @@ def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.
 
 
 def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
-    """Join the maps of several transmitters along a dimension "tx"."""
+    """Join the maps of several transmitters along "tx"."""
     positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
     antennas = "tx", [each.attrs.pop(ANTENNA) for each in maps]
     coordinates: dict[str, Any] = {
@@ -263,7 +168,7 @@ def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
 
 
 def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
-    """Return the coverage of one transmitter, `transmitter_m` in its attributes; a SettingsError for anything else."""
+    """Return the coverage of one transmitter with `transmitter_m` in its attributes, or raise a SettingsError."""
     remedy = "give the xarray.Dataset that predict_map returned, or load it from its .nc file."
     kind = type(coverage).__name__
     if not isinstance(coverage, xr.Dataset):
@@ -294,7 +199,6 @@ def require_coverage(coverage: xr.Dataset) -> xr.Dataset:
 
 
 def _require_values(coverage: xr.Dataset) -> None:
-    """Raise a SettingsError for a grid or values that no coverage map has."""
     for name in ("x", "y"):
         steps_m = np.diff(np.asarray(coverage[name], dtype=np.float64))
         regular = bool((np.abs(steps_m - coverage.attrs["spacing_m"]) < 1e-3 * coverage.attrs["spacing_m"]).all())
@@ -319,7 +223,7 @@ def _require_values(coverage: xr.Dataset) -> None:
 
 
 def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the coverage of each transmitter by name, as `require_coverage` does; "" names a single one."""
+    """Return the coverage of each transmitter by name, "" for a single one; see `require_coverage`."""
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         return {"": require_coverage(coverage)}
     names = [str(name) for name in coverage["tx"].to_numpy()]
@@ -328,7 +232,7 @@ def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
 
 
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
-    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can stand; threshold in [-150, 0] dB."""
+    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can be; threshold in [-150, 0] dB."""
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
     return LinkPrediction(**columns).probability_above(threshold_db)
@@ -356,7 +260,7 @@ class CoverageAccessor:
 
     @property
     def _coverage(self) -> xr.Dataset:
-        """The coverage map as it is now: xarray keeps the accessor when variables are assigned."""
+        """Return the coverage map as it is now: xarray keeps the accessor when variables are assigned."""
         inner = ("y", "x") if {"y", "x"} <= self._given.sizes.keys() else ()
         return self._given.transpose(..., *inner)
 
@@ -369,16 +273,16 @@ class CoverageAccessor:
         later("export:save_coverage")(self._coverage, path)
 
     def probability_above(self, threshold_db: float) -> xr.DataArray:
-        """Return the probability (ny, nx), or (tx, ny, nx), that the path gain exceeds a threshold t [dB].
+        """Return the probability (ny, nx) or (tx, ny, nx) that the path gain exceeds a threshold t [dB].
 
-        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), where m
-        and s are `gain_los_mean_db`, `gain_los_std_db` and so on, and Phi is the normal distribution function: an
-        outage has a gain of -150 dB. It is NaN where no receiver can stand.
+        P(gain > t) = p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t), with m
+        and s from `gain_los_mean_db`, `gain_los_std_db` etc., and the normal distribution function Phi. NaN where no
+        receiver can be.
 
         Raises
         ------
         SettingsError
-            For a threshold that is no number of dB.
+            For a threshold that is not a finite number.
         """
         transmitters_of(self._coverage)
         above = probability_above(self._coverage, threshold_db)
@@ -392,19 +296,19 @@ class CoverageAccessor:
         Parameters
         ----------
         eirp_dbm : float or (T,) array-like
-            Equivalent isotropically radiated power [dBm], of all or of each of the T transmitters.
+            Equivalent isotropically radiated power [dBm], of all or each of the T transmitters.
         rx_gain_db : float
             Gain of the receiver's antenna [dB].
 
         Returns
         -------
         xarray.Dataset
-            `power_mean_dbm`, an outage counting as a path gain of -150 dB, and `power_std_db`.
+            `power_mean_dbm` (outage: path gain -150 dB) and `power_std_db`.
 
         Raises
         ------
         SettingsError
-            For a power or a gain that is none.
+            For a power or gain that is not a finite number.
         """
         return self._level("power", "dBm", self._offset_db(eirp_dbm, rx_gain_db))
 
@@ -421,8 +325,7 @@ class CoverageAccessor:
         Returns
         -------
         xarray.Dataset
-            `snr_mean_db`, an outage counting as a path gain of -150 dB, and `snr_std_db`. With interference:
-            `network_map`.
+            `snr_mean_db` (outage: path gain -150 dB) and `snr_std_db`. `network_map` includes interference.
         """
         budget = LinkBudget(noise_figure_db, bandwidth_hz)
         return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm)
@@ -436,24 +339,23 @@ class CoverageAccessor:
         noise_figure_db: float = 7.0,
         bandwidth_hz: float = 80e6,
     ) -> xr.DataArray:
-        """Return the mean rate [bit/s] of one spatial stream whose modulation and coding follow the SNR.
+        """Return the mean rate [bit/s] of one spatial stream with modulation and coding adapted to the SNR.
 
         Parameters
         ----------
         standard : {"wifi6", "wifi7", "nr"}
-            Wi-Fi: MCS 0 to 11 of IEEE 802.11ax, 0 to 13 of 802.11be, guard interval 0.8 us, each from the SNR of the
-            standard's receiver sensitivity at its noise figure of 10 dB. NR: MCS 0 to 28 of 3GPP TS 38.214, table
-            5.1.3.1-1, each from the SNR at which it is 0.6 of the Shannon bound (TR 36.942, annex A), less the overhead
-            of TS 38.306.
+            Wi-Fi: MCS 0 to 11 of IEEE 802.11ax, 0 to 13 of 802.11be, guard interval 0.8 us; required SNR from the
+            receiver sensitivity at a noise figure of 10 dB. NR: MCS 0 to 28 of 3GPP TS 38.214, table 5.1.3.1-1;
+            required SNR from 0.6 of the Shannon bound (TR 36.942, annex A), overhead of TS 38.306.
         bandwidth_hz : float
-            Channel bandwidth [Hz]: in Wi-Fi 20, 40, 80, 160 and (802.11be, from 5.925 GHz) 320 MHz, up to 40 MHz
-            below 3 GHz; in NR 5 to 100 MHz (FR1) or 50 MHz to 2 GHz (FR2).
+            Wi-Fi: 20, 40, 80, 160 and (802.11be, from 5.925 GHz) 320 MHz, up to 40 MHz below 3 GHz. NR: 5 to 100 MHz
+            (FR1) or 50 MHz to 2 GHz (FR2).
 
         Raises
         ------
         SettingsError
-            For another standard, a channel that it does not have, or a map at a frequency outside its bands: 1 to 7.125
-            GHz (802.11ax), 1 to 7.25 GHz (802.11be), 0.41 to 7.125 and 24.25 to 71 GHz (NR).
+            For a bandwidth that the standard lacks, or a frequency outside 1 to 7.125 GHz (802.11ax), 1 to 7.25 GHz
+            (802.11be), 0.41 to 7.125 and 24.25 to 71 GHz (NR).
         """
         budget = LinkBudget(noise_figure_db, bandwidth_hz)
         offset_db = self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm
@@ -474,24 +376,23 @@ class CoverageAccessor:
         rx_gain_db: float = 0.0,
         any_transmitter: bool = False,
     ) -> xr.Dataset:
-        """Return how much of the floor receives more than a power: "95 % of it above -67 dBm with probability 0.9".
+        """Return the covered fraction of the floor, as in "95 % above -67 dBm with probability 0.9".
 
         Parameters
         ----------
         threshold_dbm : float
-            Received power, as `power` computes it [dBm].
+            Received power [dBm], see `power`.
         probability : float
-            Required of each receiver, in [0, 1].
+            Required probability of a receiver, in [0, 1].
         any_transmitter : bool
-            Count receivers of several transmitters once, by the largest probability.
+            Combine several transmitters by their largest probability.
 
         Returns
         -------
         xarray.Dataset
-            On `floor`, "observed" (free cells), "all" (each receiver weighted by the probability that it is indoors; 1
-            in free cells) and each room of the map: `fraction` with at least that probability, `fraction_mean`, the
-            mean probability, and the size `area_m2`; NaN where there is no such floor. Several transmitters are on
-            `tx`.
+            On `floor`: "observed" (free cells), "all" (weighted by `p_indoor`; 1 in free cells) and the rooms of the
+            map. `fraction` has at least that probability, `fraction_mean` is the mean probability, `area_m2` the size.
+            Fractions are NaN on an empty floor. Several transmitters are on `tx`.
 
         Examples
         --------
@@ -523,15 +424,13 @@ class CoverageAccessor:
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
 
     def _rooms(self) -> dict[str, Bools]:
-        """Return the receivers (ny, nx) in each room by its name."""
         if ROOM not in self._coverage:
             return {}
         room = self._coverage[ROOM]
-        flags = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
-        return {name: room.to_numpy() == number for name, number in flags if number}
+        numbers = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
+        return {name: room.to_numpy() == number for name, number in numbers if number}
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
-        """Return the sum of EIRP and receiver gain, () or (T, 1, 1) [dB]."""
         maps = transmitters_of(self._coverage)
         require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
         offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
@@ -552,22 +451,20 @@ class CoverageAccessor:
         )
 
     def _probability_of(self, threshold_db: Floats) -> Floats:
-        """Return P(path gain > threshold), thresholds () or (T, 1, 1); an outage is never above."""
         columns = {name: self._coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
         return LinkPrediction(**columns).probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
 
     def radio_map(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> Any:
-        """Return the mean path gain as a radio map of Sionna RT, for `scene.preview`, `scene.render` and its own plots.
+        """Return the mean path gain as a radio map of Sionna RT, for `scene.preview`, `scene.render` and `show`.
 
-        Cells without receiver, or with an outage, are empty, as in Sionna RT. The transmitters of the scene are
-        replaced by the transmitters of the coverage.
+        Cells without receiver or in outage are empty. The transmitters of the coverage replace those in the scene.
 
         Parameters
         ----------
         scene : sionna.rt.Scene
             The scene of `export_scene`, loaded by `sionna.rt.load_scene`.
         scene_offset_m : (2,) or (3,) sequence of float
-            `scene_offset` in `map.yaml` of the exported scene, which is not 0 on maps far from the origin [m].
+            `scene_offset` [m] in `map.yaml` of the exported scene; not 0 on maps far from the origin.
 
         Returns
         -------
@@ -576,7 +473,7 @@ class CoverageAccessor:
         Raises
         ------
         SettingsError
-            For something else than a scene.
+            For anything but a scene.
         """
         plane, tx, maps = self._plane(scene_offset_m)
         return planar_radio_map(scene, plane, tx, np.stack([one["gain_mean_db"].to_numpy() for one in maps]))
@@ -584,24 +481,23 @@ class CoverageAccessor:
     def stock_gain(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> xr.DataArray:
         """Return the path gain [dB] that Sionna RT's `RadioMapSolver` finds in the exported scene, on the same grid.
 
-        Frequency, depth, kinds of interactions, rays and transmitters are taken from the coverage. Compare with
-        `partial_gain_db`, the trace of the same scene by this package: the solver averages over a cell the power that
-        enters it, misses rays, and counts crossed walls in the depth. `gain_mean_db` also predicts unobserved walls.
+        Settings and transmitters are taken from the coverage. Compare with `partial_gain_db`, the trace of the same
+        scene by this package: the solver averages power over cells, misses rays, and counts crossed walls in the depth.
 
         Parameters
         ----------
         scene, scene_offset_m
-            As of `radio_map`.
+            As in `radio_map`.
 
         Returns
         -------
         xarray.DataArray
-            On (y, x) or (tx, y, x): -150 dB where no ray arrives, NaN where no receiver can stand.
+            On (y, x) or (tx, y, x): -150 dB where no ray arrives, NaN where no receiver can be.
 
         Raises
         ------
         SettingsError
-            For something else than a scene, or a transmitter at the height of the receivers.
+            For anything but a scene, or a transmitter at the height of the receivers.
         """
         plane, tx, maps = self._plane(scene_offset_m)
         settings = TraceSettings(**json.loads(maps[0].attrs["trace_settings"]))
@@ -611,7 +507,6 @@ class CoverageAccessor:
         return found.rename("stock_gain_db").assign_attrs(attributes)
 
     def _plane(self, scene_offset_m: Sequence[float]) -> tuple[MapPlane, dict[str, Floats], list[xr.Dataset]]:
-        """Return the plane of the receivers, the transmitters by name in the scene, and the map of each."""
         maps, offset_m = transmitters_of(self._coverage), np.array([*scene_offset_m, 0.0])[:3]
         x_m, y_m = (self._coverage[name].to_numpy() - offset_m[axis] for axis, name in enumerate("xy"))
         attributes = self._coverage.attrs
@@ -625,7 +520,7 @@ class CoverageAccessor:
         Raises
         ------
         PositionError
-            If that is not on the map.
+            For a position off the map.
         """
         transmitters_of(self._coverage)
         half_m = float(self._coverage.attrs["spacing_m"]) / 2.0
@@ -647,7 +542,7 @@ class CoverageAccessor:
 
 
 def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
-    """Return the position of the transmitter, or the number of transmitters, as a text."""
+    """Return the position of the transmitter, or the number of transmitters, as text."""
     if len(maps) > 1:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()
@@ -658,33 +553,3 @@ def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
     else:
         position = f"at ({position}) m"
     return f"transmitter {position}" + (f", {antenna}" if antenna != "iso" else "")
-
-
-def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
-    """Return, bit by bit, which parts of each receiver's cell hold a wall."""
-    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
-    walls = walls.cumsum(axis=1, dtype=np.int32)
-    ny, nx = partial.shape
-    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
-    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    for row, (bottom, top) in enumerate(rows):
-        strip = walls[top] - walls[bottom]
-        for column, (left, right) in enumerate(columns):
-            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
-    return bits
-
-
-def _part_spans(
-    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
-) -> list[tuple[Indices, Indices]]:
-    """Return the first map cell, and the one after the last, that each part of the receivers' cells overlaps."""
-    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
-    step = spacing_m / resolution_m / WALL_PARTS
-    return [
-        (
-            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
-            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
-        )
-        for part in range(WALL_PARTS)
-    ]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -10,10 +11,10 @@ from typing import Any, TypeAlias
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.checks import (
     Progress,
     float_array,
@@ -22,14 +23,17 @@ from sionna_partial.checks import (
     require_choice,
     require_memory,
     require_names,
+    require_number,
     transmitter_names,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB
+from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage.dataset import (
     ANTENNA,
-    Receivers,
-    coverage_map,
-    grid_receivers,
+    ATTRIBUTES,
+    DISTRIBUTION,
+    ROOM,
+    WALL_PARTS,
+    flags,
     join_transmitters,
     link_columns,
     provenance,
@@ -38,7 +42,7 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, with_height
+from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
@@ -50,33 +54,38 @@ from sionna_partial.measurements.measurements import (
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
-from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 RECEIVERS = ("indoor", "anywhere")
 """Receivers that probabilities and gains refer to: indoors (default), or anywhere."""
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
-"""Antennas of transmitters: one of all, or one for each."""
+"""Antennas of transmitters: one for all, or one each."""
 
 POSITIONS = 8
-"""Number of positions of an unknown transmitter over which coverage is averaged."""
+"""Number of positions over which the coverage of an unknown transmitter is averaged."""
 
 LARGE_OFFSET_DB = 15.0
-"""Offset between measurements and predictions from which on they are powers and not path gains [dB]."""
+"""Smallest offset between measurements and predictions that is logged as an offset of powers [dB]."""
 
 UNSURE_P = 0.05
-"""Probability of the less probable kind of measurements, powers or path gains, from which on a warning is logged."""
+"""Smallest probability of the less probable kind of measurements (powers or path gains) that is logged."""
 
 LOCATING_FRACTION = 0.3
 """Fraction of the progress bar for finding a transmitter."""
 
 LIBRARIES_GB, CELL_BYTES, RECEIVER_BYTES, WORK_BYTES = 1.0, 40, 400, 120_000
-"""Memory of the process with all libraries [GB], of a cell of the map, of a receiver, and of a receiver of the block
-that is predicted [bytes]; `benchmarks/scale.py` measures them."""
+"""Memory of the libraries [GB], of a map cell, a receiver and a receiver in a block [bytes], from
+`benchmarks/scale.py`."""
 
 BLOCK_RECEIVERS = (500, 8_000)
-"""Smallest and largest number of receivers of a block."""
+"""Smallest and largest size of a block."""
+
+MAX_RECEIVERS = 2_000_000
+"""Largest number of receivers of a coverage map."""
+
+_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _log = logging.getLogger(__name__)
 
@@ -100,72 +109,70 @@ def predict_map(
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
     The known part of the map is traced. The predictor turns the traced links and the unobserved lengths into
-    distributions (paper, Section III). On a complete map the trace itself is the prediction.
+    distributions (paper, Section III). On a complete map the trace is the prediction.
 
-    Probabilities and gains hold for a receiver that is indoors, as in the paper; `p_indoor` is the probability that it
-    is. With ``receivers="anywhere"`` they include receivers outdoors, whose links count as outages. On a complete map
-    a receiver is indoors wherever a cell is free, and outdoors elsewhere.
+    Probabilities and gains are conditional on an indoor receiver, as in the paper; `p_indoor` is the probability of
+    that. With ``receivers="anywhere"`` they include outdoor receivers, which are in outage. On a complete map free
+    cells are indoors, all others outdoors.
 
-    Receivers inside walls, within 1.1 cm of a wall or at the transmitter (within 1.1 cm, or within wavelength / 4 pi,
-    where Friis' formula is above 0 dB) are left out: `valid` is False there, floating-point variables and link states
-    are NaN. A NetCDF file holds these link states as 255, its `_FillValue`.
+    Receivers within 1.1 cm of a wall or of the transmitter (or within wavelength / 4 pi, where Friis' formula exceeds 0
+    dB) have `valid` False and NaN in floating-point variables and link states. A NetCDF file stores these link states
+    as 255, its `_FillValue`.
 
-    Without `tx`, the position of the transmitter is found from measurements: `p_transmitter` is its posterior, and
+    Without `tx`, the transmitter is located by measurements: `p_transmitter` is the posterior of its position, and
     probabilities and gains are averaged over 8 positions drawn from it.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        The map, or a file that `load_map` reads. With a `LinkModel`, later calls are faster.
+        A map, or a file that `load_map` reads. With a `LinkModel`, later calls are faster.
     tx : (3,) or (2,) array-like, (T, 3) array-like, mapping of names to positions, or None
-        Transmitter position [m]; 1.5 m high where no z is given. It may be in unknown space. Several are named "tx1",
-        "tx2" and so on, or as in the mapping. None if it is not known: then `measurements` are of one transmitter,
-        1.5 m high unless they have its z.
+        Transmitter position [m], also in unknown space; z is 1.5 m by default. Several are named "tx1", "tx2" etc., or
+        as in the mapping. None if unknown: `measurements` then are of one transmitter, 1.5 m high unless they have its
+        z.
     tx_antenna : Antenna, AntennaPattern or str, a sequence of these or mapping of names to them, optional
-        Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains then
-        include the antenna. Link states do not depend on the antenna: a link in a null of the pattern has a low gain,
-        and is no outage.
+        Antenna of the transmitter, or of each of several; isotropic and vertically polarised by default. Gains include
+        it; link states do not depend on it, a link in a null of the pattern is no outage.
     rx_height_m : float
         Height of the receivers [m].
     spacing_m : float
-        Distance between receivers [m]. Their grid starts half of it inside the lower-left corner of the map.
+        Distance between receivers [m]. The grid starts half of it inside the lower-left corner of the map.
     predictor : None, "map", "paper", path or Predictor
-        None is the shipped default, "map"; a path is a predictor that you saved. On a complete map it is not used.
+        None is the shipped default, "map"; a path is a saved predictor. Not used on a complete map.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     measurements : Measurements, mapping, data frame or path, optional
-        Gains that were measured of this transmitter (see `Measurements`), which improve the prediction of other
-        receivers (`Assimilation`). Those of transmitters farther than 0.5 m from `tx` are
-        not used where walls are opaque; through walls they teach the material of walls and the offset of powers.
-        Where the material is unknown, the attribute `wall_material` of the map has its probabilities, and
-        `wall_loss_db` the expected loss of a wall.
+        Measured gains (see `Measurements`), which improve the prediction of other receivers (`Assimilation`). Gains of
+        transmitters farther than 0.5 m from `tx` are not used where walls are opaque; through walls they contribute to
+        the material of walls and the offset of powers. Where the material is unknown, the attributes `wall_material`
+        and `wall_loss_db` contain its probabilities and the expected loss of a wall.
     receivers : {"indoor", "anywhere"}
-        Probabilities and gains given that a receiver is indoors, or of one that may be outdoors, in outage.
+        Receivers that probabilities and gains refer to.
     memory_gb : float
         Memory limit of the process [GB]. Receivers are traced and predicted in blocks that fit.
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(fraction_done, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        False shows none; a callable is called as ``progress(fraction_done, message)``. Default: a bar in terminals and
+        notebooks after 2 s.
 
     Returns
     -------
     xarray.Dataset
-        On (y, x), in metres: the variables of `ATTRIBUTES`, and the settings, versions and predictor in attributes.
-        With several transmitters what depends on them is on (tx, y, x); ``.sel(tx=name)`` is the map of one.
-        Without `tx` also `p_transmitter` on (tx_y, tx_x), the probability of each cell; the attribute `transmitter_m`
-        is then the position from which the expected distance is smallest, `transmitter_std_m` the root mean square
-        distance from it, and the features belong to the drawn position nearest to it.
+        On (y, x) [m]: the variables of `ATTRIBUTES`, with settings, versions and predictor in attributes. Variables
+        that depend on several transmitters are on (tx, y, x); ``.sel(tx=name)`` selects one. Without `tx` also
+        `p_transmitter` on (tx_y, tx_x), the probability of each cell; the attribute `transmitter_m` is then the
+        position with the smallest expected distance, `transmitter_std_m` the root mean square distance from it, and the
+        features are from the drawn position nearest to it.
 
     Raises
     ------
     MapError
         If the map cannot be read.
     MemoryLimitError
-        If the job cannot be done within `memory_gb`; nothing was begun.
+        If the job needs more than `memory_gb`, before it begins.
     MeasurementError
         If the measurements cannot be read, or none is usable.
     PositionError
-        For a transmitter outside the map or in a wall, or if no receiver can be anywhere.
+        For a transmitter outside the map or in a wall, or if no receiver is valid.
     SettingsError
         For a height, spacing or frequency out of range, or another value of `receivers`.
     PredictorError
@@ -204,8 +211,19 @@ def predict_map(
 
 
 @dataclass(frozen=True)
+class Receivers:
+    """Receivers on a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
+
+    x_m: Floats
+    y_m: Floats
+    cell_state: States
+    valid: Bools
+    rx_m: Floats
+
+
+@dataclass(frozen=True)
 class Transmitter:
-    """A transmitter to predict; `position_m` (3,) is None if it is to be found from the measurements."""
+    """A transmitter to predict; `position_m` (3,) is None if measurements locate it."""
 
     name: str
     position_m: Floats | None
@@ -216,7 +234,7 @@ class Transmitter:
 
 @dataclass(frozen=True)
 class _Source:
-    """Possible positions (K, 3) [m] of a transmitter, weights (K,), an assimilation for each, and the best estimate."""
+    """Possible positions (K, 3) [m] of a transmitter, their weights (K,) and assimilations, and the best estimate."""
 
     tx_m: Floats
     weights: Floats
@@ -227,7 +245,7 @@ class _Source:
 
 @dataclass(frozen=True)
 class CoverageJob:
-    """Predicts the coverage of one transmitter after the other, `block` receivers at a time."""
+    """Coverage of one transmitter after the other, `block` receivers at a time."""
 
     model: LinkModel
     rx_height_m: float
@@ -235,16 +253,16 @@ class CoverageJob:
     receivers: str
     block: int
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
-    """Assimilated measurements of other transmitters, for each transmitter."""
+    """Assimilated measurements of other transmitters, by the name of the transmitter they are used for."""
 
     def coverage(self, transmitter: Transmitter, report: Progress) -> tuple[xr.Dataset, Floats]:
-        """Predict the coverage map of a transmitter, and the probabilities (K,) of the materials of walls."""
+        """Return the coverage map of a transmitter, and the probabilities (K,) of the materials of walls."""
         model, measured, grid = self.model, transmitter.measured, transmitter.grid
         posterior = None
         if transmitter.position_m is None:
             posterior = self._located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
-            grid = receivers_of(model, source.tx_m, self.rx_height_m, self.spacing_m)
+            grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m)
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
@@ -271,9 +289,9 @@ class CoverageJob:
     def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
         """Return the job with the measurements of other transmitters assimilated, each alone.
 
-        They give the prior of offset and loss of walls. Where walls are opaque, or where the transmitter is unknown,
-        they are not used. A transmitter that is predicted has its own antenna. The antenna of any other one is taken
-        to be like the antenna of the transmitter that it is used for, in an unknown orientation.
+        They give the prior of offset and loss of walls, except where walls are opaque or the transmitter is unknown.
+        Transmitters that are not predicted are assumed to have the antenna of the predicted one, in an unknown
+        orientation.
         """
         settings = self.model.simulation.trace_settings
         sources_m = [each.position_m[None] for each in transmitters if each.position_m is not None]
@@ -302,7 +320,6 @@ class CoverageJob:
         p_powers: Sequence[float | None],
         position_m: Floats,
     ) -> _Source:
-        """Assimilate the measurements for each possible position (K, 3) [m]."""
         p_any = float(weights @ [p or 0.0 for p in p_powers])
         if min(p_any, 1.0 - p_any) > UNSURE_P:
             _log.warning(
@@ -319,7 +336,6 @@ class CoverageJob:
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
     def _averaged(self, source: _Source, rx_m: Floats, report: Progress) -> Iterator[PredictedLinks]:
-        """Yield blocks of the links to receivers (N, 3) [m], averaged over the positions."""
         tx_m, begin = source.tx_m, LOCATING_FRACTION * (len(source.tx_m) > 1)
         nearest = int(np.linalg.norm(tx_m - source.position_m, axis=1).argmin())
         for start in range(0, len(rx_m), self.block):
@@ -346,7 +362,7 @@ class CoverageJob:
     def _prior(
         self, tx_m: Floats, rx_m: Floats, antenna: Antenna, *, at_rx: bool = False
     ) -> tuple[LinkPrediction, Floats, Floats]:
-        """Predict the links to any number of receivers (N, 3) [m] without the antenna, its gain, and P(indoor)."""
+        """Predict links to receivers (N, 3) [m] without the antenna; also return its gain and P(indoor)."""
         parts_m = [rx_m[start : start + self.block] for start in range(0, max(len(rx_m), 1), self.block)]
         blocks = [self.model.links(tx_m, part_m, no_progress, antenna, at_rx=at_rx) for part_m in parts_m]
         antenna_db = np.concatenate([links.antenna_db for links in blocks])
@@ -354,7 +370,6 @@ class CoverageJob:
         return LinkPrediction.concatenate([links.prediction for links in blocks]), antenna_db, p_indoor
 
     def _located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
-        """Find a transmitter from its measurements."""
         partial, measured = self.model.partial, transmitter.measured
         assert measured is not None
         measured_at, limit_m = cKDTree(measured.rx), nearest_m(self.model.simulation.trace_settings.frequency_hz)
@@ -370,7 +385,6 @@ class CoverageJob:
         return locate_transmitter(partial, measured, allowed, predict, part, through_walls=through_walls)
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
-        """Predict the measured links of a transmitter at (3,) [m], and fit the process to them."""
         prior, antenna_db, _ = self._prior(tx_m, measured.rx, antenna)
         settings = self.model.simulation.trace_settings
         options |= {
@@ -389,7 +403,7 @@ def _transmitters(
     rx_height_m: float,
     spacing_m: float,
 ) -> tuple[list[str] | None, list[Transmitter]]:
-    """Check the transmitters, and read their measurements; names are None for a single one."""
+    """Check the transmitters and read their measurements; names are None for a single one."""
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     names: list[str] | None = None
     positions_m: list[Floats | None] = [None]
@@ -400,7 +414,7 @@ def _transmitters(
     for antenna in {*antennas}:
         antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
-    grids = [receivers_of(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
+    grids = [grid_receivers(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)
     if measurements is not None:
         measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
@@ -408,16 +422,10 @@ def _transmitters(
     return names, [Transmitter(*row) for row in rows]
 
 
-def receivers_of(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
-    """Return the grid of receivers for transmitters (K, 3) [m]."""
-    frequency_hz = model.simulation.trace_settings.frequency_hz
-    return grid_receivers(model.partial, tx_m, rx_height_m, spacing_m, frequency_hz)
-
-
 def transmitter_positions(
     partial: PartialMap, tx: ArrayLike | Mapping[str, ArrayLike] | None
 ) -> tuple[list[str] | None, Floats]:
-    """Return the names of several transmitters, None for one, and positions (T, 3) [m]."""
+    """Return the names of several transmitters (None for one), and positions (T, 3) [m]."""
     if tx is None:
         raise PositionError("tx = None: give x, y and z in metres, or measurements that its position is found from.")
     positions = list(tx.values()) if isinstance(tx, Mapping) else tx
@@ -440,7 +448,7 @@ def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]
 
 
 def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: float) -> int:
-    """Return how many receivers are predicted together, or raise a MemoryLimitError if the limit is too low."""
+    """Return the number of receivers of a block, or raise a MemoryLimitError."""
     count, (fewest, most) = len(receivers.rx_m), BLOCK_RECEIVERS
     kept_gb = LIBRARIES_GB + (CELL_BYTES * partial.state.size + RECEIVER_BYTES * receivers.valid.size) / 1e9
     needed_gb = kept_gb + WORK_BYTES * min(count, fewest) / 1e9
@@ -454,7 +462,6 @@ def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: floa
 
 
 def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
-    """Return attributes of the measurements; a large offset is logged."""
     of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
     noise_db, offset_db, shadow_scale = source.weights @ of_each
     if abs(offset_db) > LARGE_OFFSET_DB:
@@ -469,3 +476,108 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
         "measured_offset_db": float(offset_db),
         "measured_shadow_scale": float(shadow_scale),
     }
+
+
+def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
+    """Return the receivers; receivers too near a wall or a transmitter (T, 3) [m] are masked."""
+    partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
+    require_height(partial, "rx_height_m", rx_height_m)
+    x_m, y_m = grid_axes(partial, spacing_m)
+    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
+    limit_m = nearest_m(frequency_hz)
+    cell_state = partial.state_at(points)
+    far = np.ones(cell_state.shape, dtype=bool)
+    for each_m in tx_m:
+        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
+    valid = far & clear_of_walls(partial, points)
+    if not far.any() and limit_m > SHORTEST_M:
+        raise PositionError(
+            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
+            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
+        )
+    if not valid.any():
+        raise PositionError(
+            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
+            f"spacing_m = {spacing_m:g}, give a smaller one."
+        )
+    return Receivers(x_m, y_m, cell_state, valid, points[valid])
+
+
+def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
+    """Return x (nx,) and y (ny,) [m] of the cell centres on the map."""
+    low = partial.resolution_m / 10
+    require_number("spacing_m", spacing_m, low, 1e6)
+    x0, y0, x1, y1 = partial.bounds_m
+    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
+    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
+    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
+    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
+    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
+    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
+    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
+    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
+
+
+def coverage_map(
+    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
+) -> xr.Dataset:
+    """Put the values (N,) of the valid receivers on their grid, and add the layers of the map."""
+    layers: dict[str, NDArray[Any]] = {
+        "observed": receivers.cell_state != CellState.UNKNOWN,
+        "valid": receivers.valid,
+        "cell_state": receivers.cell_state,
+        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
+    }
+    for name, values in columns.items():
+        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
+        layers[name][receivers.valid] = values
+    axes = {
+        name: (
+            name,
+            values,
+            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
+            {"_FillValue": None},
+        )
+        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
+    }
+    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
+    if partial.room is not None:
+        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
+        names = {"none": 0}
+        for number, name in enumerate(partial.room_names, 1):
+            word = "_".join(name.split())
+            names[word if word and word not in names else f"{word}_{number}"] = number
+        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **flags(names)}
+    for name in (*DISTRIBUTION, "link_state"):
+        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
+    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
+
+
+def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
+    """Return (ny, nx) bits: the parts of the cell that contain a wall."""
+    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
+    walls = walls.cumsum(axis=1, dtype=np.int32)
+    ny, nx = partial.shape
+    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
+    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
+    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
+    for row, (bottom, top) in enumerate(rows):
+        strip = walls[top] - walls[bottom]
+        for column, (left, right) in enumerate(columns):
+            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
+    return bits
+
+
+def _part_spans(
+    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
+) -> list[tuple[Indices, Indices]]:
+    """Return the first map cell, and one after the last, that each part of the receivers' cells overlaps."""
+    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
+    step = spacing_m / resolution_m / WALL_PARTS
+    return [
+        (
+            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
+            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
+        )
+        for part in range(WALL_PARTS)
+    ]

@@ -1,4 +1,4 @@
-"""Link budgets: received power, noise, SNR, and the rates of the modulation and coding schemes (MCS) of standards."""
+"""Link budgets: received power, noise, SNR, and rates of modulation and coding schemes (MCS)."""
 
 import math
 from dataclasses import dataclass
@@ -15,16 +15,14 @@ NOISE_DENSITY_DBM_HZ = -174.0
 """Thermal noise at 290 K [dBm/Hz]."""
 
 RATES = ("wifi6", "wifi7", "nr")
-"""Standards with a table of MCS."""
 
 _BITS = (0.5, 1, 1.5, 2, 3, 4, 4.5, 5, 6, 20 / 3, 7.5, 25 / 3, 9, 10)
 _SENSITIVITY_DBM = (-82, -79, -77, -74, -70, -66, -65, -64, -59, -57, -54, -52, -49, -46)
-"""Coded bits of a subcarrier, and minimum receiver sensitivity at 20 MHz, of MCS 0 to 11 (IEEE 802.11ax-2021, clause
-27.3.20.2) and 12 and 13 (IEEE 802.11be-2024, clause 36.3.21.2). The first twelve were compared with published copies of
-the standard's table, the last two were not: they go on in steps of 3 dB."""
+"""Coded bits of a subcarrier, and minimum sensitivity at 20 MHz, of MCS 0 to 11 (IEEE 802.11ax-2021, clause 27.3.20.2)
+and 12 and 13 (IEEE 802.11be-2024, clause 36.3.21.2; not compared with the standard, continued in steps of 3 dB)."""
 
 _SENSITIVITY_HZ, _NOISE_FIGURE_DB, _SYMBOL_S = 20e6, 10.0, 13.6e-6
-"""Bandwidth and noise figure of these sensitivities, with 5 dB of implementation loss; symbol with guard interval."""
+"""Bandwidth and noise figure of these sensitivities; symbol with guard interval."""
 
 _SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
 """Data subcarriers of a channel of one user."""
@@ -32,15 +30,15 @@ _SUBCARRIERS = {20e6: 234, 40e6: 468, 80e6: 980, 160e6: 1960, 320e6: 3920}
 _NR_QPSK = (120, 157, 193, 251, 308, 379, 449, 526, 602, 679)
 _NR_16QAM = (340, 378, 434, 490, 553, 616, 658)
 _NR_64QAM = (466, 517, 567, 616, 666, 719, 772, 822, 873, 910, 948)
-"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1; compared with published copies except 873 and 910); MCS 17,
-which is no faster than 16, is left out."""
+"""Code rates x 1024 (3GPP TS 38.214, table 5.1.3.1-1) without MCS 17, which is no faster than 16. 873 and 910 were not
+compared with the standard."""
 
 _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
 """Overhead of the downlink (3GPP TS 38.306, clause 4.1.2)."""
 
 
 class Band(NamedTuple):
-    """Frequencies of a band, and its channel bandwidths [Hz]: all of Wi-Fi, smallest and largest of NR."""
+    """A frequency band and its channel bandwidths [Hz]: all of Wi-Fi, smallest and largest of NR."""
 
     low_hz: float
     high_hz: float
@@ -53,10 +51,10 @@ BANDS = {
     "wifi7": (Band(1e9, 3e9, _WIFI_HZ[:2]), Band(3e9, 5.925e9, _WIFI_HZ[:4]), Band(5.925e9, 7.25e9, _WIFI_HZ)),
     "nr": (Band(410e6, 7.125e9, (5e6, 100e6)), Band(24.25e9, 71e9, (50e6, 2e9))),
 }
-"""Bands of each standard (IEEE 802.11ax: 1 to 7.125 GHz, 802.11be: up to 7.25 GHz; 3GPP TS 38.104: FR1 and FR2)."""
+"""Bands (IEEE 802.11ax and 802.11be; 3GPP TS 38.104: FR1 and FR2)."""
 
 _NR_SHANNON = 0.6
-"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A, which is of LTE up to 4.4 bit/s/Hz)."""
+"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A: LTE up to 4.4 bit/s/Hz)."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +68,12 @@ class LinkBudget(Checked):
 
     @property
     def noise_dbm(self) -> float:
-        """Thermal noise plus noise figure [dBm]."""
+        """Return thermal noise plus noise figure [dBm]."""
         return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
 
 
 def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power_dbm") -> Floats:
-    """Return the powers (count,) of transmitters [dBm], or raise a SettingsError."""
+    """Return the powers (count,) of transmitters [dBm]."""
     remedy = f"give one power [dBm], or one for each of the {count} transmitters, from -200 to 200."
     found = float_array(name, powers_dbm, SettingsError, remedy)
     allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())
@@ -84,7 +82,7 @@ def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power
 
 
 class Scheme(NamedTuple):
-    """A modulation and coding scheme: the least SNR [dB] at which it is used, and its rate [bit/s]."""
+    """A modulation and coding scheme: the lowest SNR at which it is used, and its rate."""
 
     snr_db: float
     rate_bit_s: float
@@ -93,13 +91,7 @@ class Scheme(NamedTuple):
 def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Scheme]:
     """Return the schemes of a standard for one spatial stream, the slowest first.
 
-    Wi-Fi: the SNR of the standard's minimum sensitivity at a noise figure of 10 dB. NR, whose standard has none: the
-    SNR at which 0.6 of the Shannon bound is the spectral efficiency.
-
-    Raises
-    ------
-    SettingsError
-        For another standard, or a frequency or bandwidth that it does not have.
+    The SNR follows from the minimum sensitivity (Wi-Fi), or from 0.6 of the Shannon bound (NR).
     """
     require_choice("standard", standard, RATES)
     _require_band(standard, bandwidth_hz, frequency_hz)
@@ -120,7 +112,6 @@ def schemes(standard: str, bandwidth_hz: float, frequency_hz: float) -> list[Sch
 
 
 def _require_band(standard: str, bandwidth_hz: float, frequency_hz: float) -> None:
-    """Raise a SettingsError unless the standard has such channels at that frequency."""
     bands = BANDS[standard]
     ends = sorted({band.low_hz for band in bands} ^ {band.high_hz for band in bands})  # without ends that two share
     spans = " and ".join(f"{low / 1e9:g} to {high / 1e9:g}" for low, high in zip(ends[::2], ends[1::2], strict=True))

@@ -57,10 +57,11 @@ def network_map(
 ) -> xr.Dataset:
     """Predict best server, SINR and rate of a network, from the coverage of its transmitters.
 
-    Links of several transmitters are drawn together (`JointLatents`): one unseen wall blocks all of them. In each draw
-    a receiver is served by the strongest transmitter, and the others interfere:
-    ``SINR = P_b / (N + load * sum of the other P)``, with the received powers P = transmit power x path gain and the
-    noise N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate is bandwidth x log2(1 + SINR).
+    Links are drawn jointly (`JointLatents`), because one unseen wall blocks several of them. In each draw a receiver is
+    served by the strongest transmitter, and the others interfere: ``SINR = P_b / (N + load * sum of the other P)``,
+    with
+    P = transmit power x path gain and N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate is
+    bandwidth x log2(1 + SINR).
 
     Parameters
     ----------
@@ -76,14 +77,14 @@ def network_map(
     sinr_threshold_db : float
         Threshold of `p_sinr_above` [dB].
     n : int
-        Number of draws, up to 1,000.
+        Number of draws, at most 1,000.
     seed : int
         Seed of the draws.
 
     Returns
     -------
     xarray.Dataset
-        The `VARIABLES` on (y, x); NaN where no receiver stands. SINRs below -60 dB count as -60 dB.
+        The `VARIABLES` on (y, x); NaN where no receiver can be. SINRs below -60 dB count as -60 dB.
 
     Raises
     ------
@@ -144,14 +145,12 @@ def require_network(network: xr.Dataset) -> None:
 
 
 def _map_of(coverage: xr.Dataset) -> PartialMap:
-    """Return the part of the map that the coverage shows, at its receivers."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = (float(coverage["x"][0]) - spacing_m / 2, float(coverage["y"][0]) - spacing_m / 2)
     return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)
 
 
 def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[Any]]:
-    """Variables of receivers from their draws (n, T, N)."""
     power_mw = 10.0 ** (received_dbm / 10.0)
     best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
     received = best_mw > 0.0

@@ -1,1 +1,1 @@
-"""Live coverage: a robot's messages, by DDS, rosbridge or from a recording -> grids for its planner."""
+"""Live coverage: messages of a robot by DDS, rosbridge or from a recording -> grids for its planner."""

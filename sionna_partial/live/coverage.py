@@ -1,4 +1,4 @@
-"""LiveCoverage: messages of a robot -> the coverage of its newest map, first coarse and then fine; no transport."""
+"""LiveCoverage: messages of a robot -> coverage of its newest map, first coarse, then fine; without a transport."""
 
 import functools
 import logging
@@ -39,20 +39,19 @@ from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 LATE_S = 30.0
-"""A map whose stamp is older than the last stamp by less is late and is dropped; by more, the robot's clock has started
-again [s]."""
+"""Maps older than the last one by less are late and dropped; by more, the robot's clock was restarted [s]."""
 
 POSE_AGE_S = 2.0
-"""Time for which the last pose of the robot counts as where it is [s]."""
+"""Time for which the last pose of the robot is used [s]."""
 
 POWER_CELL_M = 0.25
-"""Edge of the squares in each of which the newest power of a transmitter is kept [m]."""
+"""Edge of squares that keep the newest power of a transmitter [m]."""
 
 MOST_POWERS = 500
-"""Number of powers of a transmitter that are kept, the newest ones."""
+"""Number of powers that are kept of a transmitter."""
 
 REPEATED_S, MOST_LINES = 60.0, 50
-"""Time for which a line is not logged again [s], and the number of lines for which that is remembered."""
+"""Time for which a line is not logged again [s], and number of lines that are remembered."""
 
 _log = logging.getLogger(__name__)
 
@@ -64,20 +63,19 @@ class LiveSettings(Checked):
     Parameters
     ----------
     frame : str
-        Frame in which the transmitters are given and maps are taken; "" is the frame of the first map.
+        Frame of transmitters and maps; "" is the frame of the first map.
     threshold_db : float
         Path gain up to which a cell counts as not covered [dB].
     spacing_m, rx_height_m : float
-        Distance between the receivers of the final answer, and their height [m].
+        Spacing of the receivers in the final answer, and their height [m].
     tx_power_dbm : float
-        Subtracted from measured powers [dBm]; 0 where it is not known: a common offset is estimated.
+        Subtracted from measured powers [dBm]; 0 if unknown, as a common offset is estimated.
     refresh_s : float
-        Shortest time between two answers for one map, as measured powers come in [s].
+        Shortest time between two answers for one map while powers arrive [s].
     views_every_s : float
-        Time between two lists of next views [s]; 0 lists them on request alone.
+        Time between two lists of next views [s]; 0 lists them on request only.
     max_cost : int
-        Largest value of a published grid [percent]; greater probabilities of outage are set to it. Nav2 reads 99 as an
-        inscribed obstacle and 100 as an obstacle.
+        Largest value of a published grid [percent]: nav2 reads 99 as an inscribed obstacle and 100 as an obstacle.
 
     Examples
     --------
@@ -102,22 +100,22 @@ class LiveGrid(NamedTuple):
     Parameters
     ----------
     name : str
-        The transmitter's.
+        Name of the transmitter.
     map_number : int
-        Number of maps that had been taken, including this one.
+        Number of the map, from 1.
     is_final : bool
-        False of the coarse answer, true of the fine one.
+        False for the coarse answer.
     coverage : xarray.Dataset
-        As `predict_map` returns it.
+        From `predict_map`.
     cost : (ny, nx) int8 array
         P(path gain <= threshold) in percent, at most `LiveSettings.max_cost`, on the cells of the message; -1 in walls
-        and in cells that the map does not know.
+        and unknown cells.
     unknown_cost : (ny, nx) int8 array
-        The predictions for the cells that the map does not know; -1 in all others.
+        Values of the unknown cells; -1 in all others.
     header, info : dict
-        Those of the map, as `nav_msgs/OccupancyGrid` has them.
+        Fields of the `nav_msgs/OccupancyGrid` of the map.
     age_s : float
-        Time since the map was taken [s].
+        Time since the map arrived [s].
     """
 
     name: str
@@ -131,25 +129,25 @@ class LiveGrid(NamedTuple):
     age_s: float
 
     def message(self, *, unknown: bool = False) -> dict[str, Any]:
-        """Return the fields of a `nav_msgs/OccupancyGrid` with `cost`, or with `unknown_cost`."""
+        """Return a `nav_msgs/OccupancyGrid` of `cost` or `unknown_cost` as a dict."""
         data = self.unknown_cost if unknown else self.cost
         return {"header": self.header, "info": self.info, "data": data.ravel().tolist()}
 
 
 class LiveViews(NamedTuple):
-    """The best next views on one map."""
+    """Best next views on one map."""
 
     views: NextViews
     header: dict[str, Any]
 
     def message(self) -> dict[str, Any]:
-        """Return the fields of a `geometry_msgs/PoseArray`."""
+        """Return a `geometry_msgs/PoseArray` as a dict."""
         return {"header": self.header, "poses": self.views.poses()}
 
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """An OccupancyGrid that has been checked."""
+    """A checked OccupancyGrid."""
 
     percent: NDArray[np.integer[Any]]
     resolution_m: float
@@ -162,7 +160,7 @@ class _Grid:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """By what maps differ."""
+        """Return the key that tells maps apart."""
         return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
 
     @property
@@ -182,7 +180,7 @@ class _Grid:
     def costs(
         self, coverage: xr.Dataset, threshold_db: float, max_cost: int
     ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the percentage of outage at the nearest receiver of free and of unknown cells, -1 in all others."""
+        """Return the percentage of outage at the nearest receivers of free and of unknown cells, -1 elsewhere."""
         valid = coverage["valid"].to_numpy() == 1
         percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
         apart, nearest = distance_transform_edt(~valid, return_indices=True)
@@ -203,11 +201,11 @@ class _Grid:
 
 
 class _NewerMap(Exception):
-    """A newer map waits, and comes first."""
+    """A newer map is waiting."""
 
 
 def _refusing(method: Callable[..., None]) -> Callable[..., None]:
-    """Log the reason for which a message is refused: a robot's message never ends the program."""
+    """Log why a message is refused: no message ends the program."""
 
     @functools.wraps(method)
     def take(self: "LiveCoverage", *given: Any, **named: Any) -> None:
@@ -223,17 +221,17 @@ def _refusing(method: Callable[..., None]) -> Callable[..., None]:
 
 
 class LiveCoverage:
-    """Coverage that keeps up with the map of a robot, under any transport.
+    """Coverage of the newest map of a robot, for any transport.
 
-    Messages are taken in any thread; while one map is computed, newer ones replace each other. `run` computes in a
-    thread of its own, `step` in the caller's. Messages that are refused are logged, by name.
+    Any thread may pass messages; while one map is computed, newer ones replace each other. `start` computes in a
+    thread, `step` in the calling one. Refused messages are logged.
 
     Parameters
     ----------
     tx : (3,) array-like, or mapping of names to them
         Transmitter positions [m], in the frame of the map.
     publish : callable
-        Takes each `LiveGrid` and `LiveViews`.
+        Called with each `LiveGrid` and `LiveViews`.
     settings : LiveSettings, optional
     **model
         `predictor`, `trace_settings` and `scene_settings` of `LinkModel`.
@@ -241,7 +239,7 @@ class LiveCoverage:
     Raises
     ------
     PositionError, SettingsError
-        For positions that are none, and names that no topic can have.
+        For invalid positions, or names that no topic can have.
 
     Examples
     --------
@@ -285,7 +283,7 @@ class LiveCoverage:
 
     @_refusing
     def on_map(self, message: Any) -> None:
-        """Take a `nav_msgs/OccupancyGrid`, which replaces one that waits."""
+        """Take a `nav_msgs/OccupancyGrid`, which replaces a waiting one."""
         values, resolution_m, origin = occupancy_parts(message)
         self._take(message, values, resolution_m, origin)
 
@@ -306,7 +304,7 @@ class LiveCoverage:
 
     @_refusing
     def on_pose(self, x_m: float, y_m: float, time_s: float) -> None:
-        """Take the position of the robot in the frame of the map [m], and when it was there [s]."""
+        """Take the position of the robot in the frame of the map [m], and its time."""
         values = tuple(map(number_of, (x_m, y_m, time_s)))
         if not all(map(math.isfinite, values)):
             raise PositionError(f"({shown(x_m)}, {shown(y_m)}) m at {shown(time_s)} s is no position.")
@@ -314,7 +312,7 @@ class LiveCoverage:
 
     @_refusing
     def on_power(self, power_dbm: float, time_s: float, name: str | None = None) -> None:
-        """Take a received power [dBm], or path gain [dB], of a transmitter where the robot is."""
+        """Take a received power [dBm] or path gain [dB] of a transmitter at the robot."""
         name = next(iter(self.tx_m)) if name is None and len(self.tx_m) == 1 else name
         if name not in self._powers:
             raise MeasurementError(f"of {shown(name)}: the transmitters are {', '.join(self.tx_m)}.")
@@ -333,7 +331,7 @@ class LiveCoverage:
 
     @_refusing
     def on_transmitter(self, name: str, position_m: ArrayLike | None) -> None:
-        """Add a transmitter, or move it, or remove it with None; its measured powers are forgotten."""
+        """Add, move or (None) remove a transmitter, and forget its measured powers."""
         if position_m is None and name not in self.tx_m:
             raise PositionError(f"{shown(name)} is not known: the transmitters are {', '.join(self.tx_m)}.")
         added = {} if position_m is None else _named_positions({name: position_m})
@@ -344,20 +342,20 @@ class LiveCoverage:
             self._changed.notify_all()
 
     def request_views(self) -> None:
-        """Ask for the best next views, once."""
+        """Request the best next views once."""
         with self._changed:
             self._views_wanted = True
             self._changed.notify_all()
 
     def run(self) -> None:
-        """Compute maps as they come, until `close` and nothing waits."""
+        """Compute maps until `close` is called and none is waiting."""
         while self.step() or not self._closed:
             with self._changed:
                 if self._waiting is None and not self._closed:
                     self._changed.wait(0.2)
 
     def start(self) -> threading.Thread:
-        """Call `run` in a thread of its own."""
+        """Call `run` in a thread."""
         thread = threading.Thread(target=self.run, name="live coverage", daemon=True)
         thread.start()
         return thread
@@ -369,7 +367,7 @@ class LiveCoverage:
             self._changed.notify_all()
 
     def step(self) -> bool:
-        """Compute and publish for the newest map, if it or its measured powers are new; return whether."""
+        """Answer the newest map if it or its measured powers are new; return whether this was so."""
         with self._changed:
             now_s, grid = time.monotonic(), self._waiting
             if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
@@ -387,7 +385,7 @@ class LiveCoverage:
         return grid is not None or views
 
     def report(self, line: str) -> None:
-        """Log a refusal, the same line once a minute."""
+        """Log a refusal, at most once a minute."""
         now_s = time.monotonic()
         if now_s - self._lines_s.get(line, -math.inf) >= REPEATED_S:
             self._lines_s.pop(line, None)
@@ -397,7 +395,6 @@ class LiveCoverage:
     def _take(
         self, message: Any, values: NDArray[Any], resolution_m: float, origin: tuple[float, float, float]
     ) -> None:
-        """Check a map, and let it wait and replace an older one, unless it is the same as the newest."""
         frame, stamp = _frame_and_stamp(message)
         if self.frame and frame != self.frame:
             raise MapError(f"frame_id = {shown(frame)}: the transmitters are given in {shown(self.frame)}.")
@@ -414,7 +411,7 @@ class LiveCoverage:
                 self._changed.notify_all()
 
     def _guarded(self, what: str, compute: Callable[..., None], *given: Any) -> None:
-        """Compute, and log why something is not answered; a coarse answer, "", is followed by the final one's line."""
+        """Compute, and log failures; a failed coarse answer ("") is followed by the line of the final one."""
         try:
             compute(*given)
         except _NewerMap:
@@ -438,14 +435,13 @@ class LiveCoverage:
             self._gave_way = True
 
     def _clear_removed(self) -> None:
-        """Publish a last grid, in which nothing is known, of each transmitter that was removed."""
         for name in self._published.keys() - self.tx_m.keys():
             last = self._published.pop(name)
             nothing = np.full_like(last.cost, -1)
             self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
 
     def _give_way(self, fraction: float, message: str) -> None:
-        """End a final answer as soon as a newer map waits."""
+        """Stop a final answer as soon as a newer map is waiting."""
         if self._waiting is not None:
             raise _NewerMap
 
@@ -471,7 +467,6 @@ class LiveCoverage:
             self._publish(answer)
 
     def _measured(self, name: str, tx_m: Floats) -> Measurements | None:
-        """Return the powers that were measured of a transmitter and can be used on the map of now."""
         with self._changed:
             rows = np.array([*self._powers.get(name, {}).values()]).reshape(-1, 3)
         if not len(rows):
@@ -497,7 +492,6 @@ class LiveCoverage:
 
 
 def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:
-    """Transmitters by name [m]; a single one is "tx"."""
     given = tx if isinstance(tx, Mapping) else {"tx": tx}
     require(bool(given), "tx", tx, "give at least one transmitter.")
     found = {}
@@ -512,7 +506,7 @@ def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Float
 
 
 def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:
-    """Frame of a message, as "map", and its stamp as seconds and nanoseconds; both may be missing."""
+    """Return frame and stamp (seconds, nanoseconds) of a message; both may be missing."""
     header = getattr(message, "header", None)
     stamp = getattr(header, "stamp", None)
     seconds, nanoseconds = (

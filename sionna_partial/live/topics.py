@@ -1,7 +1,4 @@
-"""Topics of a robot, from a recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back; no ROS is needed.
-
-rosbridge also works where DDS does not pass. Its WebSocket is opened again when it is lost.
-"""
+"""Topics of a robot, from a recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back, without ROS."""
 
 import json
 import logging
@@ -27,25 +24,23 @@ from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
 from sionna_partial.resources import optional_packages
 
 MOST_FRAMES = 1000
-"""Number of frames outside the robot's chain that are kept, the newest ones of `/tf` and of `/tf_static`."""
+"""Number of frames outside the robot's chain that are kept of `/tf` and of `/tf_static`."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
-"""Types of published messages."""
 
 UPDATE_TYPE = "map_msgs/msg/OccupancyGridUpdate"
 UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
-"""Definition of the one message that no type store has."""
+"""Definition of the only message that no type store has."""
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
 HIGHEST_DOMAIN = 232
-"""Domains that have ports."""
 
 MOST_AT_ONCE = 100
-"""Number of messages of a topic that are taken before the next topic's."""
+"""Number of messages of a topic that are taken before those of the next one."""
 
 POLL_S = 0.02
-"""Time between two looks for messages [s]."""
+"""Time between two polls [s]."""
 
 _LIMITS = (
     "<CycloneDDS><Domain><Internal>"
@@ -53,10 +48,10 @@ _LIMITS = (
 )
 
 MAX_BYTES = 100_000_000
-"""Largest message that is taken [bytes]."""
+"""Size of the largest accepted message [bytes]."""
 
 RETRY_S = 1.0
-"""Time after which a server that is gone is looked for again [s]."""
+"""Time between two attempts to connect [s]."""
 
 _log = logging.getLogger(__name__)
 
@@ -68,15 +63,15 @@ class Topics(Checked):
     Parameters
     ----------
     map, prefix : str
-        Topic of the map, to which "_updates" is added for its updates; what published topics begin with.
+        Topic of the map ("_updates" is added for its updates); prefix of published topics.
     robot_frame : str
-        Frame of the robot, whose position in the map is read from `/tf` and `/tf_static`.
+        Frame of the robot in `/tf` and `/tf_static`.
     powers : mapping
-        Topics of `std_msgs/Float32` with received powers, and the transmitter of each; None where there is one alone.
+        Transmitter of each topic of `std_msgs/Float32` with received powers; None for a single one.
     key_values : str
-        Topic of `diagnostic_msgs/KeyValue` with the name of a transmitter and its power; "" for none.
+        Topic of `diagnostic_msgs/KeyValue` with names of transmitters and powers; "" for none.
     unknown : bool
-        Predictions for cells that the map does not know are published, too, with "/unknown" behind the topic.
+        Also publish the predictions for unknown cells, on the topic with the suffix "/unknown".
 
     Raises
     ------
@@ -102,7 +97,7 @@ class Topics(Checked):
         require(bool(self.robot_frame), "robot_frame", self.robot_frame, "give a frame, such as base_link.")
 
     def types(self) -> dict[str, str]:
-        """Return the message type of each topic that is listened to."""
+        """Return the message type of each subscribed topic."""
         types = {self.map: GRID_TYPE, f"{self.map}_updates": UPDATE_TYPE, "/tf": TF_TYPE, "/tf_static": TF_TYPE}
         types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32")
         types |= dict.fromkeys(filter(None, (self.key_values, self.transmitters)), "diagnostic_msgs/msg/KeyValue")
@@ -110,17 +105,17 @@ class Topics(Checked):
 
     @property
     def transmitters(self) -> str:
-        """Topic of `diagnostic_msgs/KeyValue` with the name and the position of a transmitter: see `Listener`."""
+        """Return the topic of `diagnostic_msgs/KeyValue` with names and positions of transmitters, see `Listener`."""
         return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
-        """Return the message type of each topic that is published for transmitters of these names."""
+        """Return the message type of each topic published for the named transmitters."""
         ends = ("", "/unknown") if self.unknown else ("",)
         grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
         return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
 
     def messages(self, answer: LiveGrid | LiveViews) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Return the messages of an answer by topic, each with its type."""
+        """Return topic, message and type of each part of an answer."""
         if isinstance(answer, LiveViews):
             return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
         topic = f"{self.prefix}/{answer.name}"
@@ -137,9 +132,9 @@ class _Transform(NamedTuple):
 
 
 class Listener:
-    """Hands the messages of topics to a `LiveCoverage`, whatever they hold.
+    """Passes messages of topics to a `LiveCoverage`.
 
-    The value of a transmitter is its position, "x y" or "x y z" [m]; an empty value removes it.
+    The value of a transmitter is "x y" or "x y z" [m]; an empty value removes it.
     """
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
@@ -151,7 +146,7 @@ class Listener:
         self._frames = ChainMap[str, _Transform]({}, {})  # of /tf and of /tf_static
 
     def take(self, topic: str, message: Any, time_s: float | None = None) -> None:
-        """Take a message that came at `time_s`, now by default."""
+        """Take a message that arrived at `time_s`, by default now."""
         now_s, topics, live = time.monotonic() if time_s is None else time_s, self.topics, self.live
         try:
             if topic == topics.map:
@@ -194,12 +189,12 @@ class Listener:
 
 
 def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) -> None:
-    """Hand over the messages of a recording, `rate` times as fast as they came; 0 waits for each map's answer.
+    """Replay the messages of a recording at `rate` times their speed; 0 waits for the answer to each map.
 
     Raises
     ------
     MapError
-        If it is no rosbag or damaged, or has no topic of the map.
+        For anything but an intact rosbag with the topic of the map.
     """
     with open_recording(path, MapError) as recording:
         recording.topic_of(listener.topics.map, (GRID,))
@@ -213,7 +208,7 @@ def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) 
 
 
 class Dds:
-    """The topics of one DDS domain, and of no other.
+    """The topics of one DDS domain.
 
     `CYCLONEDDS_URI` chooses interfaces and peers, as for ROS 2 with Cyclone DDS.
 
@@ -221,14 +216,14 @@ class Dds:
     ----------
     topics : Topics
     names : mapping
-        Transmitters, by name.
+        Transmitters by name.
     domain : int or None
         None is `ROS_DOMAIN_ID`, or 0.
 
     Raises
     ------
     SettingsError
-        For a domain that is none, or one that cannot be joined.
+        For an invalid domain, or one that cannot be joined.
     """
 
     def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
@@ -252,21 +247,21 @@ class Dds:
         self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
-        """Publish an answer, reliably; who joins later gets the last one."""
+        """Publish an answer reliably; late subscribers get the last one."""
         for topic, (kind, message) in self.topics.messages(answer).items():
             if topic not in self._writers:
                 self._writers[topic] = self._writer(topic, kind)
             self._writers[topic].write(filled(kind, message))
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage` without end."""
+        """Pass messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.poll(listener)
             time.sleep(POLL_S)
 
     def poll(self, listener: Listener) -> None:
-        """Hand over the messages that have come."""
+        """Pass the messages that have arrived."""
         for topic, reader in self._readers:
             for _ in range(MOST_AT_ONCE):
                 try:
@@ -311,7 +306,7 @@ def _domain(given: int | None) -> int:
 
 
 def _qos(*, latched: bool, reliable: bool, depth: int) -> Any:
-    """Quality of service as nav2 has it for maps, where latched; else what matches any publisher."""
+    """Return the quality of service of nav2's maps if latched, else one that matches any publisher."""
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration
 
@@ -325,7 +320,6 @@ def _qos(*, latched: bool, reliable: bool, depth: int) -> Any:
 
 @cache
 def _store() -> Any:
-    """Return the definitions of ROS 2's messages."""
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
@@ -335,7 +329,7 @@ def _store() -> Any:
 
 @cache
 def struct(kind: str) -> Any:
-    """Return the DDS type of a message type such as "nav_msgs/msg/OccupancyGrid", named as ROS 2 does."""
+    """Return the DDS type of a message type such as "nav_msgs/msg/OccupancyGrid", named as in ROS 2."""
     from cyclonedds.idl import make_idl_struct
 
     package, _, name = kind.split("/")
@@ -370,20 +364,20 @@ def filled(kind: str, values: Mapping[str, Any]) -> Any:
 
 
 class Rosbridge:
-    """The topics of a rosbridge server.
+    """The topics of a rosbridge server; lost connections are opened again.
 
     Parameters
     ----------
     url : str
-        Such as "ws://robot:9090".
+        For example "ws://robot:9090".
     topics : Topics
     names : mapping
-        Transmitters, by name.
+        Transmitters by name.
 
     Raises
     ------
     SettingsError
-        For another kind of address.
+        For any other address.
     """
 
     def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
@@ -401,7 +395,7 @@ class Rosbridge:
         self._last: dict[str, str] = {}
 
     def publish(self, answer: LiveGrid | LiveViews) -> None:
-        """Publish an answer; a server that starts again gets the last ones."""
+        """Publish an answer; a restarted server gets the last ones."""
         for topic, (kind, message) in self.topics.messages(answer).items():
             if topic not in self._published:
                 self._published[topic] = kind
@@ -410,14 +404,14 @@ class Rosbridge:
             self._send(self._last[topic])
 
     def listen(self, live: LiveCoverage) -> None:
-        """Hand messages to a `LiveCoverage` without end."""
+        """Pass messages to a `LiveCoverage` without end."""
         listener = Listener(live, self.topics)
         while True:
             self.connect(listener)
             time.sleep(RETRY_S)
 
     def connect(self, listener: Listener) -> None:
-        """Hand over messages until the connection ends, and log why."""
+        """Pass messages until the connection ends, and log why it did."""
         from websockets.exceptions import WebSocketException
         from websockets.sync.client import connect
 
@@ -469,6 +463,6 @@ class Rosbridge:
 
 
 def _old(kind: str) -> str:
-    """Return a type as rosbridge of ROS 1 and 2 takes it: without "msg"."""
+    """Return a type as rosbridge of ROS 1 and 2 accepts it: without "msg"."""
     package, _, name = kind.split("/")
     return f"{package}/{name}"

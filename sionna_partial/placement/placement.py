@@ -1,4 +1,4 @@
-"""Placement of a transmitter: positions are compared by visibility, traced and predicted, and the best are refined."""
+"""Placement of a transmitter: compare positions by visibility, trace and predict some, refine the best."""
 
 import json
 import math
@@ -25,58 +25,57 @@ from sionna_partial.settings import Objective, PlacementSettings, SceneSettings,
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
-"""Least distance of a transmitter from known walls [m], and the largest cells in which it is kept [m]."""
+"""Smallest distance from known walls, and largest cells in which it is kept [m]."""
 
 RECEIVER_SPACING_M, MAX_RECEIVERS = 0.5, 4000
 POSITION_SPACING_M, MAX_POSITIONS = 0.25, 500
-"""Grid spacings of receivers and of transmitter positions [m]; they grow where the grid would have more points."""
+"""Spacings of receivers and of transmitter positions [m]; they grow if the grid has too many points."""
 
 NEGLIGIBLE = 0.02
-"""Probability of being indoors below which a receiver is left out."""
+"""Probability of being indoors below which a receiver is omitted."""
 
 _INDOOR_POSITIONS = 8
 """Number of transmitter positions over which the probability of being indoors is averaged."""
 
 _UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
-"""Visibility falls as exp(-u / 4 m) with the unobserved length u; behind walls it is 0.8 exp(-d / 4 m) of that at the
-distance d. Fitted on made homes (others than in `benchmarks/placement.py`) to predicted coverage at -100 dB."""
+"""Visibility is exp(-u / 4 m) with the unobserved length u, and 0.8 exp(-d / 4 m) of the value at distance d behind
+walls. Fitted to predicted coverage at -100 dB on homes that `benchmarks/placement.py` does not use."""
 
 RECEIVERS = 120
-"""Largest number of receivers during the search; the final positions are compared at all receivers."""
+"""Largest number of receivers during the search."""
 
 STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
-"""Number of positions that are traced first, and of those that are refined: fewest, most, and area for each [m^2].
-Fewer than 6 starts would miss the best room of a small home."""
+"""Number of traced and of refined positions: fewest, most, and area for each [m^2]. Fewer than 6 starts would miss the
+best room of a small home."""
 
 STEPS_M = (0.6, 0.25)
-"""Distances at which the refinement tries neighbours, in turn [m]."""
+"""Distances of neighbours in the refinement [m]."""
 
 OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
 
 OUTAGE["p_outage"] = 1.0
-"""Prediction of an outage that is certain."""
+"""Prediction of a certain outage."""
 
 _DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
 SIMILARITY_PENALTY = 0.6
-"""Loss of score of a start that sees the same receivers as one that is chosen already."""
+"""Relative loss of score of a start that covers the same receivers as a chosen one."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
-"""The worst 5 % of the receivers, sorted by gain, count in full, and linearly less up to 15 %."""
+"""The worst 5 % of the receivers count in full, others linearly less up to 15 %."""
 
 
 @dataclass(frozen=True, eq=False)
 class PlacementArea:
     """Possible positions of a transmitter, and weighted receivers.
 
-    A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors: the mean over
-    transmitter positions all over the free cells, so that no position gains by making the building seem larger. On a
-    complete map unknown cells are outdoors.
+    A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors, averaged over
+    transmitter positions: no position gains by making the building seem larger.
 
     Parameters
     ----------
     height_m : height of the transmitter
-    room : FREE where the transmitter may stand, UNKNOWN elsewhere
+    room : FREE where the transmitter may be, UNKNOWN elsewhere
     rx_m : (N, 3)
     weight : (N,), above 0
     spacing_m : distance between receivers
@@ -91,15 +90,15 @@ class PlacementArea:
 
     @property
     def size_m2(self) -> float:
-        """Area where the transmitter may stand [m^2]."""
+        """Return the area of transmitter positions [m^2]."""
         return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
 
     def stands(self, positions_m: Floats) -> Bools:
-        """Return whether a transmitter may stand at each of the positions (..., 3) [m]."""
+        """Return whether a transmitter may be at positions (..., 3) [m]."""
         return self.room.state_at(positions_m) == CellState.FREE
 
     def positions(self, seed: int) -> Floats:
-        """Transmitter positions (C, 3) on a grid with a random offset [m]; cell centres where the grid meets none."""
+        """Return positions (C, 3) [m] on a grid with a random offset, or cell centres if the grid meets none."""
         rng = np.random.default_rng(seed)
         spacing_m = max(POSITION_SPACING_M, math.sqrt(self.size_m2 / MAX_POSITIONS))
         x0, y0, x1, y1 = self.room.bounds_m
@@ -113,7 +112,7 @@ class PlacementArea:
         return np.column_stack([cell_centres_m(self.room, chosen), np.full(len(chosen), self.height_m)])
 
     def thinned(self, count: int) -> "PlacementArea":
-        """Return the area with at most `count` of the receivers, drawn evenly by weight along the rows of the grid."""
+        """Return the area with at most `count` receivers, drawn evenly by weight along the rows of the grid."""
         if len(self.rx_m) <= count:
             return self
         order = _boustrophedon(self.rx_m)
@@ -123,7 +122,7 @@ class PlacementArea:
         return replace(self, rx_m=self.rx_m[weight > 0.0], weight=weight[weight > 0.0])
 
     def visibility(self, positions_m: Floats, range_m: float = math.inf) -> Floats:
-        """Return how well positions (C, 3) see each receiver, without tracing: (C, N) in [0, 1], 0 beyond `range_m`."""
+        """Return the visibility (C, N) in [0, 1] of receivers from positions (C, 3) [m], 0 beyond `range_m`."""
         walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
         seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
         seen *= np.where(walled, _WALL_FACTOR * np.exp(-distance_m / _WALL_LENGTH_M), distance_m <= range_m)
@@ -137,10 +136,9 @@ def placement_area(
     model: AnyPredictor | None,
     frequency_hz: float | None = None,
 ) -> PlacementArea:
-    """Find where a transmitter may stand, and receivers wherever `predict_map` has valid ones.
+    """Return possible transmitter positions, and receivers as in `predict_map`; a PositionError if there are none.
 
-    `model` predicts which unknown cells are indoors; without one, as on a complete map, all are outdoors. A
-    PositionError is raised if there is no position for a transmitter or a receiver.
+    `model` predicts which unknown cells are indoors; without one all are outdoors.
     """
     x0, y0, x1, y1 = partial.bounds_m
     spacing_m = max(RECEIVER_SPACING_M, math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS))
@@ -159,7 +157,7 @@ def placement_area(
 
 
 def _room(partial: PartialMap) -> PartialMap:
-    """Return the cells where a transmitter may stand, as a map in which all others are unknown."""
+    """Return a map whose free cells are the possible transmitter positions; all others are unknown."""
     fine = max(1, math.ceil(partial.resolution_m / FINEST_M - 1e-9))
     fine = max(1, min(fine, int(math.sqrt(4e6 / partial.state.size))))
     state = partial.state.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -177,7 +175,7 @@ def _room(partial: PartialMap) -> PartialMap:
 
 
 def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: float | None) -> Floats:
-    """Weight (N,) of each receiver: 1 in free cells, else the mean P(indoor) over some transmitter positions."""
+    """Return weights (N,) of receivers: 1 in free cells, else the mean P(indoor) over transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():
         return weight
@@ -196,13 +194,13 @@ def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: floa
 
 
 def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, z_m: float) -> Floats:
-    """Return positions (N, 3) on a grid between two x and two y, all at one height [m]."""
+    """Return positions (N, 3) on a grid between x and y limits at one height [m]."""
     x, y = np.meshgrid(np.arange(*x_m, spacing_m), np.arange(*y_m, spacing_m))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z_m)])
 
 
 def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
-    """Return whether lines (A B,) from A points to B others meet a wall, unobserved lengths and lengths [m]."""
+    """Return, for lines (A B,) from A to B points, whether they meet a wall, unobserved lengths and lengths [m]."""
     start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
     walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
     return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
@@ -219,42 +217,39 @@ def _boustrophedon(points_m: Floats) -> Indices:
 @read_only
 @dataclass(frozen=True, eq=False)
 class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
-    """A position for a transmitter, and the search that found it.
+    """A transmitter position, and the search that found it.
 
     Parameters
     ----------
     position_m : (3,) float64 array
-        The best position that was found [m].
+        Best position [m].
     score : float
-        The objective there, at all receivers: the mean predicted coverage in [0, 1], or the gain of the worst tenth
-        [dB].
+        Objective at all receivers: mean predicted coverage in [0, 1], or gain of the worst tenth [dB].
     trajectory_m : (K, 3) float64 array
-        Positions of the refinement that led there, from its start [m].
+        Route of the refinement that led there [m].
     scores : (K,) float64 array
-        The objective along it, at some of the receivers. It rises.
+        Objective along the route at some of the receivers, increasing.
     starts_m : (S, 3) float64 array
-        Positions that were traced first [m].
+        Starts of the search [m].
     start_scores : (S,) float64 array
-        The objective there, at some of the receivers.
+        Objective of the starts at some of the receivers.
     rx_m : (N, 3) float64 array
-        All receivers [m].
+        Receivers [m].
     weight : (N,) float64 array
-        Their weights: 1 in free cells, the probability of being indoors in unknown ones.
+        Weights of receivers: 1 in free cells, the probability of being indoors in unknown ones.
     values : (N,) float64 array
-        P(gain > threshold) of each with the transmitter at `position_m`, or its mean gain [dB].
+        P(gain > threshold), or mean gain [dB], of each receiver.
     spacing_m : float
         Distance between receivers [m].
     partial : PartialMap
     settings : PlacementSettings
     provenance : dict
-        Predictor and settings of scene and trace, as plain data.
+        Predictor and settings.
 
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> found = sp.place_transmitter(partial)
+    >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
     >>> found.position_m.shape, found.values.shape == found.weight.shape
     ((3,), True)
     """
@@ -275,10 +270,6 @@ class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write position, score, search and settings as JSON; equal placements give equal files.
-
-        Parameters
-        ----------
-        path : path-like
 
         Raises
         ------
@@ -308,31 +299,30 @@ def place_transmitter(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> TransmitterPlacement:
-    """Find the transmitter position that covers a partly known building best, as predicted from its known part.
+    """Find the transmitter position with the best predicted coverage of a partly known building.
 
-    Positions all over the free cells are compared by visibility, without tracing. The best of them that see different
-    receivers are traced and predicted, as `predict_map` does. Around the best of these, neighbours at 0.6 and 0.25 m
-    are tried; the results are compared at all receivers. Larger maps get more positions and steps.
+    Positions in all free cells, at least 10 cm from known walls, are compared by visibility without tracing. The best
+    that cover different receivers are traced and predicted. Around the best of these, neighbours at 0.6 and 0.25 m are
+    tried; the results are compared at all receivers. Larger maps get more positions and steps.
 
-    A transmitter stands in a free cell, at least 10 cm from known walls. Receivers are 0.5 m apart wherever
-    `predict_map` has some; one in a free cell has weight 1, one in an unknown cell its probability of being indoors,
-    which does not depend on the transmitter.
+    Receivers are those of `predict_map`, 0.5 m apart; one in a free cell has weight 1, one in an unknown cell its
+    probability of being indoors.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        The map, or whatever `load_map` reads.
+        A map, or a file that `load_map` reads.
     objective : {"coverage", "percentile"}
-        Quantity that is maximised: the mean probability that the path gain exceeds the threshold, or the mean predicted
-        gain of the worst tenth of the receivers.
+        Maximised quantity: mean probability that the path gain exceeds the threshold, or mean predicted gain of the
+        worst tenth of the receivers.
     threshold_db : float
-        Path gain above which a receiver is covered [dB].
+        Path gain of a covered receiver [dB].
     tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m].
     seed : int
-        Seed of the positions that are compared.
+        Seed of the compared positions.
     predictor : None, "map", "paper", path or Predictor
-        As for `predict_map`.
+        As in `predict_map`.
     scene_settings : SceneSettings, optional
     trace_settings : TraceSettings, optional
     progress : bool or callable, optional
@@ -344,16 +334,12 @@ def place_transmitter(
 
     Raises
     ------
-    MapError
-        If the map cannot be read.
+    MapError, PredictorError, BackendError
+        As `predict_map`.
     PositionError
-        If a transmitter or a receiver can stand nowhere.
+        If there is no position for a transmitter or a receiver.
     SettingsError
         For another objective, or a threshold, height, seed or frequency out of range.
-    PredictorError
-        If the predictor cannot be read.
-    BackendError
-        If LLVM or Sionna RT cannot be used.
 
     Examples
     --------
@@ -400,7 +386,7 @@ def place_transmitter(
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Settings, link model and area of a search for transmitters."""
+    """Settings, link model and area of a search."""
 
     settings: PlacementSettings
     model: LinkModel
@@ -417,7 +403,7 @@ class Search:
         return cls(settings, model, area)
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
-        """Choose positions (S, 3) [m] by visibility; what others see as well counts less."""
+        """Return start positions (S, 3) [m] by visibility; receivers that other starts cover count less."""
         positions_m, range_m = area.positions(self.settings.seed), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
@@ -436,7 +422,7 @@ class Search:
     def links(
         self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress
     ) -> tuple[LinkPrediction, Bools]:
-        """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; a short one is an outage."""
+        """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; short ones are outages."""
         frequency_hz = self.model.simulation.trace_settings.frequency_hz
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]
@@ -448,7 +434,7 @@ class Search:
         return LinkPrediction(**columns), far
 
     def values(self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress) -> Floats:
-        """Values (P, N) of receivers for positions (P, 3) [m]; one at the transmitter is covered, with 0 dB."""
+        """Return the values (P, N) of receivers for positions (P, 3) [m]; a receiver at the transmitter has 0 dB."""
         links, far = self.links(positions_m, area, report)
         return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
 
@@ -468,7 +454,7 @@ def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> Floa
 
 
 def placement_score(values: Floats, weight: Floats, settings: PlacementSettings) -> float:
-    """Return the objective of receivers' values (N,) and weights (N,), rounded: threads change the last bits."""
+    """Return the objective of values (N,) with weights (N,), rounded because threads change the last bits."""
     fraction = weight / weight.sum()
     if settings.objective == "coverage":
         return round(float(values @ fraction), 5)
@@ -478,7 +464,7 @@ def placement_score(values: Floats, weight: Floats, settings: PlacementSettings)
 
 
 def _counted(fraction: Floats) -> Floats:
-    """Return the integral of the weight of the worst receivers, from 0 to a fraction of them."""
+    """Return the integral of the weights of the worst receivers, up to a fraction of them."""
     falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
     width = LAST_FRACTION - FULL_FRACTION
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)
@@ -487,7 +473,6 @@ def _counted(fraction: Floats) -> Floats:
 def _refined(
     search: Search, area: PlacementArea, starts_m: Floats, start_scores: Floats, report: Progress
 ) -> list[tuple[Floats, Floats]]:
-    """Move the best starts to better neighbours: positions (K, 3) [m] and scores (K,) of each route."""
     best = np.argsort(-start_scores, kind="stable")[: _per_area(area, *REFINED)]
     routes = [([starts_m[index]], [start_scores[index]]) for index in best]
     for number, step_m in enumerate(STEPS_M):

@@ -1,4 +1,4 @@
-"""Placement of several transmitters: candidates are drawn together, chosen greedily, then swapped."""
+"""Placement of several transmitters: draw candidates jointly, choose greedily, swap."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from sionna_partial.tracing.simulation import Simulation
 MOST_TRANSMITTERS = 16
 
 CANDIDATES = 24
-"""Number of positions from which the transmitters are chosen; twice as many as transmitters, if that is more."""
+"""Number of candidates, at least twice the number of transmitters."""
 
 DRAWS = 100
 _SWAPS = 20
@@ -37,24 +37,24 @@ _SWAPS = 20
 @read_only
 @dataclass(frozen=True, eq=False)
 class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement"):
-    """Positions for several transmitters, and the search that found them.
+    """Positions of several transmitters, and the search that found them.
 
     Parameters
     ----------
     positions_m : (K, 3) float64 array
-        The transmitters [m], in the order in which they were chosen.
+        Transmitters [m], in the order of choice.
     score : float
-        Mean over the receivers of the probability that at least one path gain exceeds the threshold, in [0, 1].
+        Mean of `values`, in [0, 1].
     scores : (K,) float64 array
-        The same of the first, of the first two and so on, as chosen greedily before any swap, at some of the receivers.
+        Scores of the first, the first two etc. before any swap, at some of the receivers.
     candidates_m : (C, 3) float64 array
-        Positions from which they were chosen [m].
+        Candidates [m].
     rx_m : (N, 3) float64 array
         Receivers [m].
     weight : (N,) float64 array
-        Their weights: 1 in free cells, the probability of being indoors in unknown ones.
+        Weights of receivers: 1 in free cells, the probability of being indoors in unknown ones.
     values : (N,) float64 array
-        Probability that at least one gain exceeds the threshold.
+        Probability that at least one path gain exceeds the threshold.
     spacing_m : float
         Distance between receivers [m].
     partial : PartialMap
@@ -63,9 +63,7 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> found = sp.place_transmitters(partial, count=2)
+    >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
     >>> found.positions_m.shape, 0.0 <= found.score <= 1.0
     ((2, 3), True)
     """
@@ -110,22 +108,22 @@ def place_transmitters(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> NetworkPlacement:
-    """Find positions for several transmitters that together cover a partly known building best.
+    """Find positions of several transmitters with the best joint coverage of a partly known building.
 
-    Candidates are positions all over the free cells that see different receivers. Their links are drawn together
-    (`JointLatents`), so that two transmitters behind one unseen wall are correlated. The transmitters are
-    chosen one after the other, each where it adds most, and then swapped for other candidates while that helps.
+    Candidates are positions that cover different receivers. Their links are drawn jointly (`JointLatents`), because
+    transmitters behind one unseen wall are correlated. Transmitters are chosen greedily, and then swapped for other
+    candidates while that increases the score.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        The map, or whatever `load_map` reads.
+        A map, or a file that `load_map` reads.
     count : int
         Number of transmitters K, up to 16.
     rx : (N, 3) array-like, optional
-        Receivers that count [m], with equal weights. By default as in `place_transmitter`.
+        Receivers [m] with equal weights; by default as in `place_transmitter`.
     threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
-        As for `place_transmitter`.
+        As in `place_transmitter`.
 
     Returns
     -------
@@ -177,7 +175,7 @@ def place_transmitters(
 
 
 def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
-    """Positions (C, 3) [m]: half of them good alone, the others each as far as possible from those before."""
+    """Return positions (C, 3) [m]: half of them good alone, the others each far from those before."""
     chosen_m, positions_m = search.starts(area, count // 2), area.positions(search.settings.seed)
     apart_m = np.linalg.norm(positions_m[:, None] - chosen_m, axis=2).min(axis=1)
     while len(chosen_m) < count and apart_m.max() > 0.0:
@@ -188,7 +186,7 @@ def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
 
 
 def _covered(search: Search, area: PlacementArea, candidates_m: Floats) -> Bools:
-    """Return whether candidates (C, 3) cover each receiver in draws (n, C, N) of all links together."""
+    """Return whether candidates (C, 3) cover the receivers in draws (n, C, N) of all links."""
     links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
     gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [search.settings.seed])[1]
@@ -200,7 +198,6 @@ def _score(covered: Bools, weight: Floats, chosen: list[int]) -> float:
 
 
 def _greedy(covered: Bools, weight: Floats, count: int) -> tuple[list[int], list[float]]:
-    """Choose candidates one after the other, each that adds most."""
     chosen: list[int] = []
     scores = []
     for _ in range(min(count, covered.shape[1])):
@@ -214,7 +211,6 @@ def _greedy(covered: Bools, weight: Floats, count: int) -> tuple[list[int], list
 
 
 def _swapped(covered: Bools, weight: Floats, chosen: list[int]) -> list[int]:
-    """Replace one transmitter by another candidate while the score rises."""
     best = _score(covered, weight, chosen)
     for _ in range(_SWAPS):
         others = [

@@ -1,1 +1,1 @@
-"""Figures of the package; the values that they show are computed elsewhere."""
+"""Figures of results that other packages compute."""

@@ -1,4 +1,4 @@
-"""Figures of coverage maps, of networks of several transmitters, and a report of one page."""
+"""Figures of coverage maps and of networks, and a one-page report."""
 
 import io
 import itertools
@@ -47,16 +47,13 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
-_REPORT_LINE_IN, _REPORT_WIDTH, _WIDE_ASPECT = 0.14, 114, 1.7
+_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 130, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One quantity of a panel: its picture (ny, nx) or (ny, nx, 3), and the colour scale of the former.
-
-    A layer without label has no colour bar.
-    """
+    """A quantity of a panel: picture (ny, nx) with its colour scale, or (ny, nx, 3); no label, no colour bar."""
 
     title: str
     picture: Callable[[xr.Dataset], NDArray[Any]]
@@ -66,13 +63,13 @@ class Layer:
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> Floats:
-    """Mix the colours of the three link states by their probabilities (paper, Section IV-C): (..., 3) in [0, 1]."""
+    """Return the colours (..., 3) of link states, mixed by their probabilities (paper, Section IV-C)."""
     colours = np.array([to_rgb(STATE_COLOURS[state]) for state in (LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE)])
     return np.stack([p_los, p_nlos, p_outage], axis=-1).astype(np.float64) @ colours
 
 
 def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> dict[str, Layer]:
-    """Return every layer that a panel can show, by name; gains of a coverage through walls are less spread."""
+    """Return all layers by name; gains of a coverage through walls are less spread."""
     through_walls = coverage is not None and coverage.attrs.get("walls") == "through walls"
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
@@ -110,29 +107,28 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
-    Several transmitters have a row each, with the same colour scales.
-    Walls are black, the unobserved area is hatched, the transmitter is a star; a line encloses 90 % of where it may be,
-    if that is not known. On a complete map the outside is left blank.
+    Each transmitter has a row. Walls are black, the unobserved area is hatched, the transmitter is a star; a line
+    encloses 90 % of the posterior of an unknown position. On a complete map the outside is blank.
 
     Parameters
     ----------
     coverage : xarray.Dataset
-        From `predict_map`, or read from its NetCDF file.
+        From `predict_map` or `load_coverage`.
     layers : sequence of str
-        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (the colours of the
-        three states mixed by their probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by the
+        probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
+        Not registered with pyplot.
 
     Raises
     ------
     SettingsError
-        For a Dataset that is no coverage map, another layer, or a threshold out of range.
+        For anything but a coverage map, another layer, or a threshold out of range.
 
     Examples
     --------
@@ -152,7 +148,6 @@ def plot_coverage(
 
 
 def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
-    """Draw a panel for each layer."""
     aspect = coverage.sizes["x"] / coverage.sizes["y"]
     columns = sheet_columns(len(layers), aspect)
     figure, axes = _panels(math.ceil(len(layers) / columns), columns, aspect, keys_in=_KEY_IN * columns)
@@ -167,7 +162,6 @@ def _plot_sheet(coverage: xr.Dataset, layers: Sequence[Layer]) -> Figure:
 
 
 def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figure:
-    """Draw a row for each transmitter, a column for each layer, and under it the colour bar."""
     sizes = next(iter(maps.values())).sizes
     figure, axes = _panels(len(maps), len(layers), sizes["x"] / sizes["y"], keys_in=0.3)
     for row, (name, coverage) in zip(axes, maps.items(), strict=True):
@@ -183,9 +177,9 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
 def plot_comparison(
     coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
 ) -> Figure:
-    """Draw coverage maps of one area by title, a column each, and a row for each layer (paper, Fig. 5).
+    """Draw coverage maps of one area, a column for each title and a row for each layer (paper, Fig. 5).
 
-    The walls of the first are drawn grey in the others where these do not contain them.
+    Walls that only the first map contains are grey in the others.
     """
     require(len(coverages) > 0, "coverages", dict(coverages), "give at least one coverage map.")
     coverages = {title: require_coverage(coverage) for title, coverage in coverages.items()}
@@ -215,10 +209,7 @@ def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) ->
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Title with the transmitter's position, or how many there are, the frequency, and whether walls are opaque.
-
-    For a partial map it states whether gains refer to receivers indoors or anywhere.
-    """
+    """Return a title: transmitters, frequency, walls, and for a partial map the receivers that gains refer to."""
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
         what = f"{what} for receivers that are indoors"
@@ -227,14 +218,13 @@ def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
 
 
 def _heading(title: str, coverage: xr.Dataset) -> str:
-    """Title of a map; of a partial one with its observed fraction."""
     observed = float(coverage.attrs["map_observed_fraction"])
     partial = observed > 0.0 and not coverage.attrs["map_complete"]
     return f"{title}, {observed:.0%} observed" if partial else title
 
 
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a figure with panels (rows, columns) of one scale, as wide as a page; its colour bars take `keys_in`."""
+    """Make a page-wide figure with panels (rows, columns) of one scale; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
     highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
     height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
@@ -247,10 +237,7 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend.
-
-    They are to the right of the panels, or that fraction of the figure below them.
-    """
+    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend."""
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         where: dict[str, Any] = {"location": "right", "pad": 0.05}
@@ -270,7 +257,6 @@ def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None
 
 
 def _draw_triangle(key: Axes) -> None:
-    """Draw every mixture of the three states: LOS at the left, NLOS at the right, outage at the top."""
     height = 3**0.5 / 2
     x, y = np.meshgrid(np.linspace(0.0, 1.0, 200), np.linspace(0.0, 1.0, 200))
     p_nlos = x - y / 2
@@ -290,7 +276,6 @@ def _draw_triangle(key: Axes) -> None:
 
 
 def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset | None = None) -> None:
-    """Draw one layer, the unknown area, the walls and the transmitter."""
     extent = extent_m(coverage)
     wall = wall_cells(coverage)
     picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
@@ -311,14 +296,14 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
 
 
 def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, float]:
-    """Limits x0, x1, y0, y1 of a map with the attribute `spacing_m` [m]."""
+    """Return the limits x0, x1, y0, y1 of a map with the attribute `spacing_m` [m]."""
     half = coverage.attrs["spacing_m"] / 2
     x, y = coverage["x"].to_numpy(), coverage["y"].to_numpy()
     return x[0] - half, x[-1] + half, y[0] - half, y[-1] + half
 
 
 def wall_cells(coverage: xr.Dataset) -> Bools:
-    """Return the walls, in up to 6 x 6 parts of a cell: as fine as a picture can show."""
+    """Return the walls in up to 6 x 6 parts of a cell, as fine as a picture can show."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
     merge = WALL_PARTS // fine
@@ -336,7 +321,7 @@ def outside(coverage: xr.Dataset) -> Bools:
 def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
     """Refine a picture to the size of `wall`, and fill cells without receiver from their nearest neighbour.
 
-    A wall thinner than a cell leaves a strip of cells without receiver bare; this is for the eye alone.
+    Walls thinner than a cell would have a white border otherwise.
     """
     fine = wall.shape[0] // valid.shape[0]
     bare = ~valid.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -347,12 +332,11 @@ def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
 
 
 def _hatched(coverage: xr.Dataset) -> Bools:
-    """Unobserved cells that a receiver may be in."""
     return ~coverage["observed"].to_numpy() & ~outside(coverage)
 
 
 def unobserved_area(coverage: xr.Dataset) -> tuple[Floats, Floats, Floats]:
-    """Cell centres x (nx + 2,) and y (ny + 2,) with one cell around the map, and 1 where to hatch (ny + 2, nx + 2)."""
+    """Return cell centres x (nx + 2,) and y (ny + 2,) with a border of one cell, and the hatched cells as 1."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
     return x, y, np.pad(_hatched(coverage), 1, mode="edge").astype(float)
@@ -369,7 +353,7 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
 
 
 def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
-    """As `unobserved_area`, the cells with 90 % of an unknown transmitter's posterior; nothing if it is known."""
+    """Return as `unobserved_area` the cells with 90 % of an unknown transmitter's posterior, or nothing."""
     if "p_transmitter" not in coverage:
         return []
     x, y = (coverage[f"tx_{name}"].to_numpy() for name in "xy")
@@ -379,7 +363,7 @@ def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
-    """Return the legend of the map; walls that only the first of several maps has are not observed in the others."""
+    """Return the legend; walls that only the first of several maps contains are "not observed" in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
     located = any("p_transmitter" in coverage for coverage in coverages)
     if located:
@@ -401,7 +385,7 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
 
 
 def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()) -> bytes:
-    """Return `report_figure` as a PDF; equal maps give equal bytes."""
+    """Return `report_figure` as PDF; equal maps give equal bytes."""
     figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading), io.BytesIO()
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
@@ -410,17 +394,14 @@ def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, 
 def report_figure(
     coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
 ) -> Figure:
-    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty.
-
-    `heading` is the name of the map and the date.
-    """
+    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty."""
     maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
     notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
     text_in = _REPORT_LINE_IN * (text.count("\n") + 2)
     figure = Figure(figsize=_A4_IN, layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(_A4_IN[1] - text_in, text_in))
-    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm)
+    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm, _A4_IN[1] - text_in - 0.6)
     title = " \N{MIDDLE DOT} ".join(["Radio coverage", *heading])
     figure.suptitle(f"{title}\n{headline('Prediction', maps)}", fontsize="medium", parse_math=False)
     axis = parts[1].subplots()
@@ -429,10 +410,30 @@ def report_figure(
     return figure
 
 
+def _report_grid(most: int, aspect: float, height_in: float) -> tuple[int, int]:
+    """Return the number of panels, two or more, and the columns that give them most of the page.
+
+    Colour bars are beside the panels of one column, and else below each panel.
+    """
+
+    def area(grid: tuple[int, int]) -> float:
+        count, columns = grid
+        more_in = _BESIDE_IN if columns == 1 else _BELOW_IN
+        width_in = min(_A4_IN[0] / columns - more_in[0], aspect * (height_in / math.ceil(count / columns) - more_in[1]))
+        return count * max(width_in, 0.0) ** 2
+
+    return max(((count, columns) for count in range(2, most + 1) for columns in (1, 2, count)), key=area)
+
+
 def _draw_report(
-    pictures: Any, coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
+    pictures: Any,
+    coverage: xr.Dataset,
+    maps: Mapping[str, xr.Dataset],
+    powers_dbm: Floats,
+    threshold_dbm: float,
+    height_in: float,
 ) -> None:
-    """Draw received power, its probability and uncertainty, and the strongest transmitter; on wide maps two of them."""
+    """Draw received power, its probability, and as it fits the strongest transmitter and the uncertainty."""
     power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
     strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
     thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
@@ -447,12 +448,13 @@ def _draw_report(
     panels = [
         Layer("Mean received power", lambda _: _taken(power, strongest), level, "viridis", "dBm"),
         Layer(f"P(received power > {threshold_dbm:g} dBm)", lambda _: above, probability, "cividis", "probability"),
-        Layer("Standard deviation of the received power", lambda _: spread, Normalize(0.0, 30.0), "magma", "dB"),
         Layer("Strongest transmitter", lambda _: strongest.astype(float), *servers),
+        Layer("Standard deviation", lambda _: spread, Normalize(0.0, 30.0), "magma", "dB"),
     ]
-    is_wide = coverage.sizes["x"] > _WIDE_ASPECT * coverage.sizes["y"]
-    count = 2 if is_wide else 3 + (len(maps) > 1)
-    axes = pictures.subplots(2, 1 if is_wide else 2).ravel()
+    if len(maps) == 1:
+        del panels[2]
+    count, columns = _report_grid(len(panels), coverage.sizes["x"] / coverage.sizes["y"], height_in)
+    axes = pictures.subplots(math.ceil(count / columns), columns, squeeze=False).ravel()
     x_m, y_m = (coverage[name].to_numpy() for name in TX_COORDINATES[:2])
     for axis, layer in zip(axes[:count], panels, strict=False):
         _draw(axis, next(iter(maps.values())), layer)
@@ -461,7 +463,8 @@ def _draw_report(
         for place in zip(maps, zip(x_m, y_m, strict=True), strict=True):
             axis.annotate(*place, (7, 0), textcoords="offset points", va="center", zorder=5, **_NAME)
         axis.set_title(layer.title, fontsize="medium")
-        bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, location="bottom", label=layer.label)
+        where = {"location": "right" if columns == 1 else "bottom", "shrink": 0.9}
+        bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, label=layer.label, **where)
         if not layer.label:
             bar.set_ticks(range(len(maps)), labels=[name[:_ROW_NAME] for name in maps])
     for axis in axes[count:]:
@@ -469,14 +472,12 @@ def _draw_report(
 
 
 def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
-    """Take one of (T, ny, nx) for each (ny, nx)."""
     return np.take_along_axis(values, index[None], axis=0)[0]
 
 
 def _report_table(
     coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
 ) -> str:
-    """Return the covered area by received power, a row for each transmitter, and one for any of several."""
     rows = [f"Observed floor / all floor above, with P = {_LIKELY:g}"]
     for (name, one), power_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]
@@ -493,10 +494,9 @@ def _report_table(
 
 
 def _report_notes(coverage: xr.Dataset) -> list[str]:
-    """Return paragraphs on the receivers, the map, the uncertainty and the material of the walls."""
     attributes = coverage.attrs
     notes = [
-        f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. "
+        f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. Axes are in m. "
         f"{attributes['map_observed_fraction']:.0%} of the map is observed. Predictor: {attributes['predictor']}. "
         f"Lines enclose the area above the threshold with a probability of {_LIKELY:g}. Unobserved floor counts with "
         "the probability that it is indoors."
@@ -539,12 +539,11 @@ def plot_network(network: xr.Dataset) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than a network map.
+        For anything but a network map.
 
     Examples
     --------
@@ -589,7 +588,6 @@ def plot_network(network: xr.Dataset) -> Figure:
 def _draw_network(
     axis: Axes, network: xr.Dataset, picture: Floats, cmap: str | ListedColormap, norm: Normalize
 ) -> None:
-    """Draw a layer, the walls and the transmitters."""
     extent = extent_m(network)
     shown = np.ma.masked_invalid(picture)
     axis.imshow(shown, extent=extent, origin="lower", interpolation="nearest", norm=norm, cmap=cmap)

@@ -1,4 +1,4 @@
-"""A coverage map as one HTML page: its transmitters and layers, the values under the pointer, P(gain > threshold)."""
+"""A coverage map as an HTML page: transmitters, layers, values under the pointer, P(gain > threshold)."""
 
 import html
 import json
@@ -28,12 +28,12 @@ from sionna_partial.plots.style import server_colours
 from sionna_partial.resources import optional_packages
 
 THRESHOLD_DB = -100.0
-"""Threshold of P(gain > threshold) before the slider is moved [dB]."""
+"""Initial threshold of P(gain > threshold) [dB]."""
 
 _WIDTH, _HEIGHT, _SHORTEST, _COLOURS, _STEPS = 760, 1000, 60, 256, 1024
 _LAYERS = ("link_state", "p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db", "p_above", "best_server")
 STATES = ["outage", "LOS", "NLOS"]
-"""Words for link states."""
+"""Names of link states."""
 
 _STRONGEST = "best server"
 _TOOLTIPS = (
@@ -80,7 +80,7 @@ _PAGE = Path(__file__).with_suffix(".html").read_text(encoding="utf-8")
 
 
 def coverage_page(coverage: xr.Dataset) -> bytes:
-    """Return the HTML page of a coverage map, which needs no other file. Equal maps give equal pages."""
+    """Return the self-contained HTML page of a coverage map; equal maps give equal pages."""
     with optional_packages():
         from bokeh.embed import json_item
         from bokeh.resources import Resources
@@ -135,7 +135,7 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
 
 
 def radio_layers(servers: int) -> dict[str, Layer]:
-    """Return layers of a transmitter with its power, or of the strongest of so many, by the name of their variable."""
+    """Return layers of a transmitter with its power, or of the strongest of several, by variable."""
     known = coverage_layers(THRESHOLD_DB)
     level = Normalize(-130.0, -30.0), "viridis", "dBm"
     ratio, numbers = (Normalize(-20.0, 50.0), "viridis", "dB"), Normalize(0, servers - 1)
@@ -153,13 +153,13 @@ def radio_layers(servers: int) -> dict[str, Layer]:
 
 
 def server_codes(count: int) -> list[str]:
-    """Return the colours of so many transmitters as a browser has them."""
+    """Return the CSS colours of transmitters."""
     cmap = ListedColormap(server_colours(count))
     return [to_hex(cmap(number)) for number in range(count)]
 
 
 def level_codes(below: int, above: int) -> list[str]:
-    """Return colours for so many steps below and above a threshold, with a break between them, for a browser."""
+    """Return CSS colours for steps below and above a threshold, with a break between them."""
     steps = [*np.linspace(0.0, 0.3, below), *np.linspace(0.6, 1.0, above)]
     return [to_hex(colour) for colour in colormaps["viridis"](steps)]
 
@@ -190,16 +190,15 @@ def _empty_plot(coverage: xr.Dataset) -> Any:
 
 
 def _best_server(maps: Mapping[str, xr.Dataset]) -> Layer:
-    """Show the number of the transmitter with the largest mean path gain."""
     gain_db = np.stack([each["gain_mean_db"].to_numpy() for each in maps.values()])
     best = np.nan_to_num(gain_db, nan=-np.inf).argmax(axis=0)
     return Layer("Best server", lambda _: best, Normalize(0, len(maps) - 1), ListedColormap(server_colours(len(maps))))
 
 
 def _source(maps: Mapping[str, xr.Dataset], layers: Mapping[str, Layer]) -> Any:
-    """Values (ny, nx) in a row for each transmitter, and in one for the best server.
+    """Return values (ny, nx), a row for each transmitter and for the best server.
 
-    They are NaN where no receiver can stand, and outside a complete map; rounding them halves the page.
+    NaN without a receiver and outside a complete map; rounding halves the page.
     """
     from bokeh.models import ColumnDataSource
 
@@ -227,7 +226,7 @@ def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
 def add_layer(
     plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str], side: Any = "right"
 ) -> list[Any]:
-    """Draw a layer, of numbers or of words, with its colour bar, and return both; the first layer alone is visible."""
+    """Draw a layer of numbers or words with its colour bar, and return both; only the first layer is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
 
@@ -259,7 +258,6 @@ def _add_hover(plot: Any, images: list[Any], words: Mapping[str, Sequence[str]])
 
 
 def _add_map(plot: Any, maps: Mapping[str, xr.Dataset]) -> None:
-    """Draw the unobserved area hatched, the walls black, and the transmitters; several with their names."""
     from bokeh.models import LinearColorMapper
 
     coverage = next(iter(maps.values()))

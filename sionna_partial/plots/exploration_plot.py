@@ -1,4 +1,4 @@
-"""Pictures of an exploration: the map of the robot, its trajectory and field of view, and the next poses."""
+"""Figures of explorations: map of the robot, trajectory, field of view and next poses."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ from sionna_partial.plots.style import (
 from sionna_partial.worlds.camera import view_corners_m
 
 FRAME_MS, LAST_FRAME_MS = 100, 2500
-"""Time of a frame of an animation, and of its last one [ms]."""
+"""Duration of a frame and of the last one [ms]."""
 
 MAX_PANELS = 12
-"""Largest number of moments in one contact sheet."""
+"""Largest number of steps in one figure."""
 
 _FREE, _UNSEEN_WALL = "white", "0.68"
 _VIEW_OPACITY = 0.35
@@ -64,22 +64,21 @@ _PREDICTED = {
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw the map of the robot at each step, with its trajectory and its field of view.
+    """Draw the map of the robot at each step, with its trajectory and field of view.
 
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`. Each of its `steps` has a panel, or `MAX_PANELS` of them, evenly chosen.
+        From `explore_trajectory`. Each step has a panel, up to `MAX_PANELS`.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than an Exploration.
+        For anything but an Exploration.
 
     Examples
     --------
@@ -110,21 +109,21 @@ def plot_exploration(exploration: Exploration) -> Figure:
 def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], tx: ArrayLike | None = None) -> None:
     """Write a GIF of an exploration, with a frame for each of its `steps`.
 
-    With a transmitter, the predicted path gain and its uncertainty grow beside the map; each frame takes a prediction.
+    With a transmitter, predicted path gain and uncertainty are beside the map; each frame takes a prediction.
 
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`, for instance with `steps=range(0, 201, 4)`.
+        From `explore_trajectory`.
     path : path-like
-        The file, with the suffix `.gif`. Equal explorations give equal bytes.
+        A `.gif` file. Equal explorations give equal bytes.
     tx : (3,) or (2,) array-like, optional
         Transmitter [m].
 
     Raises
     ------
     SettingsError
-        For something else than an Exploration, or another suffix.
+        For anything but an Exploration, or another suffix.
     PositionError
         For a transmitter outside the map or in a wall.
     OutputError
@@ -166,7 +165,6 @@ def _frame(exploration: Exploration, index: int, size: tuple[float, float]) -> I
 def _predicted(
     partial: PartialMap, tx: ArrayLike, window: tuple[float, float, float, float], size: tuple[float, float]
 ) -> Image.Image:
-    """Draw the predicted path gain and its standard deviation, the paler the less likely receivers are indoors."""
     coverage = predict_map(partial, tx, spacing_m=_SPACING_M, progress=False)
     width, height, wide = size[0] - 0.6, size[1] - 0.7, 2 * size[0] + 1.0
     figure = Figure(figsize=(wide, size[1]), dpi=_FRAME_DPI)
@@ -193,7 +191,7 @@ def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
 
 
 def _palette(frame: Image.Image) -> Image.Image:
-    """Choose the colours of all frames: exactly those that are drawn, and the mixtures that the last frame has."""
+    """Return the drawn colours and their mixtures in the last frame, for all frames."""
     drawn = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
     mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
@@ -204,7 +202,6 @@ def _palette(frame: Image.Image) -> Image.Image:
 
 
 def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
-    """Draw one step: the map, the trajectory up to then, and the field of view."""
     home, step = exploration.home, exploration.steps[index]
     x0, y0, x1, y1 = home.bounds_m
     picture = _picture(exploration.states[index], home.state)
@@ -225,13 +222,12 @@ def _draw(panel: Axes, exploration: Exploration, index: int) -> None:
 
 
 def _arrow(heading_deg: float) -> MarkerPath:
-    """Slender triangle in the heading of the robot."""
     angles = np.radians(heading_deg + np.array([0.0, 140.0, 220.0, 0.0]))
     return MarkerPath(np.stack([np.cos(angles), np.sin(angles)], axis=1), closed=True)
 
 
 def _picture(state: States, truth: States) -> Floats:
-    """Colours of the cells, (ny, nx, 3): the map, and beneath it the walls that are not on it."""
+    """Return the colours of the cells (ny, nx, 3), with the walls that are not on the map."""
     picture = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN)])[state]
     picture[(state == CellState.UNKNOWN) & (truth == CellState.WALL)] = to_rgb(_UNSEEN_WALL)
     return picture
@@ -264,7 +260,7 @@ def _add_legend(figure: Figure, exploration: Exploration) -> None:
 
 
 def plot_next_views(views: NextViews) -> Figure:
-    """Draw the map, the predicted uncertainty, and the ranked poses with their paths and frontiers.
+    """Draw map, predicted uncertainty, and ranked poses with their paths and frontiers.
 
     Parameters
     ----------
@@ -274,12 +270,11 @@ def plot_next_views(views: NextViews) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than NextViews.
+        For anything but NextViews.
 
     Examples
     --------

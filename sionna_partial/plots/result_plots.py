@@ -1,4 +1,4 @@
-"""Figures of placements, of calibrations of materials, and of evaluations of predictors."""
+"""Figures of placements, calibrations and evaluations."""
 
 import itertools
 from collections.abc import Mapping
@@ -42,10 +42,9 @@ _WIDTH_IN, _DPI = 9.0, 130
 _STAR: dict[str, Any] = STAR | {"markersize": 15}
 
 ANGLES_DEG = np.linspace(0.0, 85.0, 171)
-"""Angles of incidence at which reflections are drawn [degrees]."""
 
 LARGEST_LOSS_DB = 30.0
-"""Largest loss of a reflection that is drawn [dB]."""
+"""Largest drawn loss of a reflection [dB]."""
 
 _LINE: dict[str, Any] = {"linewidth": 1.6}
 
@@ -56,7 +55,7 @@ _PANELS = {
 }
 
 _COLOURS = (BLUE, "#ee6677", "#228833", "#bbbbbb", "#ccbb44", "#66ccee", "#aa3377", "#000000")
-"""Paul Tol's bright colours, the predictor's darkened, and black, for all that `evaluate` compares."""
+"""Paul Tol's bright colours (the predictor's darkened) and black."""
 
 _STYLES: dict[str, dict[str, Any]] = {
     "test": {"marker": "o", "linestyle": "-"},
@@ -67,10 +66,10 @@ _IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 
 
 def plot_placement(placement: TransmitterPlacement) -> Figure:
-    """Draw the map, the positions that were traced first, the refinement, and the best position with its coverage.
+    """Draw the map, the traced starts, the refinement, and the best position with its coverage.
 
-    Squares are receivers, in the colour of their probability of being covered from there (or of their mean gain), the
-    paler the less likely they are indoors. The refinement that led to the best position is red.
+    Squares are receivers in the colour of their probability of coverage (or mean gain), paler where they are less
+    probably indoors. The refinement that led to the best position is red.
 
     Parameters
     ----------
@@ -80,19 +79,17 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than a TransmitterPlacement.
+        For anything but a TransmitterPlacement.
 
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> figure = sp.plot_placement(sp.place_transmitter(partial))
+    >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
+    >>> figure = sp.plot_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
@@ -118,28 +115,27 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
 
 
 def plot_network_placement(placement: NetworkPlacement) -> Figure:
-    """Draw the transmitters that `place_transmitters` chose, the candidates, and the receivers that they cover.
+    """Draw the chosen transmitters, the candidates and the covered receivers.
 
     Parameters
     ----------
     placement : NetworkPlacement
+        From `place_transmitters`.
 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than a NetworkPlacement.
+        For anything but a NetworkPlacement.
 
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> figure = sp.plot_network_placement(sp.place_transmitters(partial, count=2))
+    >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
+    >>> figure = sp.plot_network_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
@@ -170,7 +166,6 @@ def _headline(placement: TransmitterPlacement) -> str:
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:
-    """Return the limits x0, x1, y0, y1 of the drawn part of the map: known cells and receivers that count [m]."""
     partial, half = placement.partial, 0.5 * placement.spacing_m
     known_m = corners_m(partial.state != CellState.UNKNOWN, partial.origin_m, partial.resolution_m)
     counting_m = placement.rx_m[placement.weight > 0.2, :2]
@@ -180,7 +175,6 @@ def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, flo
 def _draw_receivers(
     figure: Figure, axis: Axes, placement: TransmitterPlacement | NetworkPlacement, probability: str
 ) -> None:
-    """Draw a square for each receiver, and the colour scale of the probability, or of the mean gain."""
     size = placement.spacing_m
     patches = [Rectangle((x - size / 2, y - size / 2), size, size) for x, y in placement.rx_m[:, :2]]
     coverage = placement.settings.objective == "coverage"
@@ -207,9 +201,8 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
 def plot_calibration(calibration: MaterialCalibration) -> Figure:
     """Draw a calibration of materials.
 
-    Left the loss after each step; in the middle the measured gains against those that are traced with the material of
-    the start and with the calibrated one; right the loss of a reflection at walls, with two standard deviations to
-    either side, and of the start: a panel for each material of a mesh.
+    Left: the loss after each step. Middle: measured gains against gains traced with the initial and the calibrated
+    material. Right: the loss of a reflection with two standard deviations, a panel for each material.
 
     Parameters
     ----------
@@ -218,17 +211,17 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     SettingsError
-        For something else than a MaterialCalibration.
+        For anything but a MaterialCalibration.
 
     Examples
     --------
+    >>> import numpy as np
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 0, 0, 0, 0, 1], [1, 1, 1, 1, 1, 1]]
+    >>> cells = np.pad(np.zeros((3, 4), dtype=int), 1, constant_values=1)
     >>> room, tx = sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5)
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
@@ -289,10 +282,9 @@ def _words(material: Material) -> str:
 
 
 def plot_stages(evaluation: "Evaluation") -> Figure:
-    """Draw accuracy and gain errors against the stage of exploration, receivers indoors (paper, Fig. 6).
+    """Draw accuracy and gain errors of indoor receivers against the stage of exploration (paper, Fig. 6).
 
-    The predictor and every baseline have a colour each. Solid lines are test homes; the dashed line is the predictor
-    on its training homes.
+    Solid lines are test homes, the dashed line the predictor on its training homes.
     """
     rows = [row for row in evaluation.select(receivers="indoor", ends_seen="all") if row.metrics.links]
     require(len(rows) > 0, "evaluation.rows", (), "evaluate links with receivers drawn indoors.")
@@ -307,7 +299,6 @@ def plot_stages(evaluation: "Evaluation") -> Figure:
 
 
 def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
-    """Draw one figure of merit."""
     models = list(dict.fromkeys(row.model for row in rows))
     for model, colour in zip(models, itertools.cycle(_COLOURS), strict=False):
         for homes, style in _STYLES.items():
@@ -323,9 +314,8 @@ def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
 def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
     """Draw reliability diagrams of the link state (above) and histograms of the gain's transform (below), by stage.
 
-    In a reliability diagram, discs of calibrated states lie on the dashed line; the area of a disc is its number of
-    links. In a histogram, a calibrated gain fills all bins up to the dashed line; a hill is a standard deviation too
-    large, a bowl one too small, a slope a mean that is too high (falling) or too low (rising).
+    Calibrated states are on the dashed line (area: number of links), calibrated gains fill all bins up to the dashed
+    line. A hill shows a standard deviation that is too large, a bowl one that is too small.
     """
     require(len(stages) > 0, "stages", dict(stages), "give at least one calibration.")
     figure = Figure(figsize=(max(1.8 * len(stages), 5.4), 4.6), dpi=170, layout="constrained")

@@ -1,4 +1,4 @@
-"""Style of all figures (colours, shaded cells, legends, reproducible PNG files), and the figure of a map."""
+"""Style of all figures, reproducible PNG files, and the figure of a map."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 
 YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
-"""Paul Tol's high-contrast colours: distinguishable with any colour vision and in grey."""
+"""Paul Tol's high-contrast colours, for any colour vision and in grey."""
 
 STATE_COLOURS = {LinkState.LOS: YELLOW, LinkState.NLOS: RED, LinkState.OUTAGE: BLUE}
-"""The better the link, the brighter."""
+"""Colours of link states, bright for good links."""
 
 STAR: dict[str, Any] = {"marker": "*", "markerfacecolor": "white", "markeredgecolor": "black", "linestyle": "none"}
 """Marker of the transmitter."""
 
 BORDER_M = 0.3
-"""Width of the border around the known cells in a picture [m]."""
+"""Border around the known cells [m]."""
 
 
 _SHEET_ASPECT = 1.5
 
 WALL, UNKNOWN = "black", "0.86"
-"""Colours of cells on maps; free ones are white."""
+"""Colours of cells; free ones are white."""
 
 _SERVERS = "tab20"
 
 _POINTS = 72
-"""Pixels of a notebook for each inch of a figure."""
+"""Pixels of a notebook per inch."""
 
 _WIDTH_IN, _DPI = 6.4, 110
 
 
 class Figure(matplotlib.figure.Figure):
-    """A figure that a notebook shows when a cell ends with it, although pyplot has no part in it."""
+    """A figure that notebooks show although pyplot does not manage it."""
 
     def _repr_png_(self) -> tuple[bytes, dict[str, float]]:
         width, height = self.get_size_inches() * _POINTS
@@ -56,7 +56,7 @@ class Figure(matplotlib.figure.Figure):
 
 
 def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> bytes:
-    """Return a figure as a PNG file, at most so wide; equal figures give equal bytes."""
+    """Return a figure as PNG of limited width; equal figures give equal bytes."""
     buffer = io.BytesIO()
     dpi = min(figure.dpi, width_px / figure.get_figwidth())
     figure.savefig(buffer, format="png", dpi=dpi, metadata={"Software": None})
@@ -64,26 +64,26 @@ def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> 
 
 
 def shade(where: Bools, grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
-    """Paint some cells grey, black by default, and leave the rest transparent: (ny, nx, 4)."""
+    """Paint some cells, black by default, and leave the rest transparent: (ny, nx, 4)."""
     picture = np.full((*where.shape, 4), grey, dtype=np.uint8)
     picture[..., 3] = np.uint8(255 * opacity) * where
     return picture
 
 
 def window_m(points_m: Floats) -> tuple[float, float, float, float]:
-    """Limits x0, x1, y0, y1 of a picture of points (N, 2) with a border [m]."""
+    """Return the limits x0, x1, y0, y1 of points (N, 2) with a border [m]."""
     (x0, y0), (x1, y1) = points_m.min(axis=0) - BORDER_M, points_m.max(axis=0) + BORDER_M
     return float(x0), float(x1), float(y0), float(y1)
 
 
 def corners_m(cells: Bools, origin_m: tuple[float, float], resolution_m: float) -> Floats:
-    """Lower-left and upper-right corners of cells (2N, 2) [m]."""
+    """Return the lower-left and upper-right corners of cells (2N, 2) [m]."""
     corners = np.argwhere(cells)[:, ::-1]
     return np.vstack([corners, corners + 1]) * resolution_m + origin_m
 
 
 def sheet_columns(count: int, aspect: float) -> int:
-    """Choose the columns of a sheet that is neither high nor wide, with few empty panels; none of up to four panels."""
+    """Return the number of columns of a sheet that is neither high nor wide, with few empty panels."""
 
     def fault(columns: int) -> float:
         rows = math.ceil(count / columns)
@@ -93,7 +93,7 @@ def sheet_columns(count: int, aspect: float) -> int:
 
 
 def server_colours(count: int) -> list[tuple[float, ...]]:
-    """Colours of so many transmitters, which repeat beyond 20."""
+    """Return the colours of transmitters, which repeat beyond 20."""
     cmap = colormaps[_SERVERS]
     return [cmap(number % cmap.N) for number in range(count)]
 
@@ -101,33 +101,32 @@ def server_colours(count: int) -> list[tuple[float, ...]]:
 def legend_below(
     figure: Figure, handles: Sequence[Line2D | Patch], columns: int | None = None, title: str = ""
 ) -> None:
-    """Draw a legend below the axes, in one row by default, with a line above it."""
+    """Draw a legend below the axes, in one row by default."""
     count = columns or len(handles)
     figure.legend(handles=handles, loc="outside lower center", ncols=count, frameon=False, title=title or None)
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
-    """Draw a map and the positions of radios on it, to check before predicting that it is the right way up.
+    """Draw a map and the positions of radios on it, to check scale and orientation.
 
-    Positions outside the map are drawn, too.
+    Positions outside the map are included.
 
     Parameters
     ----------
     partial : PartialMap
     tx : (2,), (3,), (T, 2) or (T, 3) array-like, optional
-        Transmitters, world x, y and z [m].
+        Transmitters [m].
     rx : (2,), (3,), (N, 2) or (N, 3) array-like, optional
         Receivers [m].
 
     Returns
     -------
     matplotlib.figure.Figure
-        Not registered with pyplot: it need not be closed.
 
     Raises
     ------
     MapError
-        For something else than a PartialMap.
+        For anything but a PartialMap.
     PositionError
         For positions that are not finite, or have another shape.
 
@@ -161,7 +160,7 @@ def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike 
 
 
 def draw_map(axis: Axes, partial: PartialMap) -> None:
-    """Draw the cells: free ones white, walls black, unknown ones grey."""
+    """Draw the cells."""
     x0, y0, x1, y1 = partial.bounds_m
     axis.set_facecolor(UNKNOWN)
     for state, grey, order in ((CellState.FREE, 255, 0.5), (CellState.WALL, 0, 3.0)):
@@ -170,7 +169,6 @@ def draw_map(axis: Axes, partial: PartialMap) -> None:
 
 
 def _positions(name: str, values: ArrayLike | None) -> Floats:
-    """Return x and y (N, 2) of positions [m]; none for None."""
     if values is None:
         return np.zeros((0, 2))
     remedy = "give x and y, or x, y and z, in metres: (3,) or (N, 3)."
