@@ -225,9 +225,8 @@ def unknown_material(maps: dict[str, sp.PartialMap], arguments: argparse.Namespa
             found = {}
             for material in (None, *COMMON):
                 settings = sp.TraceSettings(frequency_hz), sp.SceneSettings(material=material)
-                sp.LinkModel(partial, None, *settings).predict(tx_m, rx_m[:50])
                 model = sp.LinkModel(partial, None, *settings)
-                model.predict(tx_m, rx_m[:2])
+                model.predict(tx_m, rx_m)  # compiles kernels
                 start = time.process_time()
                 found[material] = model.predict(tx_m, rx_m), time.process_time() - start
             unknown, seconds = found.pop(None)

@@ -15,6 +15,7 @@ from meshes import box, scene_mesh
 import sionna_partial as sp
 from sionna_partial.files import temporary_folder
 from sionna_partial.tracing.power import transmission_coefficients
+from sionna_partial.tracing.walls import Interior, are_in_wall, is_free_between
 
 BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
@@ -58,6 +59,33 @@ def field(*solids: trimesh.Trimesh | None) -> sp.PartialMap:
     state = np.zeros((60, 80), dtype=np.uint8)
     state[:, 42:46] = 2 * (None in solids)
     return sp.PartialMap(state, 0.1, mesh=scene_mesh(*(solid for solid in solids if solid is not None)))
+
+
+def test_rays_between_two_that_stay_in_one_wall() -> None:
+    """The rule for a bundle of rays is never less strict than the rule for each."""
+    rng, agreed = np.random.default_rng(4), 0
+    for _ in range(200):
+        free = np.zeros((40, 40), dtype=bool)
+        free[rng.integers(0, 40, 4), rng.integers(0, 40, 4)] = True
+        interior = Interior.of(free, free, np.zeros((0, 2), dtype=bool), 0.05, 0.4)
+        near, far = ((x, rng.uniform(0.3, 0.9), rng.uniform(1.0, 1.7)) for x in (0.8, rng.uniform(0.9, 1.5)))
+        source, rays = (0.05, rng.uniform(0.4, 1.6)), []
+
+        def ray(part: float, source=source, near=near, far=far) -> tuple[float, ...]:
+            y = near[1] + part * (near[2] - near[1])
+            length = np.hypot(near[0] - source[0], y - source[1])
+            x, y = (near[0] - source[0]) / length, (y - source[1]) / length
+            return x, y, x, length, (far[0] - source[0]) / x
+
+        rays = ray(0.0), ray(1.0)
+        if not are_in_wall(interior, *source, rays):
+            continue
+        agreed += 1
+        for x, y, cosine, first, last in map(ray, np.linspace(0.0, 1.0, 9)):
+            end = source[0] + (last + 0.1) * x, source[1] + (last + 0.1) * y
+            assert (last - first) * cosine <= 0.4 + 1e-9
+            assert not is_free_between(interior, source, end, first / (last + 0.1), last / (last + 0.1))
+    assert 20 < agreed < 180
 
 
 class TestOneWall:

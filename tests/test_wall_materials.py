@@ -77,6 +77,18 @@ class TestCandidates:
         assert found.text(np.eye(16)[0]) == "drywall 1.00"
         assert found.text(0.6 * np.eye(16)[0] + 0.4 * np.eye(16)[7]) == "drywall .60, concrete .40"
 
+    def test_predictions_need_fewer_paths(self):
+        settings, power = sp.TraceSettings(2.4e9, diffraction=False), np.zeros(len(RX))
+        simulation, count = sp.Simulation(FLAT, settings), 0
+        for block in simulation.blocks(np.array(TX), RX, lambda *_: None):
+            np.add.at(power, block.path_rx, block.power)
+            count += len(block.a)
+        every = simulation.links(TX, RX)
+        missing_db = every.gain_db - path_gain_db(power)
+        assert count < 0.8 * len(every.a)
+        assert np.median(missing_db) < 0.1
+        assert missing_db.mean() < 0.2
+
 
 class TestPrediction:
     def test_it_is_the_mixture_over_the_prior_with_residuals(self):

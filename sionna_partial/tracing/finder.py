@@ -49,7 +49,7 @@ Kinds = tuple[list[Kind], list[Kind]]
 class PlanScene:
     """An extruded floor plan on disk; `shapes` are its shape names in face order.
 
-    `floor` (ny, nx) are the cells that have a floor.
+    `floor` (ny, nx) are the cells that have a floor. Limits of paths through walls may be `coarse`.
     """
 
     xml: Path
@@ -59,13 +59,14 @@ class PlanScene:
     wedges: Wedges
     partial: PartialMap
     floor: Bools
+    coarse: bool = False
 
     @cached_property
     def interior(self) -> Interior:
         depth_m, partial = self.settings.wall_depth_m, self.partial
         walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
         solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
-        return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
+        return Interior.of(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         geometry, settings = self.geometry, self.settings
@@ -77,7 +78,7 @@ class PlanScene:
             opaque.append(DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, materials, walls))
         if not settings.through_walls:
             return opaque, []
-        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials)
+        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials, coarse=self.coarse)
         if not settings.diffraction:
             return opaque, [crossing]
         return opaque, [crossing, CrossedEdgeCandidates(geometry, self.wedges, crossing)]
@@ -93,6 +94,7 @@ class MeshScene:
     vertices_m: Floats
     triangles: NDArray[np.int64]
     cells: Cells
+    coarse: bool = False
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         """Return the kinds of candidates: sequences of planes that rays meet."""
@@ -103,7 +105,8 @@ class MeshScene:
         opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
         if not settings.through_walls:
             return opaque, []
-        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, min(SPLIT_RAYS, settings.samples_per_tx), gains)]
+        count = min(SPLIT_RAYS, settings.samples_per_tx)
+        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, count, gains, coarse=self.coarse)]
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:

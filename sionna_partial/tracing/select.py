@@ -203,14 +203,18 @@ class Limits(NamedTuple):
     weakest: float
 
     @classmethod
-    def of(cls, settings: TraceSettings, walls: int, *, directed: bool) -> "Limits":
-        """Return the limits for at most so many walls; with a directed antenna, long paths can be the strongest."""
+    def of(cls, settings: TraceSettings, walls: int, *, directed: bool, coarse: bool = False) -> "Limits":
+        """Return the limits for at most so many walls; with a directed antenna, long paths can be the strongest.
+
+        With `coarse`, fewer paths are listed: where the material of walls is unknown, its spread is much larger.
+        """
         depth = settings.max_depth
         if settings.tolerance_db == 0.0:
             return cls(depth, depth, walls, 1.0, 1e-6)
         if directed:
             return cls(depth, depth, walls, 0.1, 1e-4)
-        return cls(depth, min(depth, 4), walls, 0.03, 5e-4)
+        reflections, weakest = (3, 2.5e-3) if coarse else (4, 5e-4)
+        return cls(depth, min(depth, reflections), walls, 0.03, weakest)
 
     def min_power(self, found: Floats) -> Floats:
         return self.weakest * np.maximum(found, _NO_POWER)

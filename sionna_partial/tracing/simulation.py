@@ -218,11 +218,12 @@ class Simulation:
     ) -> Iterator[SolvedPaths]:
         """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, some at a time.
 
-        An antenna needs both polarisations; paths are left out that are weak with it.
+        An antenna needs both polarisations; paths are left out that are weak with it. Limits are coarse where the
+        material of walls is unknown.
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
-        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, averaged=True):
+        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=self._coarse_finder):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
@@ -298,6 +299,14 @@ class Simulation:
         draws = range(1, self.resolved.scene_settings.geometries or 1)
         return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
 
+    @cached_property
+    def _coarse_finder(self) -> ExactFinder | RayFinder | MeanFinder:
+        """Return the finder of the paths that predictions need."""
+        finder = self._mean_finder
+        if not self.material_unknown or not isinstance(finder, ExactFinder):
+            return finder
+        return replace(finder, written=replace(finder.written, coarse=True))
+
     def _finder_of(self, draw: int) -> ExactFinder | RayFinder:
         if self._only_by_rays:
             names = [f"{kind.setting} on a mesh" if kind.exact_on else kind.setting for kind in self._only_by_rays]
@@ -321,10 +330,10 @@ class Simulation:
         polarisations: int = 1,
         antenna: Antenna | None = None,
         *,
-        averaged: bool = False,
+        finder: ExactFinder | RayFinder | MeanFinder | None = None,
     ) -> Iterator[Iterator[Found]]:
         """Find the paths from transmitters (T, 3) to the receivers of each, in blocks of bounded memory."""
-        finder = self._mean_finder if averaged else self._finder
+        finder = finder or self._finder
         at_once = self.partial.environment.receivers_at_once
         groups = [
             (tx, chosen[start : start + at_once].astype(np.int32))
@@ -353,8 +362,9 @@ class Simulation:
     ) -> dict[str, Any]:
         """Trace the links of a mask (T, N) into columns of paths; return their states and gains [dB]."""
         sums = LinkSums(*valid.shape)
-        rx_of_tx, averaged = map(np.flatnonzero, valid), isinstance(columns, PathColumns)
-        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, averaged=averaged):
+        rx_of_tx = map(np.flatnonzero, valid)
+        finder = self._mean_finder if isinstance(columns, PathColumns) else self._finder
+        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, finder=finder):
             parts = [paths for _, paths in group]
             columns.append(parts)
             for paths in parts:
@@ -373,7 +383,9 @@ class Simulation:
         source = int(valid.sum(axis=1).argmax())
         all_m = rx_m[valid[source]]
         some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
-        found = sum(len(paths.a) for paths in self.blocks(tx_m[source], some, no_progress))
+        every = [np.arange(len(some))]
+        groups = self._groups(tx_m[source][None], some, every, no_progress, finder=self._mean_finder)
+        found = sum(len(paths.a) for group in groups for _, paths in group)
         count = round(found / len(some) * valid.sum())
         size_gb = 2 * count * bytes_each / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)

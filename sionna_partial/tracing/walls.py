@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
 from sionna_partial.scene.outlines import Plan
 from sionna_partial.tracing.interactions import REFRACTION
@@ -26,14 +26,22 @@ from sionna_partial.tracing.power import Materials
 class Interior(NamedTuple):
     """Space between walls: cells (ny, nx) that are free or have a floor, their edge and the largest wall depth [m].
 
-    `solid` (P, 2) is True where the wall continues on the left or right of its pieces.
+    `free_before` (ny + 1, nx + 1) is the number of free cells in smaller rows and columns. `solid` (P, 2) is True where
+    the wall continues on the left or right of its pieces.
     """
 
     free: Bools
+    free_before: Indices
     floor: Bools
     solid: Bools
     cell_m: float
     depth_m: float
+
+    @classmethod
+    def of(cls, free: Bools, floor: Bools, solid: Bools, cell_m: float, depth_m: float) -> "Interior":
+        """Count the free cells."""
+        before = np.pad(free.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        return cls(free, before, floor, solid, cell_m, depth_m)
 
 
 def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
@@ -249,3 +257,26 @@ def is_free_between(cells, start, end, first, last):
             return True
         s += 0.5 * cells.cell_m
     return False
+
+
+@njit(cache=True)
+def are_in_wall(interior, x, y, rays):  # type: ignore[no-untyped-def]
+    """Return whether all rays between two from a point stay in one wall from a face to the next, by `is_free_between`.
+
+    Each of the two rays is (direction x, y, cosine of incidence at the next face, distances of the two faces).
+    """
+    left = low = np.inf
+    right = high = -np.inf
+    for along_x, along_y, cosine, near, far in rays:
+        if far < near or (far - near) * cosine > interior.depth_m:
+            return False
+        for s in (near + interior.cell_m, far - interior.cell_m):
+            left, right = min(left, x + s * along_x), max(right, x + s * along_x)
+            low, high = min(low, y + s * along_y), max(high, y + s * along_y)
+    rows, columns = interior.free.shape
+    begin, end = max(int(left / interior.cell_m), 0), min(int(right / interior.cell_m) + 1, columns)
+    bottom, top = max(int(low / interior.cell_m), 0), min(int(high / interior.cell_m) + 1, rows)
+    if begin >= end or bottom >= top:
+        return True
+    before = interior.free_before
+    return before[top, end] - before[bottom, end] - before[top, begin] + before[bottom, begin] == 0

@@ -130,11 +130,13 @@ class MeshReflections:
         settings: TraceSettings,
         rays: Iterable[Rays] | int,
         gains: Gains = ISOTROPIC,
+        *,
+        coarse: bool = False,
     ) -> None:
         ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64)), settings.max_depth
         if isinstance(rays, int):
             self.name, self._opaque, self._rays = "paths through walls", None, rays
-            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1)
+            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1, coarse=coarse)
         else:
             self.name, limits = "reflections", Limits(depth, depth, 0, 1.0, 0.0)
             sequences = collect_sequences(rays, mesh.planes)

@@ -44,6 +44,7 @@ from sionna_partial.tracing.plan.clipping import (
 from sionna_partial.tracing.plan.room import FACES, Building, Room
 from sionna_partial.tracing.power import COSINES, gain_between
 from sionna_partial.tracing.select import discount_after, matters, needs_by_distance
+from sionna_partial.tracing.walls import are_in_wall
 
 _BEAMS_AT_ONCE = 256
 """Number of beams through walls that one thread works on at a time."""
@@ -386,7 +387,8 @@ def _sort_by_distance(layers, count, t):
 def _lay_one(beam, i, active, task, layers, windows):
     scratch, plan_line, low = layers.clipped, task.building.plan.line, task.building.plan.low
     pieces = task.building.plan.pieces_m
-    of_piece, solid, depth_m = task.building.material, task.building.interior.solid, task.building.interior.depth_m
+    of_piece, interior = task.building.material, task.building.interior
+    solid, depth_m = interior.solid, interior.depth_m
     most_reflected = task.building.materials.most_reflected
     most_transmitted = task.building.materials.most_transmitted
     limits, left, crossed = task.building.limits, beam.left, beam.crossed
@@ -395,6 +397,7 @@ def _lay_one(beam, i, active, task, layers, windows):
     t0, x_0, y_0, size_0 = scratch.edge[i], layers.ray[i, 0], layers.ray[i, 1], layers.ray[i, 2]
     t1, x_1, y_1, size_1 = scratch.edge[i + 1], layers.ray[i + 1, 0], layers.ray[i + 1, 1], layers.ray[i + 1, 2]
     start_0 = start_1 = steep_0 = steep_1 = first = 0.0
+    before_0, before_1, may_be_same = size_0, size_1, order > 0 and depth_m > 0.0
     for j in range(min(active, FACES)):
         c = scratch.active[j]
         piece = scratch.wall[c]
@@ -411,12 +414,17 @@ def _lay_one(beam, i, active, task, layers, windows):
         total = beam.reflected * left * (task.most_transmitted if crossed == 0 else 1.0)
         if not matters(total * discount, near, task.needed):
             break
-        if beam.more > 0 and not _is_solid(pieces, solid, beam.window, piece):
+        rays = (x_0, y_0, cos_0, before_0, r_0), (x_1, y_1, cos_1, before_1, r_1)
+        inside = may_be_same and are_in_wall(interior, beam.window[0], beam.window[1], rays)
+        before_0, before_1, may_be_same = r_0, r_1, depth_m > 0.0 and not low[piece]
+        if beam.more > 0 and not ((inside and j > 0) or _is_solid(pieces, solid, beam.window, piece)):
             flat = near / np.hypot(near, 2.0 * task.building.room.height_m)
             part = most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
             if matters(part * total * next_discount, near, task.needed):
                 new = t0, t1, part * beam.reflected, left, crossed
                 windows = _extend(layers, plan_line, of_piece, c, new, windows)
+        if inside and j == 0 and not low[piece]:
+            break
         through = 1.0 if low[piece] else most_transmitted[material, min(int(most * COSINES) + 1, COSINES)]
         same = j > 0 and first > 0.0
         if same:

@@ -312,10 +312,12 @@ class CrossingCandidates:
         interior: Interior,
         settings: TraceSettings,
         materials: Materials,
+        *,
+        coarse: bool = False,
     ) -> None:
         self._geometry = geometry
         walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
-        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1)
+        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1, coarse=coarse)
         self.building = Building.of(geometry.plan, interior, room, materials, limits)
         self.lowered = Lowered.of(geometry, self.building, settings.max_walls)
 
