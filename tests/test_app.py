@@ -312,7 +312,6 @@ class TestRobot:
         window.settle()
         assert session.steps == 500
         found = window.answer.agreement()
-        assert found is not None
         assert found[0] > 0.9
         session.find_views()
         window.settle()
@@ -510,7 +509,6 @@ class TestDrawing:
                 act()
         with pytest.raises(SettingsError, match="drag along it"):
             session.measure([(5.0, 5.0)], 4.0)
-        assert session.plan is not None
         assert message == session.status.message
         session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
         window.settle()
@@ -539,7 +537,6 @@ class TestDrawing:
         session.draw(Stroke("free", ((2.05, 0.8), (2.05, 1.2)), 0.3))
         assert window.settle() == "Ready."
         partial = session.partial
-        assert partial is not None
         column = partial.state[:, 20].tolist()
         assert column == [1] * 7 + [0] * 6 + [1] * 19
         assert partial.state[20:, 19:22].sum() == 14
@@ -565,7 +562,6 @@ class TestDrawing:
         session = window.session
         session.open_example("apartment")
         window.settle()
-        assert session.partial is not None
         wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
         session.set(spacing_m=1.0)
         session.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
@@ -631,7 +627,6 @@ def url(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     root = str(Path(sp.__file__).parents[1])
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([root, *filter(None, sys.path)])}
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder, env=environment) as server:
-        assert server.stdout is not None
         yield server.stdout.readline().split()[1]
         server.terminate()
 

@@ -555,4 +555,4 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
-    return text + " Hatched: not observed."
+    return text + (" Hatched: not observed." if not answer.coverage.attrs["map_complete"] else "")
