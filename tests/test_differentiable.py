@@ -390,7 +390,7 @@ class TestMovedLengths:
             for times, pace in ((0.5, 0.5), (2.0, 2.0), (3.9, 3.9), (4.1, STEEPEST), (100.0, STEEPEST)):
                 exact_m = times * smooth_m
                 found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
-                np.testing.assert_allclose(found_m, np.maximum(exact_m + pace * grown_m, 0.0), rtol=1e-12)
+                np.testing.assert_allclose(found_m, np.maximum(exact_m + pace * grown_m, 0.0), rtol=1e-12, atol=1e-12)
 
     def test_complete_map_and_no_segments(self):
         complete = sp.PartialMap(np.pad(np.zeros((8, 8), dtype=np.uint8), 1, constant_values=1), 0.5)
