@@ -25,7 +25,7 @@ from importlib.metadata import version
 from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -322,10 +322,10 @@ def _truth(
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
     link_state[where] = np.concatenate([each.link_state for each in links])
     gain_db[where] = np.concatenate([each.gain_db for each in links])
-    empty = np.zeros((len(where), settings.cir_paths), np.float32)
-    cir = dict(zip(CIR, (empty, empty.copy(), np.full_like(empty, np.nan)), strict=True)) if settings.cir_paths else {}
-    parts = [_strongest(each, settings.cir_paths) for each in links if cir]
-    for name, found in zip(cir, zip(*parts, strict=True), strict=False):
+    cir: dict[str, Any] = {}
+    parts = [_strongest(each, settings.cir_paths) for each in links if settings.cir_paths]
+    for name, missing, found in zip(CIR, (0.0, 0.0, np.nan), zip(*parts, strict=True), strict=False):
+        cir[name] = np.full((len(where), settings.cir_paths), missing, np.float32)
         cir[name][where] = np.concatenate(found)
     return where, link_state, gain_db, cir
 

@@ -157,7 +157,12 @@ class LinkTable(Shown):
         index = np.concatenate([each[table.map_index] for each, table in zip(numbers, tables, strict=True)])
         is_same = len({tuple(values.shape[1:] for values in table.cir.values()) for table in tables}) == 1
         cir = {name: np.concatenate([table.cir[name] for table in tables]) for name in tables[0].cir if is_same}
-        shared = {"maps": tuple(maps.values()), "map_index": index, "complete_maps": complete_maps, "cir": cir}
+        shared: dict[str, Any] = {
+            "maps": tuple(maps.values()),
+            "map_index": index,
+            "complete_maps": complete_maps,
+            "cir": cir,
+        }
         return cls(features=features, **shared, **columns)
 
 
@@ -330,7 +335,7 @@ def _links_of(columns: dict[str, Any], notes: Any, cir: Mapping[str, Floats]) ->
     home = columns["home"].astype(np.str_)
     complete_maps = {name: _unpacked(each) for name, each in notes["maps"]["complete"].items()}
     phi = LinkFeatures(**found, context=context, frequency_hz=notes["frequency_hz"])
-    shared = {"maps": maps, "map_index": map_index, "complete_maps": complete_maps, "cir": cir}
+    shared: dict[str, Any] = {"maps": maps, "map_index": map_index, "complete_maps": complete_maps, "cir": cir}
     return LinkTable(home=home, features=phi, **shared, **table)
 
 
