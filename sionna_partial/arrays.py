@@ -16,13 +16,12 @@ Bools: TypeAlias = NDArray[np.bool_]
 Indices: TypeAlias = NDArray[np.intp]
 
 States: TypeAlias = NDArray[np.uint8]
-"""CellState or LinkState of each entry."""
 
 _Class = TypeVar("_Class", bound=type)
 
 
 def frozen(array: NDArray[Any]) -> NDArray[Any]:
-    """Return an array that cannot be written to: the array itself if it is read-only, otherwise a copy."""
+    """Return a read-only array: the array itself, or a copy if it can be written to."""
     if array.flags.writeable:
         array = array.copy()
         array.setflags(write=False)
@@ -30,10 +29,7 @@ def frozen(array: NDArray[Any]) -> NDArray[Any]:
 
 
 def read_only(cls: _Class) -> _Class:
-    """Decorate a frozen dataclass so that the arrays in its fields are read-only, also after unpickling.
-
-    Arrays that can be written to are copied (`frozen`): a caller who changes them later does not change the object.
-    """
+    """Decorate a frozen dataclass: its arrays are read-only, also after unpickling; writable arrays are copied."""
     build: Any = cls.__init__  # type: ignore[misc]
 
     def freeze(instance: Any) -> None:
@@ -56,18 +52,17 @@ def read_only(cls: _Class) -> _Class:
 
 
 def cross(first: Floats, second: Floats) -> Floats:
-    """Return the cross products of vectors (..., 2)."""
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
 def largest_part(mask: Bools) -> Bools:
-    """Return the cells (ny, nx) of the largest part of a mask whose cells touch by edges."""
+    """Return the largest part of a mask (ny, nx) whose cells touch by edges."""
     labels, _ = ndimage.label(mask)
     return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
 
 
 def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
-    """Return the largest value in each of the areas 0 to `count`, which `area` numbers. Faster than ndimage.maximum."""
+    """Return the largest value in each of the areas 0 to `count` of `area`; faster than ndimage.maximum."""
     largest = np.zeros(count + 1)
     np.maximum.at(largest, area.ravel(), values.ravel())
     return largest
@@ -76,8 +71,7 @@ def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
 def grid_edges(cost: Floats) -> tuple[Indices, Floats]:
     """Return pairs (2, E) of neighbouring cells of a grid, in eight directions, and the cost of a step between them.
 
-    A cell that costs 0 cannot be crossed, nor can the corner at which two such cells meet (skimage's MCP would take
-    that corner).
+    A cell that costs 0 cannot be crossed, nor the corner where two such cells meet (unlike in skimage's MCP).
     """
     cell, (ny, nx), passable = np.arange(cost.size).reshape(cost.shape), cost.shape, cost > 0
     ends, costs = [], []

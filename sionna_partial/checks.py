@@ -1,4 +1,4 @@
-"""Every check of input, whose error names the field, its value and the remedy; and the type of progress reports."""
+"""Checks of input, with errors that name the field, its value and the remedy; types of progress reports."""
 
 import itertools
 import math
@@ -18,7 +18,7 @@ Progress = Callable[[float, str], None]
 """Called with the fraction of the work that is done, and a message."""
 
 CountProgress = Callable[[int, int, str], None]
-"""Called with the number of things that are done, their number in all, and a message."""
+"""Called with the number of items that are done, their total, and a message."""
 
 _Settings = TypeVar("_Settings")
 
@@ -60,52 +60,46 @@ def require_number(name: str, value: object, low: float, high: float, *, open_lo
 
 
 def require_memory(memory_gb: object) -> None:
-    """Raise a SettingsError unless `memory_gb` is a limit of memory [GB]."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
 
 
 def require_whole(name: str, value: object, low: int, high: int) -> None:
-    """Raise a SettingsError unless `value` is a whole number in [low, high]."""
     inside = is_whole(value, low) and int(value) <= high  # type: ignore[call-overload]
     require(inside, name, value, f"give a whole number in [{low}, {high}].")
 
 
 def require_names(name: str, values: Sequence[str]) -> None:
-    """Raise a SettingsError unless `values` are texts for files and pictures, all different, one at least."""
-    good = len(values) == len({*values}) > 0 and all(each and each.isprintable() for each in values)
+    """Raise a SettingsError unless `values` are different texts, at least one, that can be names of files."""
+    good = len(values) == len({*values}) > 0 and all(text and text.isprintable() for text in values)
     require(good, name, values, "give each a name of its own, of printable characters.")
 
 
 def require_bool(name: str, value: object) -> None:
-    """Raise a SettingsError that names a value which is neither True nor False."""
     require(isinstance(value, bool), name, value, "give True or False.")
 
 
 def require_type(name: str, value: object, kind: type, remedy: str) -> None:
-    """Raise a SettingsError that names the type of `value` unless it is of a kind."""
     require(isinstance(value, kind), name, type(value).__name__, remedy)
 
 
 def require_choice(name: str, value: object, choices: Iterable[str]) -> None:
-    """Raise a SettingsError unless `value` is one of several words."""
     words = tuple(choices)
     require(isinstance(value, str) and value in words, name, value, f"choose one of {', '.join(words)}.")
 
 
 def transmitter_names(count: int) -> list[str]:
-    """Return the names of several transmitters that were given without: "tx1", "tx2" and so on."""
     return [f"tx{number}" for number in range(1, count + 1)]
 
 
 def plain(value: Any) -> Any:
-    """Return a scalar of NumPy as a number of Python, times as texts, and anything else as it is."""
+    """Return a NumPy scalar as a Python number, times as texts, and anything else as it is."""
     if getattr(getattr(value, "dtype", None), "kind", "") in tuple("mM"):
         return str(value)
     return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
 
 
 def number_of(value: object) -> float:
-    """Return the real number that a value is; NaN for anything else, which True and "1" are."""
+    """Return a real number; NaN for anything else, including True and "1"."""
     number = plain(value)
     try:
         return float(number) if isinstance(number, Real) and not isinstance(number, bool) else math.nan
@@ -134,12 +128,11 @@ def real_array(
 
 
 def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy: str) -> "NDArray[Any]":
-    """Return numbers as a float64 array: the one way in which positions and other real quantities enter."""
+    """Return numbers as a float64 array: the entry of positions and other real quantities."""
     return real_array(name, values, error, remedy).astype("float64")
 
 
 def is_whole(value: object, low: int = 0) -> bool:
-    """Return whether `value` is a whole number of `low` or more."""
     number = plain(value)
     return isinstance(number, Integral) and not isinstance(number, bool) and int(number) >= low
 
@@ -147,7 +140,7 @@ def is_whole(value: object, low: int = 0) -> bool:
 def are_stages(value: Any) -> bool:
     """Return whether `value` has increasing whole numbers (of steps) or increasing fractions in [0, 1)."""
     stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
-    numbers = all(isinstance(each, Real) and not isinstance(each, bool) for each in stages)
+    numbers = all(isinstance(stage, Real) and not isinstance(stage, bool) for stage in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
 
@@ -183,7 +176,7 @@ class Checked:
 
 def _checked(name: str, value: Any, hint: Any) -> Any:
     arguments = get_args(hint)
-    if NoneType in arguments and get_origin(arguments[0]) is Annotated:
+    if NoneType in arguments:
         return None if value is None else _checked(name, value, arguments[0])
     if get_origin(hint) is Annotated:
         number, allowed = arguments
@@ -194,12 +187,10 @@ def _checked(name: str, value: Any, hint: Any) -> Any:
         return number(value)
     if get_origin(hint) is Literal:
         require_choice(name, value, arguments)
-    elif hint is bool or arguments == (bool, NoneType):
-        require(isinstance(value, bool) or (value is None and hint is not bool), name, value, "give True or False.")
+    elif hint is bool:
+        require_bool(name, value)
     elif hint is str:
         require(isinstance(value, str), name, value, "give a text.")
-    elif NoneType in arguments and is_dataclass(arguments[0]):
-        return None if value is None else _checked(name, value, arguments[0])
     elif isinstance(hint, type) and is_dataclass(hint):
         if isinstance(value, str) and hasattr(hint, "named"):
             value = hint.named(value)

@@ -3,7 +3,7 @@
 from enum import IntEnum
 
 SPEED_OF_LIGHT_M_S = 299_792_458.0
-"""Speed of light in vacuum [m/s] (exact, SI)."""
+"""Exact (SI)."""
 
 CARRIER_FREQUENCY_HZ = 28e9
 """Carrier frequency of the paper's experiments [Hz]."""
@@ -12,28 +12,28 @@ GAIN_FLOOR_DB = -150.0
 """Smallest omnidirectional path gain, and the gain of an outage [dB] (paper, eq. 5)."""
 
 NO_RECEIVER = 255
-"""Link state where no receiver can stand, and no link was traced."""
+"""Link state where no receiver can be, or no link was traced."""
 
 DEFAULT_HEIGHT_M = 1.5
-"""Height of transmitters and receivers where none is given [m] (the paper's reference trace)."""
+"""Default height of transmitters and receivers [m] (the paper's reference trace)."""
 
 COARSER = 4
-"""Receiver spacing of a first, quick coverage map, as a multiple of the spacing of the final one."""
+"""Receiver spacing of a first, quick coverage map, as a multiple of the final spacing."""
 
 MEMORY_GB = 2.0
-"""Memory that a job may take where no other limit is given [GB]."""
+"""Default memory limit of a job [GB]."""
 
 DEFAULT_WALL_HEIGHT_M = 3.0
-"""Height to which plans are extruded where none is given [m]."""
+"""Default height of walls [m]."""
 
 DRYWALL_PERMITTIVITY = 2.94
 """Relative permittivity of layered drywall at 28 GHz (the paper's Wireless InSite material)."""
 
 DRYWALL_CONDUCTIVITY_S_M = 0.1226
-"""Conductivity of layered drywall at 28 GHz [S/m] (the paper's Wireless InSite material)."""
+"""Conductivity of layered drywall at 28 GHz [S/m] (same source)."""
 
 DRYWALL_CONDUCTIVITY_EXPONENT = 0.9395
-"""Exponent of the frequency in the conductivity of drywall, as of plasterboard (ITU-R P.2040-3, table 3)."""
+"""Exponent of the frequency in the conductivity, as of plasterboard (ITU-R P.2040-3, table 3)."""
 
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
@@ -42,26 +42,23 @@ MAX_COST = 98
 """Largest value of a cost grid [percent]: nav2 reads 99 as an inscribed obstacle and 100 as an obstacle."""
 
 MESH_SUFFIXES = (".ply", ".glb", ".gltf", ".obj", ".stl")
-"""File formats of meshes."""
 
 POINT_SUFFIXES = (".pcd", ".las", ".laz", ".xyz", ".pts")
-"""File formats of point clouds, besides PLY files without faces."""
+"""Point clouds, besides PLY files without faces."""
 
 DRAWING_SUFFIXES = (".dxf",)
-"""File formats of drawings."""
 
 IFC_SUFFIXES = (".ifc",)
-"""File formats of building models."""
 
 BAG_SUFFIXES = (".bag", ".mcap", ".db3")
-"""File formats of rosbags; one of ROS 2 may also be a folder with a metadata.yaml."""
+"""A bag of ROS 2 may also be a folder with a metadata.yaml."""
 
 
 VACUUM_SUFFIXES = (".json", ".vwm")
-"""File formats of maps of vacuum robots: Valetudo, and recordings of Valeronoi."""
+"""Maps of vacuum robots: Valetudo, and recordings of Valeronoi."""
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp")
-"""File formats of floor plans as pictures."""
+"""Floor plans as pictures."""
 
 
 class LinkState(IntEnum):

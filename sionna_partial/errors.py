@@ -1,17 +1,15 @@
-"""Exceptions raised for input that cannot give a trustworthy result."""
+"""Errors and warnings of the package."""
 
 
 def one_line(text: str) -> str:
-    """Return a text, which may be of a file, without what would move the cursor of a terminal or end the line."""
+    """Return a text on one line, without control characters of a terminal."""
     return "".join(
         each if each.isprintable() else " " if each == "\n" else each.encode("unicode_escape").decode() for each in text
     )
 
 
 class SionnaPartialError(Exception):
-    """Base of every error that this package raises on purpose.
-
-    The message names the field, the value that was given and the remedy.
+    """Base of every error that this package raises on purpose; messages name the field, its value and the remedy.
 
     Examples
     --------
@@ -32,7 +30,7 @@ class MapError(SionnaPartialError, ValueError):
 
 
 class PositionError(SionnaPartialError, ValueError):
-    """A transmitter or receiver where no radio can stand."""
+    """A transmitter or receiver at an impossible position."""
 
 
 class SettingsError(SionnaPartialError, ValueError):
@@ -40,11 +38,11 @@ class SettingsError(SionnaPartialError, ValueError):
 
 
 class ArgumentError(SettingsError, TypeError):
-    """A setting that was given as an argument of a function, which takes it within its settings."""
+    """A setting given as an argument of a function that takes it within its settings."""
 
 
 class MemoryLimitError(SionnaPartialError, MemoryError):
-    """A job that cannot be done within its limit of memory; it was not begun."""
+    """A job that would exceed its memory limit; it was not begun."""
 
 
 class SceneError(SionnaPartialError, ValueError):
@@ -60,7 +58,7 @@ class MeasurementError(SionnaPartialError, ValueError):
 
 
 class OutputError(SionnaPartialError, OSError):
-    """An output that could not be written; nothing half written is left behind."""
+    """An output that could not be written; no partial file is left."""
 
 
 class PredictorWarning(UserWarning):

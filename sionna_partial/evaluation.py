@@ -1,4 +1,4 @@
-"""Figures of merit of predictions, and the evaluation of a predictor against baselines, on training and other homes."""
+"""Figures of merit of predictions; evaluation of a predictor and baselines on training and test homes."""
 
 import itertools
 import json
@@ -28,19 +28,18 @@ CONFIDENCE_BINS = 15
 """Equal-width bins of the confidence in the calibration error."""
 
 PIT_BINS = 20
-"""Equal-width bins of the probability integral transform of the gain in `Calibration`."""
+"""Equal-width bins of the gain's probability integral transform in `Calibration`."""
 
 INTERVAL = (0.05, 0.95)
-"""Levels of the central 90 % interval of the gain."""
 
 _NO_SPREAD_DB = 1e-6
-"""A standard deviation below this is rounding [dB]."""
+"""Standard deviation below which a gain has no spread [dB]."""
 
 LEAST_PROBABILITY = 1e-4
-"""Least probability of the true link state in a likelihood: a map with errors excludes true states now and then."""
+"""Smallest probability of the true link state in a likelihood: a map with errors may exclude the true state."""
 
 LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
-"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain, but may be wrong."""
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain but may be wrong."""
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
@@ -56,35 +55,30 @@ DEFINITIONS = {
     "coverage_90": "fraction of links whose true gain lies in the central 90 % interval, by the randomised probability "
     "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
 }
-"""Definitions of the `Metrics`."""
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"
 
 _MAX_BYTES = 1_000_000
-"""Largest file of the majority that is read."""
 
 OFFICES = ("mixed", "open")
-"""Indoor scenarios of 3GPP TR 38.901."""
 
 _INDOOR_STD_DB = (0.0, 3.0, 8.03)
-"""Shadow fading by LinkState [dB]."""
 
 ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
-"""Number of ends of a link that are in observed cells."""
+"""Number of ends of a link in observed cells."""
 
 WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
-"""The predictor where receivers may be outside: as if all were indoors, and with `LinkPrediction.anywhere`."""
+"""Predictions for receivers anywhere: as if all were indoors, and by `LinkPrediction.anywhere`."""
 
 ALWAYS_OUTAGE = "always outage"
-"""The baseline where most receivers are outside."""
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """Figures of merit of one prediction of N links, see `DEFINITIONS`; nan where one has no finite value.
+    """Figures of merit of one prediction of N links (`DEFINITIONS`), nan if undefined.
 
-    That is so without links; for `rmse_linked_db` if all links are in outage; and for `coverage_90` of a prediction
-    without any spread.
+    Undefined are all without links, `rmse_linked_db` if all links are in outage, and `coverage_90` of a prediction
+    without spread.
     """
 
     links: int
@@ -97,7 +91,7 @@ class Metrics:
     coverage_90: float
 
     def as_json(self) -> dict[str, Any]:
-        """Return the figures by name, None for nan, which JSON does not have."""
+        """Return the figures by name, None for nan."""
         return {name: None if math.isnan(value) else value for name, value in asdict(self).items()}
 
 
@@ -120,8 +114,8 @@ class Reliability(Shown):
 class Calibration(Shown):
     """Calibration of link state and gain.
 
-    `gain_pit` (PIT_BINS,) has the fractions of the randomised probability integral transforms of the true gains in bins
-    of equal width; all are equal when calibrated.
+    `gain_pit` (PIT_BINS,) is the histogram of the randomised probability integral transform of the true gains, uniform
+    for a calibrated prediction.
     """
 
     state: Reliability
@@ -129,7 +123,7 @@ class Calibration(Shown):
 
 
 def measure(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Metrics:
-    """Compare a prediction of N links with their true link states and gains [dB]; outages count as -150 dB."""
+    """Compare a prediction with the true link states and gains [dB] of N links; an outage has -150 dB."""
     outage = link_state == LinkState.OUTAGE
     errors_db = gain_errors_db(prediction, link_state, gain_db)
     nll_state, nll = _negative_log_likelihoods(prediction, link_state, gain_db)
@@ -147,18 +141,18 @@ def measure(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> 
 
 
 def calibration(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Calibration:
-    """Measure the calibration of link state and gain."""
+    """Return the calibration of link state and gain."""
     fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
     return Calibration(reliability(prediction, link_state), np.diff(fractions))
 
 
 def gain_errors_db(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Floats:
-    """Return predictive mean minus true gain (N,) [dB], an outage counting -150 dB."""
+    """Return predictive mean minus true gain (N,) [dB]; an outage has -150 dB."""
     return prediction.gain_mean_db - np.where(link_state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
 
 def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
-    """Compare confidence and accuracy of the link state, bin by bin."""
+    """Compare confidence and accuracy of the link state by bins."""
     confidence = np.max([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
     bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
     links = np.bincount(bins, minlength=CONFIDENCE_BINS)
@@ -168,11 +162,10 @@ def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
 
 
 def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
-    """Return the fractions of links (K,) whose probability integral transform lies below some levels (K,) in [0, 1].
+    """Return the fractions of links (K,) whose probability integral transform is below some levels (K,) in [0, 1].
 
-    The transform of a gain is the predicted probability of a smaller one. Where a gain has a probability of its own, as
-    in an outage, the transform is spread evenly over it (randomised, and the expectation taken). A calibrated
-    prediction returns the levels themselves.
+    The transform is the predicted probability of a smaller gain, spread evenly over a probability mass such as an
+    outage (randomised, in expectation). A calibrated prediction returns the levels.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
@@ -183,7 +176,6 @@ def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Float
 
 
 def _negative_log_likelihoods(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> tuple[float, float]:
-    """Return the loss of the link state, and of link state and gain."""
     los, outage = link_state == LinkState.LOS, link_state == LinkState.OUTAGE
     p = np.select([los, outage], [prediction.p_los, prediction.p_outage], prediction.p_nlos)
     mean_db = np.where(los, prediction.gain_los_mean_db, prediction.gain_nlos_mean_db)
@@ -200,7 +192,7 @@ def _mean(values: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Majority:
-    """The same prediction for every link: fractions, means and standard deviations [dB] of the training links by state.
+    """Equal prediction for every link: fractions, means and standard deviations [dB] of the training links by state.
 
     A state without links has the gain of an outage.
     """
@@ -211,7 +203,7 @@ class Majority:
 
     @classmethod
     def fit(cls, link_state: States, gain_db: Floats) -> "Majority":
-        """Count true link states (N,), and average true gains (N,) [dB]."""
+        """Fit to true link states (N,) and gains (N,) [dB]."""
         groups = [gain_db[link_state == state] for state in LinkState]
         known = [group if len(group) else np.array([GAIN_FLOOR_DB]) for group in groups]
         return cls(
@@ -221,21 +213,21 @@ class Majority:
         )
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
-        """Return the same for N links, whatever their features."""
+        """Return the same distribution for N links."""
         rows = (self.fractions, self.means_db, self.stds_db)
         return LinkPrediction.of_parts(*(np.repeat(np.array(row)[:, None], len(phi), axis=1) for row in rows))
 
 
 @dataclass(frozen=True, eq=False)
 class Baselines(Shown):
-    """The baselines that are fitted to the training links of a predictor; `distance` uses the distance alone."""
+    """Baselines fitted to the training links of a predictor; `distance` uses the distance alone."""
 
     majority: Majority
     distance: Predictor
 
     @classmethod
     def fit(cls, links: LinkTable, settings: PredictorSettings) -> "Baselines":
-        """Fit to links whose receivers were drawn indoors."""
+        """Fit to links with receivers drawn indoors."""
         blind = nothing_seen(links.features, settings.frequency_hz)
         homes = list(dict.fromkeys(map(str, links.home)))
         distance = Predictor.fit(
@@ -256,7 +248,7 @@ class Baselines(Shown):
 
     @classmethod
     def load(cls, folder: Path) -> "Baselines":
-        """Read what `save` wrote."""
+        """Read the files of `save`."""
         path = folder / MAJORITY_FILE
         try:
             content = json.loads(read_bytes(path, "path", PredictorError, _MAX_BYTES))
@@ -271,9 +263,9 @@ class Baselines(Shown):
 
 
 def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
-    """Return the features of the same N links on an empty map, where the distance is all that is known.
+    """Return the features of N links on an empty map, where only the distance is known.
 
-    `frequency_hz` applies to links whose features have none.
+    `frequency_hz` applies to features without a frequency.
     """
     frequency_hz = phi.frequency_hz or frequency_hz
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
@@ -297,8 +289,8 @@ def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
 def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, Floats]:
     """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
 
-    The distance (N,) is three-dimensional [m]; the model is made for 1 to 150 m and 0.5 to 100 GHz, and is extended to
-    1 cm here. There is no shadow fading.
+    The distance (N,) is three-dimensional [m]; the model covers 1 to 150 m and 0.5 to 100 GHz, and is extended to 1 cm
+    here. There is no shadow fading.
     """
     decades, frequency = np.log10(np.maximum(distance_m, 0.01)), np.log10(frequency_hz / 1e9)
     los_db = 32.4 + 17.3 * decades + 20.0 * frequency
@@ -309,8 +301,7 @@ def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, F
 def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkPrediction:
     """Predict with the indoor model of 3GPP TR 38.901, which depends on distance alone, and has no outage.
 
-    The gain is Gaussian with the shadow fading of Table 7.4.1-1: 3 dB in LOS, 8.03 dB in NLOS. Transmitter and receiver
-    are taken to be at the same height, so that the horizontal distance is the distance.
+    The gain has the shadow fading of Table 7.4.1-1. Both ends are assumed at the same height.
     """
     p_los = indoor_los_probability(phi.distance_m, office)
     gains_db = indoor_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
@@ -324,7 +315,7 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
 def baseline_predictions(
     baselines: Baselines, paper: Predictor | None, phi: LinkFeatures, frequency_hz: float
 ) -> Mapping[str, LinkPrediction]:
-    """Predict N links with every baseline; the paper's predictor comes first."""
+    """Predict N links with every baseline, the paper's predictor first."""
     distance = baselines.distance
     return ({} if paper is None else {"paper": paper.predict(phi)}) | {
         "distance only": distance.predict(nothing_seen(phi, frequency_hz)),
@@ -336,18 +327,18 @@ def baseline_predictions(
 
 @dataclass(frozen=True)
 class Row:
-    """Figures of merit of one prediction on some links.
+    """Figures of merit of one prediction on a selection of links.
 
     Parameters
     ----------
     homes : {"test", "train"}
-        Homes of these links: the predictor was trained on "train" ones.
+        The predictor was trained on "train" homes.
     receivers : {"indoor", "anywhere"}
         Receivers drawn indoors, or from the whole map area.
     stage : float
-        Steps that the robot has explored; below 1, the fraction that it was to observe.
+        Exploration steps; below 1, the wanted observed fraction.
     ends_seen : {"all", "both", "one", "none"}
-        Selection of links: all, or by the number of ends in observed cells.
+        All links, or by the number of ends in observed cells.
     model : str
         "predictor" or a baseline.
     metrics : Metrics
@@ -363,9 +354,9 @@ class Row:
 
 @dataclass(frozen=True)
 class Difference:
-    """A predictor minus a baseline on the same links: paired difference over test homes, mean and standard error.
+    """Predictor minus baseline on the same links: mean and standard error of the paired differences over test homes.
 
-    The standard error over homes is nan for one home.
+    The error is nan for one home.
     """
 
     receivers: str
@@ -385,13 +376,13 @@ class Evaluation(Shown):
     Parameters
     ----------
     predictor, fingerprint : str
-        Name of the predictor, and SHA-256 of its file.
+        Name and SHA-256 of the predictor.
     homes : mapping of str to tuple of str
         Names of the "test" and "train" homes.
     rows : tuple of Row
     differences : tuple of Difference
     calibrations : mapping of float to Calibration
-        Calibration of the predictor on test homes, receivers indoors, by stage of exploration.
+        Calibration on test homes, receivers indoors, by stage.
     notes : tuple of str
         Remarks for the reader.
     """
@@ -405,7 +396,7 @@ class Evaluation(Shown):
     notes: tuple[str, ...]
 
     def select(self, **wanted: object) -> list[Row]:
-        """Return the rows whose fields have the wanted values, such as ``select(homes="test", stage=200)``."""
+        """Return the rows with given field values, such as ``select(homes="test", stage=200)``."""
         return [row for row in self.rows if all(getattr(row, name) == value for name, value in wanted.items())]
 
 
@@ -416,32 +407,31 @@ def evaluate(
     baselines: Baselines | None = None,
     progress: Progress | bool | None = None,
 ) -> Evaluation:
-    """Measure a predictor and its baselines on the links of a data set, stage by stage.
+    """Evaluate a predictor and baselines on the links of a data set, stage by stage.
 
-    Homes that the predictor's card names are training homes, all others test homes. Where receivers are drawn from the
-    whole map area, the predictor is measured with and without its indoor model; a receiver in an observed cell is
-    indoors for certain.
+    Homes in the predictor's card are training homes, all others test homes. For receivers drawn anywhere, the predictor
+    is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
 
     Parameters
     ----------
     predictor : None, "map", "paper", path or Predictor
     dataset : LinkTable, path, or sequence of paths
-        Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
+        Links, or folders of `sionna-partial dataset`; a home may be in several.
     baselines : Baselines, optional
-        Those fitted to other links; by default those in the folder of the predictor, else the shipped ones.
+        By default the baselines in the folder of the predictor, else the shipped ones.
     progress : bool or callable, optional
         As in `predict_map`.
 
     Returns
     -------
     Evaluation
-        `rows` of figures of merit (`select` filters them), paired `differences`, `calibrations` and `notes`.
+        Figures of merit (`select` filters them), paired differences, calibrations and notes.
 
     Raises
     ------
     PredictorError
-        If the data set or a predictor cannot be read; if the data set has no links, or was traced at another frequency
-        than the predictor's, or otherwise with diffraction; or if the predictor was trained on all of its homes.
+        If the data set or a predictor cannot be read; if the data set has no links, or was traced with other settings
+        than the predictor's; or if the predictor was trained on all homes.
 
     Examples
     --------
@@ -493,7 +483,7 @@ def evaluate(
 
 
 def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[Floats, Floats]:
-    """Return accuracy and root mean square gain error [dB] of each home (H,), in the order of their names."""
+    """Return accuracy and root mean square gain error [dB] of each home (H,), sorted by name."""
     _, home, count = np.unique(links.home, return_inverse=True, return_counts=True)
     right = np.bincount(home, prediction.link_state == links.link_state)
     squares = np.bincount(home, gain_errors_db(prediction, links.link_state, links.gain_db) ** 2)
@@ -501,20 +491,20 @@ def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[Floats, F
 
 
 def mean_and_error(values: Floats) -> tuple[float, float]:
-    """Return the mean of values of homes (H,), and its standard error; nan for one home."""
+    """Return the mean over homes (H,) and its standard error, nan for one home."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
     return float(values.mean()), float(error)
 
 
 def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> dict[str, LinkPrediction]:
-    """Predictions where receivers may be outside, from those for receivers indoors."""
+    """Return the predictions for receivers anywhere, from the predictions for receivers indoors."""
     p_indoor = np.where(links.context.rx_seen, 1.0, model.predict_indoor(links.features))
     outage = indoors.anywhere(np.zeros(len(links)))
     return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 
 
 def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, ...]) -> Iterator[str]:
-    """Homes that the baselines were trained on."""
+    """Yield remarks on the homes that the baselines were trained on."""
     fitted = others["distance only"]
     those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
     yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
@@ -525,7 +515,6 @@ def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, .
 
 
 def _homes(model: Predictor, links: LinkTable) -> dict[str, tuple[str, ...]]:
-    """Names of test and of training homes in the order of the data set."""
     names = list(dict.fromkeys(map(str, links.home)))
     trained = set(model.homes)
     test, train = (tuple(name for name in names if (name in trained) == seen) for seen in (False, True))
@@ -543,7 +532,7 @@ def _baselines_folder(model: Predictor) -> Path:
 
 
 def _shipped(model: Predictor) -> dict[str, Predictor]:
-    """Load the shipped predictors, without those that are the same, or differ in frequency or diffraction."""
+    """Load the shipped predictors that are comparable to, and other than, `model`."""
     here, every = LinkTraces.of_settings(model.settings), {name: warm_predictor(name) for name in ("paper", "map")}
     return {
         name: each
@@ -566,7 +555,6 @@ def _rows(
 def _differences(
     receivers: str, stage: float, links: LinkTable, predictions: Mapping[str, LinkPrediction]
 ) -> Iterator[Difference]:
-    """Compare the first prediction with each of the others."""
     scores = {model: home_scores(prediction, links) for model, prediction in predictions.items()}
     first, *others = scores
     for baseline in others:

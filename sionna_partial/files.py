@@ -1,4 +1,4 @@
-"""Files: input of bounded size; output that is written whole or not at all, and by one run at a time."""
+"""Input of bounded size; output that is written completely or not at all, by one process at a time."""
 
 import csv
 import errno
@@ -22,19 +22,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 SCENE_FILES = ("scene.xml", "map.yaml")
-"""Files by which an exported scene folder is recognised."""
 
 CALIBRATED_FILE = "calibrated.npz"
-"""File with the map in a folder of `sionna-partial calibrate`."""
 
 MAX_CSV_BYTES = 100_000_000
-"""Largest CSV that is read."""
 
 LOCK_FILE = ".lock"
-"""File in a locked folder."""
 
 HIDDEN, TEMPORARY = ".tmp-sionna_partial_", "sionna_partial_"
-"""Beginnings of the names of hidden folders beside outputs, and of those in the folder of temporary files."""
+"""Prefixes of hidden folders beside outputs, and of folders for temporary files."""
 
 _REMEDIES = {
     errno.EACCES: "choose a folder that you may write to, or change its permissions.",
@@ -57,7 +53,7 @@ def open_regular(
     most: int,
     remedy: str = "give a smaller file.",
 ) -> IO[bytes]:
-    """Open a regular file of at most `most` bytes; pipes and devices, which need not end, raise an `error`."""
+    """Open a regular file of at most `most` bytes. Pipes and devices, which may block, raise an `error`."""
     source = input_path(path, field, error, "give the name of a file.")
     try:
         stream = open(source, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
@@ -82,7 +78,6 @@ def read_bytes(
     most: int,
     remedy: str = "give a smaller file.",
 ) -> bytes:
-    """Return the content of a regular file of at most `most` bytes, or raise an `error` that names `field`."""
     with open_regular(path, field, error, most, remedy) as stream:
         try:
             return stream.read(os.fstat(stream.fileno()).st_size + 1)
@@ -91,9 +86,9 @@ def read_bytes(
 
 
 def require_plain_hdf5(file: Any, most: int) -> None:
-    """Raise a ValueError for an HDF5 file with data elsewhere, or with more than `most` bytes of arrays.
+    """Raise a ValueError if HDF5 content links to other files or has more than `most` bytes of arrays.
 
-    `file` is a path, or an open stream. Links to other files, external storage and virtual data sets are such data.
+    `file` is a path or an open stream. External storage and virtual data sets count as links.
     """
     import h5py
 
@@ -117,9 +112,9 @@ def require_plain_hdf5(file: Any, most: int) -> None:
 
 
 def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], stream: Any) -> None:
-    """Write a Dataset as NetCDF 4 to an unbuffered stream, which is read, too: equal Datasets give equal bytes.
+    """Write a Dataset as NetCDF 4 to an unbuffered, readable stream; equal Datasets give equal bytes.
 
-    `Dataset.to_netcdf` would let HDF5 stamp the root group with the time of day, and keep the order of variables.
+    `Dataset.to_netcdf` lets HDF5 write time stamps, and keeps the order of variables.
     """
     import h5netcdf
     import h5py
@@ -150,9 +145,9 @@ def write_netcdf(table: "xr.Dataset", encoding: Mapping[Any, Any], stream: Any) 
 
 
 class _Sink(io.RawIOBase):
-    """A raw stream for HDF5, which crashes where a disk fails: the error waits for `require_written`.
+    """Raw stream for HDF5, which crashes if a write fails. `require_written` raises the error later.
 
-    Data that are written after it are kept in memory.
+    Data after a failed write are kept in memory.
     """
 
     def __init__(self, stream: Any) -> None:
@@ -161,7 +156,6 @@ class _Sink(io.RawIOBase):
         self._kept: list[tuple[int, bytes]] = []
 
     def require_written(self) -> None:
-        """Raise what went wrong."""
         if self._error:
             raise OSError(*self._error)
 
@@ -201,7 +195,7 @@ class _Sink(io.RawIOBase):
 
 
 def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
-    """Compute dask's arrays, of as many blocks each, block by block; `dask.array.store` has another order each time."""
+    """Compute dask arrays with equal numbers of blocks, block by block: `dask.array.store` varies the order."""
     if not sources:
         return
     import dask
@@ -217,9 +211,9 @@ def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
 def read_columns(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Mapping[str, str], remedy: str
 ) -> tuple[dict[str, list[float]], list[str]]:
-    """Return columns of a CSV by name, and the other headers, or raise an `error`.
+    """Return the columns of a CSV by name, and the other headers, or raise an `error`.
 
-    `names` has a name for each known header, in lower case.
+    `names` maps known headers, in lower case, to names of columns.
     """
     given = f"{field} = '{path}'"
     try:
@@ -272,7 +266,7 @@ def _columns(
 def decoding(
     path: Path, fault: str, error: type[SionnaPartialError], remedy: str = "export it again."
 ) -> Iterator[None]:
-    """Turn whatever decoders raise on damaged files, which is of many types, into an `error`; our own errors pass."""
+    """Convert the many exceptions that decoders raise on damaged files to an `error`; our own errors pass."""
     try:
         with optional_packages(error):
             yield
@@ -284,7 +278,7 @@ def decoding(
 
 
 def is_path(path: object) -> bool:
-    """Return whether a file can have this path: names have no NUL and no surrogates that stand for no byte."""
+    """Return whether a file can have this path: no NUL, no unpaired surrogates."""
     try:
         return isinstance(path, (str, os.PathLike)) and b"\0" not in os.fsencode(path)
     except UnicodeEncodeError:
@@ -292,7 +286,6 @@ def is_path(path: object) -> bool:
 
 
 def input_path(path: object, field: str, error: type[SionnaPartialError], remedy: str) -> Path:
-    """Return a path to read from, or raise an `error` if it is none."""
     if not is_path(path):
         given = os.fspath(path) if isinstance(path, os.PathLike) else path
         raise error(f"{field} = {shown(given)} is not a path: {remedy}")
@@ -300,20 +293,19 @@ def input_path(path: object, field: str, error: type[SionnaPartialError], remedy
 
 
 def output_path(path: object) -> Path:
-    """Return a path to write to, or raise an OutputError if it is none."""
     if not is_path(path):
         raise OutputError(f"path = {path!r} is not a path: give the name of a file or folder.")
     return Path(path)  # type: ignore[arg-type]
 
 
 def lies_in(folder: Path, name: str) -> bool:
-    """Return whether a relative path of another file leads, links followed, to a place in a folder."""
+    """Return whether a relative path, with links resolved, leads into a folder."""
     inside = bool(name) and is_path(name) and not Path(name).is_absolute() and ".." not in Path(name).parts
     return inside and Path(os.path.realpath(folder / name)).is_relative_to(os.path.realpath(folder))
 
 
 def require_plain_folder(folder: Path) -> None:
-    """Raise a ValueError for a folder with links, pipes or devices: readers of whole folders would follow or wait."""
+    """Raise a ValueError for a folder with links, pipes or devices, which folder readers would follow."""
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
             mode = os.lstat(os.path.join(parent, name)).st_mode
@@ -322,7 +314,7 @@ def require_plain_folder(folder: Path) -> None:
 
 
 def unzipped(content: bytes, most: int) -> dict[str, bytes]:
-    """Return the files of a zip archive by name; a ValueError if it is damaged or unpacks to more than `most` bytes."""
+    """Return the files of a zip archive by name, or raise a ValueError if it is damaged or unpacks to more."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
@@ -336,7 +328,7 @@ def unzipped(content: bytes, most: int) -> dict[str, bytes]:
 
 
 def zipped(contents: Mapping[str, bytes]) -> bytes:
-    """Return files by name as a zip archive; equal files give equal bytes."""
+    """Return files as a zip archive; equal files give equal bytes."""
     stream = io.BytesIO()
     with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in contents.items():
@@ -346,11 +338,10 @@ def zipped(contents: Mapping[str, bytes]) -> bytes:
 
 @contextmanager
 def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Give a library a path to write to, and move the file to `path` when all went well.
+    """Provide a temporary path for a library to write to, and move the file to `path` on success.
 
-    The temporary path has the name of `path`, in a hidden folder beside it: side files of the library vanish with
-    that folder. Missing parent folders are made. A link stays, and its file is replaced. On failure `path` is as it
-    was before.
+    The temporary file has the name of `path`, in a hidden folder beside it, so that side files of the library vanish.
+    Missing parent folders are made. The target of a link is replaced.
     """
     name = output_path(path).name
     target = Path(os.path.realpath(path))
@@ -363,7 +354,7 @@ def atomic_path(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[Any]]:
-    """Open a file that appears at `path` only when it has been written completely; text ("w") is UTF-8."""
+    """Open a file that appears at `path` when it is complete; text ("w") is UTF-8."""
     encoding, newline = (None, None) if "b" in mode else ("utf-8", "")
     with atomic_path(path) as temporary, temporary.open(mode, encoding=encoding, newline=newline) as stream:
         yield stream
@@ -371,10 +362,10 @@ def atomic_write(path: str | os.PathLike[str], mode: str = "wb") -> Iterator[IO[
 
 @contextmanager
 def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Open a scene folder that appears at `path` only when it has been written completely.
+    """Open a scene folder that appears at `path` when it is complete.
 
-    In an exported scene folder (it holds `SCENE_FILES`), entries of the new scene replace old ones of the same name,
-    all or none, and other files are kept. A folder with other content is refused.
+    In an exported scene folder (with `SCENE_FILES`), new entries replace old ones of the same name, all or none, and
+    other files are kept. A folder with other content is refused.
     """
     target = output_path(path)
     with _hidden_folder(target, target if os.path.isdir(target) else target.parent) as hidden:
@@ -400,9 +391,9 @@ def atomic_folder(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
-    """Open a folder whose files appear in the folder `path` together, when all have been written completely.
+    """Open a folder whose files appear together in the folder `path` when they are complete.
 
-    Files of the same names are replaced, all or none, others are kept. Links stay, and their files are replaced.
+    Files of the same names are replaced, all or none; targets of links are replaced.
     """
     target = output_path(path)
     with _hidden_folder(target, target) as hidden:
@@ -419,7 +410,7 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Open a folder for files that libraries exchange, and remove it in the end."""
+    """Open a folder for temporary files, and remove it at the end."""
 
     def failed(cause: OSError) -> OutputError:
         return OutputError(
@@ -436,7 +427,6 @@ def temporary_folder() -> Iterator[Path]:
 
 
 def require_writable(folder: str | os.PathLike[str]) -> None:
-    """Raise an OutputError, before long work, if no files can be made in a folder, which need not be there."""
     target = output_path(folder)
     with _hidden_folder(target, target):
         pass
@@ -444,7 +434,7 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Make a folder and keep other runs from writing to it; a lock ends with its process, however that ends."""
+    """Make a folder and keep other processes from writing to it; the lock ends with the process."""
     from filelock import FileLock, Timeout
 
     target = output_path(folder)
@@ -464,13 +454,11 @@ def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def _hidden_folder(target: Path, parent: Path) -> AbstractContextManager[Path]:
-    """Make a hidden folder in `parent`, and remove it in the end; errors of the system name `target`."""
     return _own_folder(parent, HIDDEN, lambda cause: _output_error(target, cause))
 
 
 @contextmanager
 def _own_folder(parent: Path, prefix: str, failed: Callable[[OSError], OutputError]) -> Iterator[Path]:
-    """Open an `own_folder`; errors of the system, also while it is written to, become those that `failed` returns."""
     folder: Path | None = None
     try:
         with own_folder(parent, prefix) as folder:
@@ -488,7 +476,6 @@ def _output_error(target: Path, error: OSError) -> OutputError:
 
 
 def _require_file(path: Path) -> None:
-    """Raise an OutputError for a folder, pipe or device that would be replaced by a file."""
     if path.is_dir():
         raise _output_error(path, IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR)))
     if path.exists() and not path.is_file():
@@ -496,7 +483,7 @@ def _require_file(path: Path) -> None:
 
 
 def _swap_entries(new: Path, target: Path, aside: Path) -> None:
-    """Move every entry of `new` into `target`, those that were there to `aside`; undo everything on failure."""
+    """Move every entry of `new` into `target`, and replaced ones to `aside`; undo everything on failure."""
     aside.mkdir()
     with signals_held(), ExitStack() as undo:
         for name in sorted(entry.name for entry in new.iterdir()):

@@ -37,7 +37,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
 
 KEPT_BLOCKS = 8
-"""Number of blocks of links, and of windows of transmitters, in the cache of a link model; 20 MB in all."""
+"""Number of blocks of links, and of windows of transmitters, in the cache; 20 MB in all."""
 
 _LEAST_DEPTH = 2
 """Smallest `max_depth` for which the networks were trained."""
@@ -46,10 +46,10 @@ _log = logging.getLogger(__name__)
 
 
 class PredictedLinks(NamedTuple):
-    """Features and prediction of links to N receivers that are indoors, P(indoor), and whether each is complete (N,).
+    """Features and prediction of N indoor receivers, P(indoor), and whether each link meets nothing unknown (N,).
 
-    A complete link meets nothing unknown: its trace is its prediction. `prediction` lacks the gain `antenna_db` (N,) of
-    the transmitter's antenna, because measurements are compared without it.
+    `prediction` excludes the gain `antenna_db` (N,) of the transmitter's antenna, as measurements are compared without
+    it.
     """
 
     phi: LinkFeatures
@@ -66,16 +66,16 @@ class PredictedLinks(NamedTuple):
 
 
 class LinkModel:
-    """Predicts any links on one map. Later calls reuse the loaded scene, the compiled kernels and recent links.
+    """Predictions of any links on one map. Later calls reuse the loaded scene, the compiled kernels and recent links.
 
     Every function that predicts on a map also accepts a link model: ``sp.place_transmitter(model)``.
 
     Parameters
     ----------
     scene : PartialMap, path or Simulation
-        The map, or whatever `load_map` reads.
+        The map, or any input of `load_map`.
     predictor : None, "map", "paper", path, Predictor or any object with ``predict(phi)``
-        None is the shipped default, which is read where links are not complete.
+        None is the shipped default, which is read for links that are not complete.
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
 
@@ -129,7 +129,6 @@ class LinkModel:
 
     @cached_property
     def _networks(self) -> Predictor | OtherPredictor:
-        """The networks, which are read when they are first needed."""
         networks = warm_predictor(self.asked)
         if isinstance(networks, Predictor) and not self.by_mean_losses:
             warn_of_other_traces(networks, *self.simulation.resolved)
@@ -137,7 +136,7 @@ class LinkModel:
 
     @property
     def by_mean_losses(self) -> bool:
-        """Return whether mean losses predict: the shipped networks were trained on opaque walls."""
+        """True if mean losses predict: the shipped networks were trained on opaque walls."""
         return self.asked is None and self.simulation.trace_settings.through_walls
 
     @cached_property
@@ -153,9 +152,7 @@ class LinkModel:
         return None if self.partial.is_complete else self.predictor
 
     def update(self, partial: PartialMap) -> None:
-        """Replace the map, for instance by one on which the robot has seen more; settings stay as they were given.
-
-        The networks and compiled kernels are kept. The predictions equal the predictions of a new `LinkModel`.
+        """Replace the map, for instance after the robot has seen more; settings, networks and kernels are kept.
 
         Raises
         ------
@@ -205,14 +202,14 @@ class LinkModel:
 
     def _checked(self, tx: ArrayLike, rx: ArrayLike) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.simulation.trace_settings.frequency_hz)
-        return self.predict_each([(each_m, rx_m) for each_m in tx_m])
+        return self.predict_each([(position_m, rx_m) for position_m in tx_m])
 
     def predict_each(
         self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        """Return features and predictions of links, and which of them are complete.
+        """Return features and predictions of links, and whether each is complete.
 
-        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m], which have been checked.
+        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m], checked positions.
         """
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
@@ -220,12 +217,12 @@ class LinkModel:
         return self._predict_paths(ends_m, paths)
 
     def _predict_paths(
-        self, ends_m: Sequence[tuple[Floats, Floats]], paths_of_each: Sequence[Iterable[SolvedPaths]]
+        self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        complete = np.concatenate([self._complete(*each_m) for each_m in ends_m])
+        complete = np.concatenate([self._complete(*link_m) for link_m in ends_m])
         settings, found = None if complete.all() else self.predictor.settings, []
         context = not complete.all() and (settings is None or settings.networks != "paper")
-        for (tx_m, rx_m), paths in zip(ends_m, paths_of_each, strict=True):
+        for (tx_m, rx_m), paths in zip(ends_m, found_paths, strict=True):
             windows = self._windows_around(tx_m) if context else None
             ends, unknown = (tx_m, rx_m), self.simulation.material_unknown
             found.append(
@@ -237,7 +234,6 @@ class LinkModel:
         return phi, self.predict_features(phi, complete), complete
 
     def _windows_around(self, tx_m: Floats) -> NDArray[np.uint8]:
-        """Draw the map around a transmitter (3,) [m]; the latest windows are kept."""
         key = tx_m.tobytes()
         if key not in self._windows:
             self._windows[key] = map_windows(self.partial, tx_m[None, :2])
@@ -245,10 +241,10 @@ class LinkModel:
         return self._windows[key]
 
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
-        """Predict links from their features; the trace is the prediction of those that are complete.
+        """Predict links from their features; complete links keep their trace.
 
-        Through walls it has the residuals of traces as well. Where the material of walls is unknown, it is the mixture
-        over its candidates. Networks predict with the traced material.
+        Through walls, traces have residuals, too. For an unknown material of walls, the result is the mixture over its
+        candidates. Networks predict with the traced material.
         """
         features, prior = [phi], np.ones(1)
         if phi.path_power is not None:
@@ -286,7 +282,7 @@ class LinkModel:
         *,
         at_rx: bool = False,
     ) -> PredictedLinks:
-        """Trace and predict the links from (3,) to (N, 3) [m], which have been checked; the latest blocks are kept.
+        """Trace and predict the links from (3,) to (N, 3) [m], checked positions; the latest blocks are kept.
 
         With `at_rx` the antenna is at the receivers.
         """
@@ -314,7 +310,7 @@ class LinkModel:
         return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor), complete, antenna_db)
 
     def coverage(self, tx: ArrayLike | Mapping[str, ArrayLike] | None = None, **options: Any) -> xr.Dataset:
-        """Predict links everywhere on the map: `predict_map` of this model, with the same options."""
+        """Predict links everywhere on the map, with the options of `predict_map`."""
         found: xr.Dataset = later("coverage.job:predict_map")(self, tx, **options)
         return found
 
@@ -332,11 +328,11 @@ def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settin
     """Warn if a predictor is used on traces of another kind than it was trained on."""
     trained = model.settings
     if trained.through_walls != settings.through_walls:
-        then, now = (f"{'through' if each.through_walls else 'on opaque'} walls" for each in (trained, settings))
+        then, now = (f"{'through' if kind.through_walls else 'on opaque'} walls" for kind in (trained, settings))
     elif not math.isclose(trained.frequency_hz, settings.frequency_hz, rel_tol=0.05):
-        then, now = (f"at {each.frequency_hz / 1e9:g} GHz" for each in (trained, settings))
+        then, now = (f"at {kind.frequency_hz / 1e9:g} GHz" for kind in (trained, settings))
     elif trained.diffraction != settings.diffraction:
-        then, now = (f"with{'' if each.diffraction else 'out'} diffraction" for each in (trained, settings))
+        then, now = (f"with{'' if kind.diffraction else 'out'} diffraction" for kind in (trained, settings))
     elif settings.max_depth < _LEAST_DEPTH:
         then, now = (f"with max_depth = {depth}" for depth in (TraceSettings.max_depth, settings.max_depth))
     elif scene_settings.traced_material.itu == "metal":
@@ -353,7 +349,7 @@ def link_model_of(
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> LinkModel:
-    """Return a given link model, or make one of a map. A given link model already has predictor and settings."""
+    """Return a given link model, which keeps its predictor and settings, or make one of a map."""
     if not isinstance(scene, LinkModel):
         return LinkModel(scene, predictor, trace_settings, scene_settings)
     given = {"predictor": predictor, "trace_settings": trace_settings, "scene_settings": scene_settings}

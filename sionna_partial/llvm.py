@@ -1,9 +1,8 @@
 """Loads the LLVM library of Dr.Jit before Dr.Jit and TensorFlow meet.
 
-Dr.Jit compiles its kernels with an LLVM that it finds when it is imported, and accepts versions 15 and 16, which abort
-the process in path solving. TensorFlow exports LLVM symbols that would replace its symbols. So pip's library
-is loaded when `sionna_partial` is imported, with its own symbols first, and `DRJIT_LIBLLVM_PATH` names it for Dr.Jit,
-stock Sionna RT too, and for child processes.
+Dr.Jit accepts LLVM 15 and 16, which abort the process in path solving, and TensorFlow exports LLVM symbols that would
+replace its symbols. So pip's library is loaded when `sionna_partial` is imported, with its own symbols first, and
+`DRJIT_LIBLLVM_PATH` names it for Dr.Jit, stock Sionna RT and child processes.
 """
 
 import ctypes
@@ -20,7 +19,7 @@ from typing import Final
 from sionna_partial.errors import BackendError
 
 PATH_VARIABLE: Final = "DRJIT_LIBLLVM_PATH"
-"""Environment variable from which Dr.Jit takes the path of its LLVM library."""
+"""Environment variable with the path of Dr.Jit's LLVM library."""
 
 PIP_PACKAGE = "karellen-llvm-core"
 """PyPI package with a complete LLVM library."""
@@ -45,8 +44,8 @@ class LlvmLibrary:
 def choose_llvm() -> None:
     """Load the library that Dr.Jit will find, when the package is imported.
 
-    Raises a BackendError where Dr.Jit runs on another one already, and cannot compile with it. A library that cannot be
-    loaded is an error of `load_llvm` only: what needs no Dr.Jit works without.
+    Raises a BackendError where Dr.Jit already runs on one that cannot compile. A library that cannot be loaded is an
+    error of `load_llvm` only: functions without Dr.Jit work.
     """
     try:
         _loaded_library()
@@ -56,11 +55,11 @@ def choose_llvm() -> None:
 
 
 def load_llvm() -> LlvmLibrary:
-    """Return the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's, which Dr.Jit is to be started with.
+    """Return the LLVM library that `DRJIT_LIBLLVM_PATH` names, or pip's, for Dr.Jit.
 
-    Call it before importing mitsuba, drjit or sionna. Raises a BackendError with the remedy if there is no
-    library, or none that works; if the process is a fork of one that called it; or if its working directory was
-    deleted, on which native libraries abort.
+    Call it before importing mitsuba, drjit or sionna. Raises a BackendError with the remedy if no library is found or
+    works, if the process is a fork of one that called it, or if its working directory was deleted, on which native
+    libraries abort.
     """
     library, process = _loaded_library(), _first_process()
     if process != os.getpid():
@@ -97,9 +96,9 @@ def _loaded_library() -> LlvmLibrary:
 
 
 def _started_library() -> Path | None:
-    """Return the library that Dr.Jit runs on already; raise a BackendError if it cannot compile path kernels with it.
+    """Return the library that Dr.Jit runs on already; raise a BackendError if it cannot compile path kernels.
 
-    A path that the user has set is left to the checks of the path where Dr.Jit could not load it.
+    A path that the user has set, and that Dr.Jit could not load, is left to the checks of paths.
     """
     order, major = list(sys.modules), sys.modules["drjit"].detail.llvm_version()[0]
     found = f"LLVM {major}" if major > 0 else "no LLVM"
@@ -118,7 +117,7 @@ def _started_library() -> Path | None:
 
 
 def _end_without_destructors() -> None:
-    """Let this process skip the destructors of native libraries in the end: this LLVM's free memory of TensorFlow's."""
+    """Skip the destructors of native libraries at exit: this LLVM's free memory of TensorFlow's."""
     libc = ctypes.CDLL(None)
     libc.on_exit(libc._exit, None)
 
@@ -126,7 +125,7 @@ def _end_without_destructors() -> None:
 def _named_library(name: str) -> Path:
     """Return a path that child processes in other folders can use; the dynamic loader finds a bare name.
 
-    It would wait for the content of a pipe.
+    Pipes are refused: loading one would block.
     """
     if "/" not in name:
         return Path(name)
@@ -137,7 +136,6 @@ def _named_library(name: str) -> Path:
 
 
 def _pip_library() -> Path:
-    """Return the real file of the library that pip installed."""
     with suppress(metadata.PackageNotFoundError):
         for file in metadata.distribution(PIP_PACKAGE).files or []:
             if re.fullmatch(r"libLLVM(-\d[\d.]*)?\.so[\d.]*", file.name) and Path(str(file.locate())).exists():

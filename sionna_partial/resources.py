@@ -1,4 +1,4 @@
-"""Files that ship with the package, and libraries that only some of its functions need."""
+"""Files that ship with the package, and optional libraries."""
 
 import json
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ EXTRAS = {
     "live": ("cyclonedds", "rosbags", "websockets"),
     "maps": ("ezdxf", "laspy", "lazrs", "pypcd4", "rosbags"),
 }
-"""Optional packages by the extra of pyproject.toml that installs them; `all` installs every one."""
+"""Optional packages by extra of pyproject.toml; `all` installs every one."""
 
 HOMES_FILE = "homes.json"
 """File in the scenes folder with the origin of each home and its transmitter position."""
@@ -25,7 +25,6 @@ HOMES_FILE = "homes.json"
 _PACKAGE = Path(__file__).resolve().parent
 
 PREDICTORS_FOLDER = _PACKAGE / "predictors"
-"""Trained predictors that come with the package."""
 
 
 @contextmanager
@@ -51,7 +50,7 @@ def scenes_folder() -> Path:
 
 
 def demo_homes() -> dict[str, dict[str, Any]]:
-    """Describe the demo homes, each a folder in `scenes_folder`, by name.
+    """Return the demo homes by name, each a folder in `scenes_folder`.
 
     "transmitter" is the position (x, y, z) [m], the rest is how the home was made.
     """

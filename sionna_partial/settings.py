@@ -1,4 +1,4 @@
-"""One frozen dataclass of settings for each stage, checked when it is built."""
+"""Frozen dataclasses of settings, checked when built."""
 
 import functools
 import inspect
@@ -38,17 +38,16 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
     "medium_dry_ground": ((1.0, 10.0),),
     "wet_ground": ((1.0, 10.0),),
 }
-"""ITU-R P.2040-3 materials and the frequency bands of their models [GHz], as Sionna RT has them."""
+"""Frequency bands of the ITU-R P.2040-3 materials in Sionna RT [GHz]."""
 
 
 FREQUENCIES_HZ = (1e6, 1e12)
-"""Lowest and highest carrier frequency [Hz]."""
 
 POWER_TOLERANCE_DB = 0.1
-"""Default of `TraceSettings.power_tolerance_db` where only powers count [dB]."""
+"""Default of `TraceSettings.power_tolerance_db` for powers [dB]."""
 
 OPAQUE_FROM_HZ = 24e9
-"""Frequency from which on walls are opaque unless set otherwise [Hz]."""
+"""Frequency from which walls are opaque by default [Hz]."""
 
 HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
 """Kinds of procedural homes; the last three are large."""
@@ -59,13 +58,13 @@ NetworkKind = Literal["paper", "paths", "map"]
 """Inputs of a predictor: the paper's features; also the walls along each path; also the map around the transmitter."""
 
 Objective = Literal["coverage", "percentile"]
-"""Objective of a placement: the mean predicted coverage, or the gain of the worst tenth of the receivers."""
+"""Objective of a placement: mean predicted coverage, or gain of the worst tenth of the receivers."""
 
 Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
-"""Mappers whose rule makes a robot's map of noisy readings."""
+"""Mappers whose rule makes a map of noisy readings."""
 
 Policy = Literal["random", "coverage"]
-"""Policy by which an exploring robot chooses frontiers."""
+"""Rule by which an exploring robot chooses frontiers."""
 
 Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
 Fraction = Annotated[float, Within(0.0, 1.0)]
@@ -81,9 +80,9 @@ _Result = TypeVar("_Result")
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
-    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. `Material.named` has materials of walls with
-    their usual thickness. The default constants are the paper's layered drywall at 28 GHz, at every frequency; the
-    conductivity of ``Material.named("drywall")`` decreases below 28 GHz, so that a wall loses 10 dB less at 5 GHz.
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default is the paper's layered drywall at
+    28 GHz, at every frequency; the conductivity of ``Material.named("drywall")`` decreases below 28 GHz, so that a wall
+    loses 10 dB less at 5 GHz.
 
     Parameters
     ----------
@@ -92,12 +91,11 @@ class Material(Checked):
     conductivity_s_m : float
         Conductivity at 28 GHz [S/m], at least 0. Ignored for an ITU material.
     thickness_m : float
-        Slab thickness in the reflection and transmission coefficients [m].
+        Slab thickness [m].
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
     conductivity_exponent : float
-        Exponent b of a conductivity that grows with the frequency f, as (f / 28 GHz)^b; 0 is a constant one. Ignored
-        for an ITU material.
+        Exponent b of the conductivity's factor (f / 28 GHz)^b at a frequency f. Ignored for an ITU material.
 
     Raises
     ------
@@ -131,11 +129,10 @@ class Material(Checked):
 
     @classmethod
     def named(cls, name: str) -> "Material":
-        """Return a material of walls with its usual thickness, by its name.
+        """Return a wall material with its usual thickness.
 
-        The names are the keys of `WALL_MATERIALS`, such as "drywall", the default, and the materials of ITU-R P.2040-3,
-        with a thickness of 10 cm where `WALL_MATERIALS` has no other. Sources of the constants, and measured losses of
-        such walls: `docs/walls.md`.
+        Names are the keys of `WALL_MATERIALS`, and other materials of ITU-R P.2040-3 with a thickness of 10 cm. Sources
+        and measured losses: `docs/walls.md`.
 
         Examples
         --------
@@ -169,47 +166,46 @@ WALL_MATERIALS = {
     "door": Material(itu="chipboard", thickness_m=0.04),
     "metal": Material(itu="metal", thickness_m=0.005),
 }
-"""Materials that walls have, with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less
-below; coated glass is glass with the conductivity of its metal film."""
+"""Wall materials with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less below; coated
+glass has the conductivity of its metal film.
+"""
 
 
 def material_name(material: Material) -> str:
-    """Return the name of a material of walls."""
+    """Return the name of a wall material."""
     names = {known: name for name, known in WALL_MATERIALS.items()}
     return names.get(material) or material.itu or "a custom material"
 
 
 DRYWALL = WALL_MATERIALS["drywall"]
-"""Material of a trace where none is known."""
+"""Traced material if none is known."""
 
 
 @dataclass(frozen=True)
 class SceneSettings(Checked):
-    """Settings of the conversion of a map to a scene. For a map with a mesh, only the material is used.
+    """Settings of the conversion of a map to a scene; for a mesh, only the material is used.
 
     Parameters
     ----------
     material : Material, str or None
-        Material of walls, floor and ceiling, or of those parts of a mesh that name none; or its name, as of
-        `Material.named`. With None it is the material of the map, if the map has one. Otherwise it is unknown where
-        paths go through walls, and predictions average over the candidates of `WallMaterials`; the trace itself has
-        drywall, as it has where walls are opaque.
+        Material of walls, floor and ceiling, or of parts of a mesh without one; or a name for `Material.named`. None is
+        the map's material. If the map has none, the trace has drywall, and predictions through walls average over the
+        candidates of `WallMaterials`.
     bridge_gap_m : float
-        Longest gap that is closed in a seen wall [m], where its cells are UNKNOWN. Of FREE cells at most two are
-        closed, and 0.11 m.
+        Longest gap of UNKNOWN cells that is closed in a seen wall [m]. Gaps of FREE cells are closed up to two cells
+        and 0.11 m.
     floor_extent : {"observed", "none"}
-        Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or no floor and ceiling.
+        Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or none.
     ceiling : bool
         True for a ceiling above the floor.
     outline : {"lines", "cells"}
-        Position of the walls: few straight lines fitted to the wall cells, or the staircase through the centres of
-        the wall cells as they are, for which `bridge_gap_m` does not count.
+        Walls as few straight lines fitted to the wall cells, or as the staircase through their centres, without
+        `bridge_gap_m`.
     geometries : int or None
-        Number of plausible geometries, 1 to 16, over which powers are averaged: the mapped outlines, and outlines whose
-        vertices are moved at random by 3 cm. They count for links without line of sight on the mapped outlines. None is
-        3 on nearly complete maps with range noise (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1
-        elsewhere. Gradients, channels, meshes, links with a folder and those with a
-        `TraceSettings.power_tolerance_db` always have the mapped outlines.
+        Number of geometries, 1 to 16, over which powers of links without line of sight are averaged: the mapped
+        outlines, and outlines with vertices moved at random by 3 cm. None is 3 on nearly complete maps with range noise
+        (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1 elsewhere. Gradients, channels, meshes, links with
+        a folder and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
 
     Raises
     ------
@@ -232,7 +228,7 @@ class SceneSettings(Checked):
 
     @property
     def traced_material(self) -> Material:
-        """`material`, or drywall in place of None."""
+        """`material`, or drywall for None."""
         return DRYWALL if self.material is None else self.material
 
 
@@ -245,35 +241,32 @@ class TraceSettings(Checked):
     frequency_hz : float
         Carrier frequency [Hz].
     max_depth : int
-        Largest number of interactions on a path, 0 (line of sight alone) to 10.
+        Largest number of interactions on a path, 0 (line of sight) to 10.
     diffraction : bool or None
-        One diffraction at a vertical edge, with at most two reflections around it. On floor plans it is found by exact
-        beams, as line of sight and specular reflections are; on meshes by shooting rays, which is slow. None is True
-        on floor plans and False on meshes.
+        One diffraction at a vertical edge: by exact beams on floor plans, by shooting rays on meshes, which is slow.
+        None is True on floor plans and False on meshes.
     diffraction_walls : int
-        Largest number of reflections at walls of a floor plan before the diffraction, and after it: 0, 1 or 2.
+        Largest number of wall reflections before the diffraction, and after it, on floor plans: 0, 1 or 2.
     open_ends : bool
-        True if a wall of a floor plan diffracts also at an end where observation stopped.
+        True if walls of a floor plan also diffract at ends where observation stopped.
     power_tolerance_db : float or None
-        By how much the power of a link's indirect paths may be changed by leaving out weak paths [dB], 0 to 1; 0 keeps
-        every path. The power of all candidates is computed before any is verified, and is at least the power that
-        Sionna RT finds, up to rounding. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir`
-        and the like), which are sums of fields: links that were traced with None are traced again for them.
+        Largest change of the power of a link's indirect paths by leaving out weak paths [dB], 0 to 1; 0 keeps every
+        path. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir` and others), which are sums
+        of fields: links that were traced with None are traced again for them.
     refraction : bool or None
-        True if paths go through walls. None is False from 24 GHz on, where the paper takes walls for opaque, and True
-        below.
+        True if paths go through walls. None is True below 24 GHz, and False from there on, where the paper assumes
+        opaque walls.
     max_walls : int
-        Largest number of walls that a path goes through, 1 to 16. `max_depth` does not count them.
+        Largest number of walls that a path goes through, 1 to 16, besides `max_depth`.
     wall_depth_m : float
-        Largest depth of one wall [m], 0 to 10. Of the faces that a path goes through one after the other, with no free
-        cell between them, those within this depth are one wall, and have the loss of one slab of the material; so have
-        the faces where it enters a closed body of a mesh and leaves it again. At 0 every face is a slab, as in the
-        exported scene.
+        Largest depth of one wall [m], 0 to 10. Successive faces on a path within it, without a free cell between them,
+        have the loss of one slab, as have the two faces of a closed body of a mesh. At 0 every face is a slab, as in
+        the exported scene.
     diffuse_reflection : bool
-        Diffuse reflections. With them, every path is found by shooting rays (Sionna RT's own candidate generator),
-        which is slower than exact beams.
+        Diffuse reflections. All paths are then found by shooting rays (Sionna RT's candidate generator), which is
+        slower.
     samples_per_tx : int
-        Number of rays shot from the transmitter where rays are shot.
+        Number of rays, where rays are shot.
     seed : int
         Seed of the rays where rays are shot.
 
@@ -304,7 +297,7 @@ class TraceSettings(Checked):
 
     @property
     def tolerance_db(self) -> float:
-        """`power_tolerance_db`, or its default where only powers count [dB]."""
+        """`power_tolerance_db`, or its default for powers [dB]."""
         return POWER_TOLERANCE_DB if self.power_tolerance_db is None else self.power_tolerance_db
 
     @property
@@ -320,32 +313,30 @@ class TraceSettings(Checked):
 
 @dataclass(frozen=True)
 class SensorSettings(Checked):
-    """Sensor of the exploring robot and its errors; by default there are none.
+    """Sensor of the exploring robot and its errors, by default none.
 
     Parameters
     ----------
     range_noise_m : float
-        Standard deviation of the camera's range readings [m], independent from ray to ray, at most 1. It makes walls
-        ragged: see `fusion`.
+        Standard deviation of range readings [m], independent between rays, at most 1. It makes walls ragged.
     drift_m_per_m : float
-        Odometry drift per metre travelled [1], at most 1, in a direction that is drawn once. What is seen later is
-        mapped off its true position, and walls that are seen again may appear twice.
+        Odometry drift per metre travelled [1], at most 1, in one random direction. Later walls are displaced, and walls
+        that are seen again may appear twice.
     missed_wall_fraction : float
-        Fraction of squares of half a metre in which walls return no reading [1], as glass, mirrors and black surfaces
-        do. Rays to them are dropped: their cells stay unknown, and nothing is seen through them.
+        Fraction of squares of half a metre in which walls return no reading [1], like glass, mirrors and black
+        surfaces. Their cells stay unknown, and nothing is seen through them.
     field_of_view_deg : float
-        Horizontal angle [degree], in (0, 360], centred on the heading of the robot. The default is the camera of Active
-        Neural SLAM (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
+        Horizontal angle around the heading [degree], in (0, 360]. The default is the camera of Active Neural SLAM
+        (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
-        Largest range [m], in (0, 100]. The default is the 64 cells of 0.05 m that Active Neural SLAM maps ahead.
+        Largest range [m], in (0, 100]; by default the 64 cells of 0.05 m of Active Neural SLAM.
     heading_noise_deg : float
-        Standard deviation of the heading that the map assumes for a picture [degree], independent from picture to
-        picture, at most 180.
+        Standard deviation of the assumed heading [degree], independent between pictures, at most 180.
     missed_return_fraction : float
-        Fraction of rays that return no reading [1], at random. With any error, those that graze a wall return none.
+        Fraction of rays without a reading [1], at random. With any error, rays that graze a wall have none.
     fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
-        Mapper whose rule and default parameters decide from the readings which cells are walls (`FUSIONS`); "vacuum"
-        thins walls, too. Without errors all agree, and the map is true.
+        Mapper whose rule and default parameters turn readings into walls (`FUSIONS`); "vacuum" also thins walls.
+        Without errors all give the true map.
 
     Raises
     ------
@@ -376,7 +367,7 @@ class SensorSettings(Checked):
 
 
 SHORT_LINK_M = 25.0
-"""Largest length of a short link, on the floor plan [m]."""
+"""Largest horizontal length of a short link [m]."""
 
 MIXED_SENSORS = {
     "range_m": (3.0, 30.0),
@@ -389,8 +380,8 @@ MIXED_SENSORS = {
 }
 """Ranges of the sensors of a data set with `sensor="mixed"`.
 
-The range is drawn uniformly on a logarithmic scale, the field of view of cameras and the mapper uniformly, and errors
-more often small than large (the square of a uniform number).
+Uniform distributions for the logarithm of the range, the field of view of cameras and the mapper; squares of uniform
+numbers for errors.
 """
 
 
@@ -401,30 +392,31 @@ class DatasetSettings(Checked):
     Parameters
     ----------
     links_per_home : int
-        Number of links whose receivers are drawn from the free cells of the complete home, at least
-        `transmitters_per_home`. As many more have receivers drawn from the whole map area, indoors or not. All of them
-        are there at each stage.
+        Number of links at each stage with receivers drawn from the free cells of the complete home, at least
+        `transmitters_per_home`; as many more have receivers drawn from the whole map area.
     transmitters_per_home : int
-        Number of transmitters, drawn from the free cells of the complete home; each has receivers of its own.
+        Number of transmitters in free cells of the complete home, each with its own receivers.
     stages : tuple of int, or of float
-        Steps that the robot has explored, increasing; or, all in [0, 1), fractions of the home's free area that it has
-        observed, which mean the same in buildings of all sizes.
+        Increasing exploration steps; or, all in [0, 1), observed fractions of the home's free area, which are
+        comparable between buildings.
     seed : int
-        Seed of the positions and of the robot, together with the home's name.
+        Seed of positions and robot, combined with the home's name.
     tx_height_m, rx_height_m : float
-        Heights of transmitters and receivers above the map's z = 0 [m].
+        Heights [m].
     margin_m : float
-        Width of the map area beyond the known cells of the complete home [m]. Maps are cut and extended to it.
+        Margin of the map area around the known cells of the complete home [m].
     sensor : SensorSettings or "mixed"
-        Sensor of the exploring robot and its errors; "mixed" draws it for each home from `MIXED_SENSORS`, by `seed`
-        and the home's name: one home in three has a camera of 60 to 120 degrees, the others a lidar that turns.
+        Sensor of the robot; "mixed" draws one for each home from `MIXED_SENSORS`: a camera of 60 to 120 degrees for one
+        home in three, else a turning lidar.
     short_link_fraction : float
-        Fraction of the receivers of each transmitter that are drawn within `SHORT_LINK_M` of it [1]. In large
-        buildings most links between uniformly drawn positions are long, and in outage.
+        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1]. In large buildings, most uniformly
+        drawn links are in outage.
     scene : SceneSettings
-        Conversion of maps to scenes; without a material the walls are of drywall.
+        Conversion of maps to scenes; drywall without a material.
     trace : TraceSettings
-        Settings of the traces on the complete and on the partial maps.
+        Settings of the traces.
+    cir_paths : int
+        Number of paths in the impulse responses of the complete map, the strongest of each link; 0 stores none.
 
     Raises
     ------
@@ -450,6 +442,7 @@ class DatasetSettings(Checked):
     short_link_fraction: Fraction = 0.0
     scene: SceneSettings = field(default_factory=SceneSettings)
     trace: TraceSettings = field(default_factory=TraceSettings)
+    cir_paths: Annotated[int, Within(0, 1000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -472,11 +465,10 @@ class PredictorSettings(Checked):
     Parameters
     ----------
     networks : {"paper", "paths", "map"}
-        "paper" has the networks of the paper alone. "paths" adds one that sees the crossings of paths, "map" adds two,
-        of which one sees the map around the transmitter; both need features with a context, as `link_features`
-        returns them.
+        "paper" has the paper's networks, "paths" adds a network on the walls along paths, "map" adds it and networks on
+        the map around the transmitter. "paths" and "map" need features with a context (`link_features`).
     frequency_hz : float
-        Carrier frequency of the links [Hz]; it sets the gain of free space.
+        Carrier frequency of the links [Hz].
     diffraction : bool
         True if the links were traced with diffraction.
     passes : int
@@ -484,14 +476,14 @@ class PredictorSettings(Checked):
     steps : int
         Gradient steps of each of the paper's networks.
     batch_size : int
-        Links in such a step.
+        Links per step.
     learning_rate : float
-        Learning rate of Adam at the first such step; it falls to 0 along a cosine.
+        First learning rate of Adam, which falls to 0 along a cosine.
     minimum_links : int
-        A network of the paper with fewer links is not trained: it returns mean and standard deviation of those it has
-        and of prior knowledge.
+        A network of the paper with fewer links is not trained: it returns mean and standard deviation of its links and
+        a prior.
     seed : int
-        Seed of first weights and batches.
+        Seed of initial weights and batches.
     through_walls : bool
         True if the links were traced through walls.
 
@@ -527,14 +519,14 @@ class PlacementSettings(Checked):
     ----------
     objective : {"coverage", "percentile"}
         "coverage" maximises the weighted mean over receivers of P(gain > threshold). "percentile" maximises the mean
-        predicted gain [dB] of the worst tenth of the receivers, an outage counting -150 dB: sorted by mean gain, they
-        count in full up to 5 % of the weight, and linearly less up to 15 %, so that no single one decides.
+        predicted gain [dB] of the worst tenth, with -150 dB for an outage: sorted by mean gain, receivers count in full
+        up to 5 % of the weight, and linearly less up to 15 %.
     threshold_db : float
         Path gain above which a receiver is covered [dB], in (-150, 0].
     tx_height_m, rx_height_m : float
-        Heights of transmitter and receivers [m], below the ceiling.
+        Heights below the ceiling [m].
     seed : int
-        Seed of the grid of positions that are compared. The same seed gives the same bytes.
+        Seed of the grid of candidate positions. Equal seeds give equal bytes.
 
     Raises
     ------
@@ -556,7 +548,7 @@ class PlacementSettings(Checked):
 
 
 def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """Let a function answer a setting that was given as an argument with the settings that hold it."""
+    """Let a function reject a setting given as an argument, naming the settings class for it."""
     parameters = inspect.signature(function).parameters
     kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
     holders = {

@@ -71,8 +71,8 @@ class Tab:
         held = {"button": "left", "clickCount": 1} if kind != "mouseMoved" else {}
         self.send("Input.dispatchMouseEvent", type=kind, x=x, y=y, **held)
 
-    def click(self, x: float, y: float) -> None:
-        for kind in ("mouseMoved", "mousePressed", "mouseReleased"):
+    def click(self, x: float, y: float, times: int = 1) -> None:
+        for kind in ("mouseMoved", *("mousePressed", "mouseReleased") * times):
             self.mouse(kind, x, y)
 
     def drag(self, x0: float, y0: float, x1: float, y1: float, *, seconds: float = 0.5, held_s: float = 0.0) -> None:

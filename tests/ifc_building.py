@@ -68,7 +68,6 @@ class Building:
         api.run("material.assign_material", self.model, products=[part], material=materials)
 
     def of_list(self, part: Any, *names: str) -> None:
-        """Give a part one material, or a list of several."""
         materials = [api.run("material.add_material", self.model, name=name) for name in names]
         whole = materials[0] if len(names) == 1 else self.model.createIfcMaterialList(materials)
         self.model.createIfcRelAssociatesMaterial(ifcopenshell.guid.new(), None, None, None, [part], whole)

@@ -17,8 +17,6 @@ START_S = 1_700_000_000.0
 
 
 class Messages:
-    """Makes messages of ROS 1 or 2."""
-
     def __init__(self, ros: int) -> None:
         self.ros = ros
         self.types = get_typestore(Stores.ROS1_NOETIC if ros == 1 else Stores.ROS2_HUMBLE)
@@ -43,7 +41,6 @@ class Messages:
     def grid(
         self, cells: ArrayLike, origin: tuple[float, float, float] = (1.0, 2.0, 0.0), resolution_m: float = 0.5
     ) -> Any:
-        """A map."""
         data, header = np.array(cells, dtype=np.int8), self.header(START_S, "map")
         ny, nx = data.shape
         info = self.new("nav_msgs/MapMetaData", header.stamp, resolution_m, nx, ny, self.pose(*origin))

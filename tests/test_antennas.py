@@ -223,7 +223,7 @@ def test_antennas_radiate_no_more_than_they_are_fed(caplog: pytest.LogCaptureFix
     sp.AntennaPattern("amplified", 7.0, np.zeros(360), np.zeros(360))
     assert "a gain of 7 dBi in all directions is no antenna" in caplog.text
     assert sp.AntennaPattern.sector(9.0, 90.0, 90.0).radiated > 1.25
-    assert "radiates 1.43 times the power" in caplog.text
+    assert caplog.text.count("radiates 1.43 times the power") == 1
 
 
 def test_arrays_of_antennas_that_overlap_are_refused() -> None:
@@ -254,11 +254,6 @@ def test_odd_antennas_are_refused_by_name(values: dict[str, Any]) -> None:
     assert {*values} <= {*inspect.signature(sp.Antenna).parameters}
     with pytest.raises(SettingsError, match="tx_antenna"):
         sp.predict_map(_room(), TX, tx_antenna=3)
-
-
-def test_a_tilted_isotropic_antenna_is_polarised_otherwise() -> None:
-    assert sp.Antenna("iso", azimuth_deg=30.0).uniform_gain_dbi == 0.0
-    assert replace(sp.Antenna(), downtilt_deg=30.0).uniform_gain_dbi is None
 
 
 def test_the_commands_take_antennas(tmp_path: Path) -> None:

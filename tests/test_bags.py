@@ -25,7 +25,6 @@ TIMES = np.arange(0.0, 10.01, 0.5)
 
 
 def way(time_s: Any) -> tuple[Any, Any, Any]:
-    """x, y and yaw of the robot in the map."""
     return 1.0 + 0.5 * time_s, 2.0 + 0.1 * time_s, 0.02 * time_s
 
 
@@ -71,9 +70,7 @@ class TestMaps:
         [
             ({"time_s": 0.5}, r"has no map up to time_s = 0\.5: topic /map has its first map 1 s after the start: g"),
             ({"time_s": -1}, r"time_s = -1 is not allowed: give seconds since the start of the recording"),
-            ({"time_s": "1"}, r"time_s = '1' is not allowed"),
             ({"topic": "/odom"}, r"has no OccupancyGrid topic '/odom': name one of its topics: /amcl_pose"),
-            ({"topic": 3}, r"has no OccupancyGrid topic 3: name one of its topics"),
             ({"up": "y"}, r"up is for scans alone, but path = '.*' is a rosbag: leave it out"),
         ],
     )
@@ -123,9 +120,7 @@ class TestPoses:
         make = messages_of(name)
         rows = [("/odom", time, make.odometry(START_S + time, time, 0.0, 0.0)) for time in (0.0, 1.0)]
         bag = write_bag(tmp_path / name, [*rows, ("/empty", 0.0, make.power(0.0))])
-        with pytest.warns(
-            MapWarning, match=r"poses of /odom are in the frame 'odom', and no transform leads to 'map'; they"
-        ):
+        with pytest.warns(MapWarning, match=r"poses of /odom are in the frame 'odom', and no transform leads to 'map'"):
             poses = poses_from_bag(bag)
         assert poses.position_m[:, 0].values.tolist() == [0.0, 1.0]
         with pytest.raises(MeasurementError, match=r"has no .* topic '/empty': name one of its topics"):
@@ -210,12 +205,10 @@ class TestMessages:
         ("change", "given", "message"),
         [
             ({}, {"resolution_m": 0.1}, "resolution_m and origin_m are those of the message: leave them out"),
-            ({}, {"origin_m": (0, 0)}, "resolution_m and origin_m are those of the message"),
             ({"data": [0]}, {}, "data has 1 values for 1 x 2 cells: give the whole message"),
             ({"info": None}, {}, "data is no OccupancyGrid ("),
             ({"data": [], "width": 0}, {}, "info has 1 x 0 cells: give a map with cells"),
             ({"tilt": 1.0}, {}, "info.origin.orientation = [1.0, 0.0, 0.0, 1.0] is not level: give a yaw alone"),
-            ({"tilt": math.nan}, {}, "is not level"),
             (None, {}, "resolution_m is missing: give the edge of a cell in metres, or an Occ"),
         ],
     )

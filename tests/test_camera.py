@@ -25,7 +25,6 @@ def surrounded(state):
 
 
 def corridor(length=30, wall_at=20):
-    """A corridor along x, three cells wide, with a wall across it."""
     state = np.full((5, length), CellState.WALL, dtype=np.uint8)
     state[1:4, 1:-1] = CellState.FREE
     state[:, wall_at] = CellState.WALL
@@ -40,7 +39,6 @@ def corridor(length=30, wall_at=20):
     st.integers(0, 35),
 )
 def test_rays_pass_no_corner_where_two_walls_meet(state, cell, part, tens):
-    """All free cells that are seen are connected by their edges, and everything seen is true."""
     truth = surrounded(state)
     truth[cell] = CellState.FREE
     eye = camera(truth)
@@ -100,7 +98,6 @@ def test_readings_beyond_the_grid_are_dropped():
 
 
 def test_many_noisy_looks_find_the_wall():
-    """The wall across the corridor is 18 cells ahead; a reading errs by two cells."""
     single, many = (camera(corridor(40, 20), SensorSettings(range_noise_m=0.2), seed=1) for _ in range(2))
     for eye, looks in ((single, 1), (many, 60)):
         for _ in range(looks):

@@ -132,10 +132,10 @@ ARGUMENTS = [
     ),
     (
         "dataset --homes 3 --first-seed 7 --stage 0.25 --stage 0 --kind floor --kind hall --mixed-sensors "
-        "--short-links 0.5 --scheduler there",
+        "--short-links 0.5 --cir-paths 9 --scheduler there",
         "build_dataset",
         {"homes": [(7, "floor"), (8, "hall"), (9, "floor")], "scheduler": "there"}
-        | {"settings": DatasetSettings(stages=(0, 0.25), sensor="mixed", short_link_fraction=0.5)},
+        | {"settings": DatasetSettings(stages=(0, 0.25), sensor="mixed", short_link_fraction=0.5, cir_paths=9)},
     ),
     ("dataset --map a.npz --map b", "build_dataset", {"homes": [Path("a.npz"), Path("b")]}),
 ]

@@ -164,7 +164,9 @@ def test_the_report_has_names_any_transmitter_uncertainty_and_material(several):
     assert [row.count("%") for row in rows] == [0, 8, 8, 8]
     assert re.search(r"Material of the walls: \w+", text)
     assert "flat_2.png" in figure.get_suptitle()
-    assert len([axis for axis in figure.axes if axis.get_title()]) == 4
+    for part, panels_columns in (({"x": slice(18)}, (4, 2)), ({"y": slice(8)}, (3, 1)), ({"x": slice(6)}, (2, 2))):
+        axes = [axis for axis in report_figure(several.isel(part), 20.0, -67.0).axes if axis.get_title()]
+        assert (len(axes), axes[0].get_subplotspec().get_gridspec().ncols) == panels_columns
 
 
 def test_the_comparison_has_a_column_for_each_map(coverage):

@@ -15,6 +15,7 @@ from meshes import box, scene_mesh
 import sionna_partial as sp
 from sionna_partial.files import temporary_folder
 from sionna_partial.tracing.power import transmission_coefficients
+from sionna_partial.tracing.walls import Interior, are_in_wall, is_free_between
 
 BRICK = sp.Material(3.91, 0.031, 0.1)
 LONELY = sp.SceneSettings(material=BRICK, floor_extent="none")
@@ -60,6 +61,33 @@ def field(*solids: trimesh.Trimesh | None) -> sp.PartialMap:
     return sp.PartialMap(state, 0.1, mesh=scene_mesh(*(solid for solid in solids if solid is not None)))
 
 
+def test_rays_between_two_that_stay_in_one_wall() -> None:
+    """The rule for a bundle of rays is never less strict than the rule for each."""
+    rng, agreed = np.random.default_rng(4), 0
+    for _ in range(200):
+        free = np.zeros((40, 40), dtype=bool)
+        free[rng.integers(0, 40, 4), rng.integers(0, 40, 4)] = True
+        interior = Interior.of(free, free, np.zeros((0, 2), dtype=bool), 0.05, 0.4)
+        near, far = ((x, rng.uniform(0.3, 0.9), rng.uniform(1.0, 1.7)) for x in (0.8, rng.uniform(0.9, 1.5)))
+        source, rays = (0.05, rng.uniform(0.4, 1.6)), []
+
+        def ray(part: float, source=source, near=near, far=far) -> tuple[float, ...]:
+            y = near[1] + part * (near[2] - near[1])
+            length = np.hypot(near[0] - source[0], y - source[1])
+            x, y = (near[0] - source[0]) / length, (y - source[1]) / length
+            return x, y, x, length, (far[0] - source[0]) / x
+
+        rays = ray(0.0), ray(1.0)
+        if not are_in_wall(interior, *source, rays):
+            continue
+        agreed += 1
+        for x, y, cosine, first, last in map(ray, np.linspace(0.0, 1.0, 9)):
+            end = source[0] + (last + 0.1) * x, source[1] + (last + 0.1) * y
+            assert (last - first) * cosine <= 0.4 + 1e-9
+            assert not is_free_between(interior, source, end, first / (last + 0.1), last / (last + 0.1))
+    assert 20 < agreed < 180
+
+
 class TestOneWall:
     @pytest.mark.parametrize(("cells", "angle_deg"), [(1, 0), (1, 60), (3, 30), (6, 0), (6, 60)])
     def test_costs_its_slab_however_deep_it_is(self, cells: int, angle_deg: float) -> None:
@@ -67,12 +95,6 @@ class TestOneWall:
         tx, rx = (3.0, 2.97 - aside, 1.5), (6.0, 2.97 + aside, 1.5)
         loss = loss_db(walled(cells), tx, rx)
         assert loss == pytest.approx(slab_loss_db(np.cos(np.radians(angle_deg))), abs=0.02)
-
-    def test_reflects_as_much_however_deep_it_is(self) -> None:
-        """Both links lose the same to a deep wall as to a thin one: its far face reflects nothing."""
-        for rx in ((2.5, 3.9, 1.5), (6.5, 3.9, 1.5)):
-            losses = [loss_db(walled(each), (2.5, 2.17, 1.5), rx, max_depth=3, diffraction=False) for each in (1, 6)]
-            assert losses[1] == pytest.approx(losses[0], abs=0.02)
 
     def test_costs_the_same_where_one_face_was_seen(self) -> None:
         tx, rx = (2.5, 2.97, 1.5), (6.5, 3.11, 1.5)
@@ -200,16 +222,6 @@ def test_plans_and_meshes_agree(depth_m: float) -> None:
     assert mesh.to_dataframe("paths")["walls"].max() >= 2
 
 
-def test_weak_paths_that_are_left_out_do_not_matter() -> None:
-    settings = replace(EVERY, wall_depth_m=0.6)
-    whole, short = (
-        sp.trace_links(rooms(), TX, RX, trace_settings=replace(settings, power_tolerance_db=tolerance_db))
-        for tolerance_db in (0.0, 0.1)
-    )
-    assert len(short.a) < len(whole.a)
-    np.testing.assert_allclose(short.gain_db, whole.gain_db, atol=0.2)
-
-
 def test_on_by_default_below_24_ghz() -> None:
     for frequency_hz, through in ((5e9, True), (23.9e9, True), (24e9, False), (60e9, False)):
         assert sp.TraceSettings(frequency_hz).through_walls is through
@@ -217,22 +229,6 @@ def test_on_by_default_below_24_ghz() -> None:
             resolved = sp.Simulation(partial, sp.TraceSettings(frequency_hz)).resolved
             assert resolved.trace_settings.refraction is through
     assert sp.TraceSettings(5e9, refraction=False).through_walls is False
-
-
-def test_slopes_of_materials() -> None:
-    """Derivatives with respect to the thickness of walls agree with differences."""
-    simulation = sp.Simulation(rooms(), replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1))
-    paths = simulation.paths(TX, RX[1:3])
-    through = (paths.interactions == REFRACTION).any(axis=1)
-    strong = through & (paths.power > 1e-4 * paths.power[through].max())
-    for name, step in (("thickness_m", 2e-5), ("conductivity_s_m", 1e-3)):
-        value = getattr(paths.base, name)
-        ends = [paths.at(replace(paths.base, **{name: value + by}))[0] for by in (step, -step)]
-        slope = paths.slopes(paths.base, (name,))[name][:, 0]
-        expected = (ends[0] - ends[1]) / (2.0 * step)
-        np.testing.assert_allclose(
-            slope[strong], expected[strong], rtol=0.05, atol=0.02 * np.abs(expected[strong]).max()
-        )
 
 
 @pytest.mark.skipif(not BOWLUS.is_file(), reason="the home is not here")

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -13,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psutil
@@ -96,21 +98,16 @@ def started(*command: object) -> Iterator[subprocess.Popen[str]]:
 
 
 class TestBuild:
-    def test_all_homes_are_there(self, unbroken: Path) -> None:
+    def test_homes_and_index(self, unbroken: Path) -> None:
         links = read_dataset(unbroken)
         assert tuple(dict.fromkeys(links.home.tolist())) == NAMES
         for name in NAMES:
-            shard = read_shard(shard_path(unbroken, name))
-            assert_same(shard, fake_links(None, name, SETTINGS))
-
-    def test_folder_says_what_it_holds(self, unbroken: Path) -> None:
+            assert_same(read_shard(shard_path(unbroken, name)), fake_links(None, name, SETTINGS))
         index = json.loads((unbroken / "dataset.json").read_text())
         assert [home["name"] for home in index["homes"]] == [*NAMES]
         assert index["settings"]["stages"] == [0, 50]
         assert index["versions"].keys() == set(home_links.PACKAGES)
         assert sorted(path.name for path in unbroken.iterdir()) == [".lock", "dataset.json", "shards"]
-
-    def test_second_run_makes_nothing(self, unbroken: Path) -> None:
         before = files(unbroken)
         report = build_dataset(unbroken, SEEDS, SETTINGS)
         assert (report.skipped, report.built) == (NAMES, ())
@@ -235,21 +232,50 @@ class TestRefused:
             (SEEDS, replace(SETTINGS, seed=1, stages=(0,)), r"settings\.seed was 0 .*, and is 1 \(and 1 more\): take"),
             (SEEDS, replace(SETTINGS, trace=TraceSettings(max_depth=2)), r"settings\.trace\.max_depth was 6 .* is 2:"),
             (SEEDS[1:], SETTINGS, r"home 'make_home\(0\)' was in the list of homes when .* is not in it:"),
+            (SEEDS, SETTINGS, r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'),
         ],
     )
-    def test_other_settings_and_homes(
-        self, unbroken: Path, homes: range, settings: DatasetSettings, message: str
+    def test_other_settings_homes_and_versions(
+        self, unbroken: Path, homes: range, settings: DatasetSettings, message: str, monkeypatch: pytest.MonkeyPatch
     ) -> None:
+        if "versions" in message:
+            now = home_links.installed_versions() | {"sionna-rt": "9.9"}
+            monkeypatch.setattr(dataset, "installed_versions", lambda: now)
         before = files(unbroken)
         with pytest.raises(SettingsError, match=message):
             build_dataset(unbroken, homes, settings)
+        with (
+            locked_folder(unbroken),
+            pytest.raises(OutputError, match="is being written by another process: wait until"),
+        ):
+            build_dataset(unbroken, SEEDS, SETTINGS)
         assert files(unbroken) == before
 
-    def test_other_versions(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        now = home_links.installed_versions() | {"sionna-rt": "9.9"}
-        monkeypatch.setattr(dataset, "installed_versions", lambda: now)
-        with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
-            build_dataset(unbroken, SEEDS, SETTINGS)
+    @pytest.mark.parametrize(
+        ("error", "message", "options"),
+        [
+            (MapError, "homes is empty", {"homes": []}),
+            (SettingsError, "workers = 0 is not allowed: give a", {"workers": 0}),
+            (SettingsError, "workers = 1.5 is not allowed: give a", {"workers": 1.5}),
+            (SettingsError, "home_time_limit_s = 0.0 is not allowed: give a", {"home_time_limit_s": 0.0}),
+            (
+                SettingsError,
+                "workers = 2 is for this machine, and scheduler is given: leave one",
+                {"workers": 2, "scheduler": "tcp://127.0.0.1:1"},
+            ),
+            (BackendError, r"scheduler = 'nothing\.json' is not there: give the file", {"scheduler": "nothing.json"}),
+            *(
+                (BackendError, f"scheduler = '{address}' does not answer .*: give the address", {"scheduler": address})
+                for address in ("tcp://127.0.0.1:9", "smoke://signal")
+            ),
+        ],
+    )
+    def test_arguments(
+        self, tmp_path: Path, error: type, message: str, options: Any, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
+        with pytest.raises(error, match=message):
+            build_dataset(tmp_path / "set", **{"homes": SEEDS, "settings": SETTINGS} | options)
 
     def test_home_from_another_file(self, tmp_path: Path) -> None:
         for folder in ("a", "b"):
@@ -264,34 +290,11 @@ class TestRefused:
         with pytest.raises(OutputError, match=r"other content than a data set \(letter\.txt\): choose a new or an"):
             build_dataset(tmp_path, SEEDS, SETTINGS)
 
-    def test_two_runs_at_once(self, unbroken: Path) -> None:
-        before = files(unbroken)
-        with (
-            locked_folder(unbroken),
-            pytest.raises(OutputError, match="is being written by another process: wait until"),
-        ):
-            build_dataset(unbroken, SEEDS, SETTINGS)
-        assert files(unbroken) == before
-
     @pytest.mark.parametrize("text", ["{", "[]", '{"homes": 3, "settings": {}, "versions": {}}'])
     def test_damaged_index(self, tmp_path: Path, text: str) -> None:
         (tmp_path / "dataset.json").write_text(text)
         with pytest.raises(OutputError, match=r"dataset\.json' is damaged .*: choose a new folder\."):
             build_dataset(tmp_path, SEEDS, SETTINGS)
-
-    def test_workers_and_scheduler(self, tmp_path: Path) -> None:
-        with pytest.raises(SettingsError, match="workers = 2 is for this machine, and scheduler is given: leave one"):
-            build_dataset(tmp_path, SEEDS, SETTINGS, workers=2, scheduler="tcp://127.0.0.1:1")
-
-    @pytest.mark.parametrize(("name", "value"), [("workers", 0), ("workers", 1.5), ("home_time_limit_s", 0.0)])
-    def test_numbers(self, tmp_path: Path, name: str, value: float) -> None:
-        with pytest.raises(SettingsError, match=f"{name} = {value} is not allowed: give a"):
-            build_dataset(tmp_path, SEEDS, SETTINGS, **{name: value})
-
-    def test_no_home(self, tmp_path: Path) -> None:
-        with pytest.raises(MapError, match="homes is empty"):
-            build_dataset(tmp_path / "set", [], SETTINGS)
-        assert not (tmp_path / "set").exists()
 
 
 def test_numbers_of_numpy_are_noted_as_numbers() -> None:
@@ -305,28 +308,25 @@ def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "")
     return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_links.installed_versions(), 4.0)
 
 
-class TestWorker:
-    """What a worker finds out before it makes a home."""
-
-    def test_folder_that_it_does_not_see(self, tmp_path: Path) -> None:
-        result = run_home(task("make_home(1)", 1, tmp_path / "elsewhere"))
-        assert result.outcome == "unusable"
-        assert "cannot read" in result.error
-        assert "give a folder on a file system that all workers share" in result.error
-
-    def test_other_folder_of_the_same_name(self, tmp_path: Path) -> None:
-        (tmp_path / "dataset.json").write_text("{}")
-        result = run_home(task("make_home(1)", 1, tmp_path, "0" * 64))
-        assert result.outcome == "unusable"
-        assert "sees another" in result.error
-
-    def test_other_versions(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        (tmp_path / "dataset.json").write_text("{}")
-        mine = task("make_home(1)", 1, tmp_path, hashlib.sha256(b"{}").hexdigest())
-        monkeypatch.setattr(home_links, "installed_versions", lambda: mine.versions | {"mitsuba": "1.0"})
-        result = run_home(mine)
-        assert result.outcome == "unusable"
-        assert f"has mitsuba 1.0, the data set is made with {mine.versions['mitsuba']}: install" in result.error
+@pytest.mark.parametrize(
+    ("folder", "versions", "message"),
+    [
+        ("elsewhere", {}, "cannot read .*: give a folder on a file system that all workers share"),
+        ("other", {}, "sees another "),
+        ("", {"mitsuba": "1.0"}, "has mitsuba 1.0, the data set is made with .*: install"),
+    ],
+)
+def test_worker_that_cannot_make_homes(
+    tmp_path: Path, folder: str, versions: dict[str, str], message: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "other").mkdir()
+    for path, text in ((tmp_path, "{}"), (tmp_path / "other", "[]")):
+        (path / "dataset.json").write_text(text)
+    mine = task("make_home(1)", 1, tmp_path / folder, hashlib.sha256(b"{}").hexdigest())
+    monkeypatch.setattr(home_links, "installed_versions", lambda: mine.versions | versions)
+    result = run_home(mine)
+    assert result.outcome == "unusable"
+    assert re.search(message, result.error)
 
 
 class TestScheduler:
@@ -355,16 +355,3 @@ class TestScheduler:
         assert run.returncode == 0, errors
         assert files(tmp_path / "set") == files(unbroken)
         assert [path.name for path in tmp_path.iterdir()] == ["set"]
-
-    def test_file_that_is_not_there(self, tmp_path: Path) -> None:
-        with pytest.raises(BackendError, match=r"scheduler = 'nothing\.json' is not there: give the file that dask"):
-            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="nothing.json")
-
-    def test_address_where_nothing_answers(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
-        with pytest.raises(BackendError, match=r"scheduler = 'tcp://127\.0\.0\.1:9' does not answer .*: give the"):
-            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="tcp://127.0.0.1:9")
-
-    def test_no_address(self, tmp_path: Path) -> None:
-        with pytest.raises(BackendError, match=r"scheduler = 'smoke://signal' does not answer .*: give the address"):
-            build_dataset(tmp_path / "set", SEEDS, SETTINGS, scheduler="smoke://signal")

@@ -32,18 +32,6 @@ def _join(
     return Candidates(*(np.concatenate([getattr(part, name) for part in parts]) for name in names), wedges)
 
 
-def _ways(found: Candidates, floor_face: int) -> list[tuple[tuple[float, ...], int, int]]:
-    """All numbers of each candidate, and how many walls mirror it before and after its edge; sorted."""
-    ways = []
-    columns = found.rx, found.kind, found.face, found.vertices_m, found.wedge
-    for rx, kind, face, vertices, wedge in zip(*columns, strict=True):
-        at, used = int(np.flatnonzero(kind == DIFFRACTION)[0]), kind != 0
-        wall = used & (kind != DIFFRACTION) & (face < floor_face)
-        row = (float(rx), float(wedge), *face[used].tolist(), *vertices[used].ravel().tolist())
-        ways.append((row, int(wall[:at].sum()), int(wall[at + 1 :].sum())))
-    return sorted(ways)
-
-
 def _star(*degrees: float) -> NDArray[np.float64]:
     """Walls of 1 m from the origin, given by their directions."""
     angle = np.radians(degrees)
@@ -83,15 +71,11 @@ class TestFindWedges:
         [
             ((0,), [(0, 0)]),
             ((0, 90), [(1, 0)]),
-            ((90, 0), [(0, 1)]),
             ((0, 180), []),
             ((0, 179.99), []),
             ((0, 170), [(1, 0)]),
-            ((0, -170), [(0, 1)]),
             ((0, 90, 180), []),
-            ((0, 90, 270), []),
             ((0, 90, 180, 270), []),
-            ((90, 210, 330), []),
             ((0, 45, 90), [(2, 0)]),
             ((60, 90, 120), [(2, 0)]),
             ((175, 185, 180), [(1, 0)]),
@@ -100,10 +84,6 @@ class TestFindWedges:
     )
     def test_sectors_wider_than_a_half_plane(self, degrees: tuple[float, ...], sectors: list[tuple[int, int]]) -> None:
         assert _sectors(_star(*degrees)) == sectors
-
-    def test_no_edge_has_two_wedges(self) -> None:
-        edge_m = find_wedges(extrude(np.concatenate([ROOM, SPLINTERS])), open_ends=True).edge_m
-        assert len(np.unique(edge_m, axis=0)) == len(edge_m)
 
 
 class TestDiffractionCandidates:
@@ -129,77 +109,6 @@ class TestDiffractionCandidates:
         assert len(truth) > 200
         assert ways == truth
         assert len(found.rx) == len(truth)
-
-    def test_paths_keep_their_slope_at_the_edge_and_mirror_elsewhere(self) -> None:
-        rx = np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
-        geometry = extrude(ROOM)
-        found = _join(geometry, rx)
-        assert {geometry.floor_face, geometry.ceiling_face} <= set(found.face.ravel().tolist())
-        for index, kinds, face, vertices in zip(found.rx, found.kind, found.face, found.vertices_m, strict=True):
-            points = np.concatenate([TX[None], vertices[kinds != 0], rx[index][None]])
-            direction = np.diff(points, axis=0)
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            for kind, number, before, after in zip(kinds, face, direction[:-1], direction[1:], strict=False):
-                if kind == DIFFRACTION:
-                    assert after[2] == pytest.approx(before[2], abs=1e-9)
-                    continue
-                normal = np.array([0, 0, 1.0])
-                if number < geometry.floor_face:
-                    along = np.diff(ROOM[number // 2], axis=0)[0]
-                    normal = np.array([along[1], -along[0], 0.0]) / np.hypot(*along)
-                np.testing.assert_allclose(after, before - 2 * np.dot(before, normal) * normal, atol=1e-9)
-
-    @pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 6])
-    def test_depth_limits_the_reflections(self, max_depth: int) -> None:
-        geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1]])
-        found = diffracted_blocks(geometry, find_wedges(geometry, open_ends=False), TX, rx, max_depth)
-        depth = max((int((block.face != -1).sum(axis=1).max()) for block, _ in found), default=0)
-        assert depth == min(max_depth, MAX_REFLECTIONS + 1)
-
-    @pytest.mark.parametrize("walls_a_side", [0, 1, 2])
-    def test_walls_on_each_side_are_limited_and_nothing_else_is(self, walls_a_side: int) -> None:
-        geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
-        limited = _ways(_join(geometry, rx, walls_a_side=walls_a_side), geometry.floor_face)
-        every = _ways(_join(geometry, rx), geometry.floor_face)
-        assert {before for _, before, _ in every} == {after for _, _, after in every} == {0, 1, 2}
-        assert limited == [way for way in every if max(way[1:]) <= walls_a_side]
-        assert max(max(way[1:]) for way in limited) == walls_a_side
-
-    @pytest.mark.parametrize(
-        ("tx", "wall"),
-        [((4.0, 1.0, 1.2), 0), ((1.07, 3.0, 1.2), 1), ((1.07, 1.93, 1.2), 1)],
-        ids=["below lights the level wall", "left lights the upright wall", "both are lit"],
-    )
-    def test_the_face_that_the_transmitter_lights_comes_first(self, tx: tuple[float, ...], wall: int) -> None:
-        geometry, position = extrude(CORNER), np.array(tx)
-        found = _join(geometry, np.array([[2.5, 0.5, 1.0]]), position, 1)
-        row = int(np.flatnonzero((found.vertices_m[:, 0, :2] == [3.0, 2.0]).all(axis=1))[0])
-        normal = found.wedges.normal[found.wedge[row]]
-        assert normal[0] @ (position[:2] - [3.0, 2.0]) > 0
-        assert found.wedges.face[found.wedge[row], 0] // 2 == wall
-
-    def test_at_a_bent_junction_nothing_joins_two_sectors(self) -> None:
-        """Walls at 0, 45 and 90 degrees: only the sector of 270 degrees diffracts, and within itself."""
-        geometry, radius = extrude(_star(0, 45, 90)), 0.5
-        positions = {
-            degrees: np.array([radius * np.cos(np.radians(degrees)), radius * np.sin(np.radians(degrees)), 1.0])
-            for degrees in (20, 70, 100, 200, 350)
-        }
-        for (a, tx), (b, rx) in itertools.permutations(positions.items(), 2):
-            wedges = find_wedges(geometry, open_ends=False)
-            blocks = diffracted_blocks(geometry, wedges, tx, rx[None], 1)
-            at = [(block.vertices_m[:, 0, :2] == 0.0).all(axis=1).sum() for block, _ in blocks]
-            assert sum(at) == (a >= 100 and b >= 100), (a, b)
-
-    def test_an_open_end_diffracts_if_asked(self) -> None:
-        geometry = extrude([[(3.0, 1.0), (3.0, 3.0)]], open_ends_m=[(3.0, 1.0)], floor_m=())
-        rx = np.array([[5.0, 2.0, 1.0]])
-        for open_ends in (False, True):
-            wedges = find_wedges(geometry, open_ends=open_ends)
-            (block, share), *rest = diffracted_blocks(geometry, wedges, TX, rx, 1)
-            assert share == 1.0
-            assert not rest
-            assert sorted(block.vertices_m[:, 0, 1]) == ([1.0, 3.0] if open_ends else [3.0])
 
     def test_without_wedges_there_are_no_candidates(self) -> None:
         geometry = extrude(ROOM[:4])

@@ -5,9 +5,8 @@ import re
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import LOS, NLOS, OUTAGE, QUIET, quick_predictor
+from predictor_links import NLOS, OUTAGE, QUIET, quick_predictor
 
-from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation import (
     ALWAYS_OUTAGE,
@@ -16,10 +15,9 @@ from sionna_partial.evaluation import (
     Baselines,
     Majority,
     evaluate,
-    home_scores,
     measure,
 )
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
@@ -47,15 +45,17 @@ def evaluation(table):
 
 
 class TestEvaluate:
-    def test_homes_of_the_card_are_training_homes(self, evaluation):
-        assert evaluation.homes == {"test": ("home 0", "home 2", "home 3"), "train": ("home 1",)}
-
     def test_every_answer_at_every_stage_for_all_and_by_ends_seen(self, evaluation):
+        assert evaluation.homes == {"test": ("home 0", "home 2", "home 3"), "train": ("home 1",)}
         for homes, stage in (("test", 0), ("test", 100), ("train", 0), ("train", 100)):
             rows = evaluation.select(homes=homes, receivers="indoor", stage=stage)
             assert [(row.ends_seen, row.model) for row in rows] == [
                 (ends, answer) for ends in ("all", "both", "one", "none") for answer in ANSWERS
             ]
+        assert [(each, found.state.links.sum()) for each, found in evaluation.calibrations.items()] == [
+            (0, 900),
+            (100, 900),
+        ]
 
     def test_links_are_split_by_ends_seen(self, evaluation):
         for receivers, answer in (("indoor", "majority"), ("anywhere", WITH_INDOOR)):
@@ -111,59 +111,19 @@ class TestEvaluate:
         assert found.rmse_db == pytest.approx(np.mean(errors_db))
         assert found.rmse_error_db == pytest.approx(np.std(errors_db, ddof=1) / math.sqrt(3))
 
-    def test_one_home_has_no_standard_error(self, table):
-        found = evaluate(trained_on("home 1", "home 2", "home 3"), table, baselines=fitted_baselines()).differences
-        assert all(each.homes == 1 and math.isnan(each.accuracy_error) for each in found)
-
-    def test_calibration_is_that_of_test_homes(self, evaluation):
-        assert list(evaluation.calibrations) == [0, 100]
-        for calibration in evaluation.calibrations.values():
-            assert calibration.state.links.sum() == 900
-
-    def test_complete_maps_are_answered_by_their_trace(self, table):
-        known = table.phi.link_state == table.link_state
-        right = dataclasses.replace(table, gain_db=table.phi.gain_db).take(known & ~table.anywhere)
-        rows = evaluate(quick_predictor(), right, baselines=fitted_baselines()).select(model="partial trace")
-        assert {(row.metrics.accuracy, row.metrics.rmse_db, row.metrics.nll_state) for row in rows} == {(1.0, 0.0, 0.0)}
-        assert set(right.link_state) >= {LOS, OUTAGE}
-
-    def test_progress(self, table):
-        calls = []
-        evaluate(trained_on("home 0"), table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
-        assert calls[0] == (0.0, "measuring on test homes at 0 steps")
-        assert calls[-1] == (0.75, "measuring on train homes at 100 steps")
-
-
-class TestHomeScores:
-    def test_each_home_is_measured_by_itself_in_the_order_of_names(self, table):
-        links = table.take(table.home == "home 3")
-        right = dataclasses.replace(links, link_state=links.phi.link_state, gain_db=links.phi.gain_db)
-        third, gain_db = np.arange(len(links)) % 3 == 0, np.full(len(links), -60.0)
-        other = dataclasses.replace(
-            right,
-            home=np.full(len(links), "home 10"),
-            features=dataclasses.replace(
-                right.features, link_state=np.ones(len(links), dtype=np.uint8), gain_db=gain_db
-            ),
-            link_state=np.where(third, OUTAGE, LOS).astype(np.uint8),
-            gain_db=gain_db + 3.0,
-        )
-        both = LinkTable.concatenate([right, other])
-        accuracies, rmses_db = home_scores(LinkPrediction.of_trace(both.phi), both)
-        expected_db = math.sqrt((90.0**2 + 2 * 3.0**2) / 3)
-        np.testing.assert_allclose(accuracies, [2 / 3, 1.0])
-        np.testing.assert_allclose(rmses_db, [expected_db, 0.0], atol=1e-9)
-
 
 class TestBaselines:
-    def test_the_papers_is_not_compared_with_itself(self, table):
+    def test_the_papers_is_left_out_at_another_frequency_and_in_its_own_evaluation(self, table):
+        calls = []
+        settings = dataclasses.replace(quick_predictor().settings, frequency_hz=60e9)
+        other = dataclasses.replace(trained_on("home 1", "home 2", "home 3"), settings=settings)
+        found = evaluate(other, table, baselines=fitted_baselines(), progress=lambda *call: calls.append(call))
+        assert "paper" not in {row.model for row in found.rows}
+        assert all(each.homes == 1 and math.isnan(each.accuracy_error) for each in found.differences)
+        assert calls[0] == (0.0, "measuring on test homes at 0 steps")
+        assert calls[-1] == (0.75, "measuring on train homes at 100 steps")
         found = evaluate("paper", table, baselines=fitted_baselines())
         assert {row.model for row in found.select(receivers="indoor")} == {*ANSWERS} - {"paper"}
-
-    def test_the_papers_is_left_out_at_another_frequency(self, table):
-        settings = dataclasses.replace(quick_predictor().settings, frequency_hz=60e9)
-        found = evaluate(dataclasses.replace(quick_predictor(), settings=settings), table, baselines=fitted_baselines())
-        assert "paper" not in {row.model for row in found.rows}
 
     def test_notes_say_what_the_baselines_were_fitted_to_and_which_test_homes_they_know(self, table):
         name = Predictor.load("paper").homes[0]
@@ -193,6 +153,9 @@ class TestBaselines:
         assert rows[0] == rows[1] != []
 
 
+OTHERS = "give a data set of other homes, such as other seeds, or train with test_fraction above 0."
+
+
 @pytest.mark.parametrize(
     ("predictor", "links", "baselines", "message"),
     [
@@ -201,22 +164,19 @@ class TestBaselines:
             [f"home {index}" for index in range(4)],
             slice(None),
             None,
-            "predictor 'fitted' was trained on all 4 homes of the data set: give a data set of other homes, such "
-            "as other seeds, or train with test_fraction above 0.",
+            f"predictor 'fitted' was trained on all 4 homes of the data set: {OTHERS}",
         ),
         ((), slice(0), None, "dataset has no links"),
+        (
+            (),
+            None,
+            None,
+            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
+            "diffraction: choose another predictor",
+        ),
     ],
 )
-def test_what_cannot_be_evaluated(table, predictor, links, baselines, message):
+def test_refused(table, predictor, links, baselines, message, tmp_path):
+    given = make_dataset(tmp_path, table, frequency_hz=60e9) if links is None else table.take(links)
     with pytest.raises(PredictorError, match=re.escape(message)):
-        evaluate(trained_on(*predictor), table.take(links), baselines=baselines)
-
-
-def test_other_traces(table, tmp_path):
-    folder = make_dataset(tmp_path, table, frequency_hz=60e9)
-    message = (
-        "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
-        "diffraction: choose another predictor"
-    )
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        evaluate(quick_predictor(), folder)
+        evaluate(trained_on(*predictor), given, baselines=baselines)

@@ -1,8 +1,5 @@
-from pathlib import Path
-
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from PIL import Image
@@ -18,7 +15,6 @@ from sionna_partial.settings import SensorSettings
 
 @pytest.fixture(scope="module")
 def home() -> PartialMap:
-    """Two rooms and a door, in the middle of a larger grid."""
     state = np.full((90, 140), CellState.UNKNOWN, dtype=np.uint8)
     state[20:70, 20:120] = CellState.WALL
     state[21:69, 21:119] = CellState.FREE
@@ -29,20 +25,6 @@ def home() -> PartialMap:
 @pytest.fixture(scope="module")
 def exploration(home: PartialMap) -> Exploration:
     return explore_trajectory(home, range(0, 61, 10), 2)
-
-
-@pytest.fixture(scope="module")
-def last(exploration: Exploration) -> Axes:
-    """Panel of one drawing of the last step."""
-    return panels(plot_exploration(exploration.at((60,))))[0]
-
-
-@pytest.fixture(scope="module")
-def way(exploration: Exploration, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """One animation."""
-    path = tmp_path_factory.mktemp("way") / "way.gif"
-    animate_exploration(exploration, path)
-    return path
 
 
 def panels(figure: Figure) -> list:
@@ -62,20 +44,18 @@ class TestPlotExploration:
         assert len(np.unique(picture[hidden])) == len(np.unique(picture[unknown & ~hidden])) == 1
         assert 0 < picture[hidden][0, 0] < picture[unknown & ~hidden][0, 0] < 1
 
-    def test_the_way_ends_at_the_robot(self, exploration, last):
+    def test_the_way_ends_at_the_robot_and_its_view_in_the_room(self, home, exploration):
+        (last,) = panels(plot_exploration(exploration.at((60,))))
         way = next(line for line in last.lines if len(line.get_xdata()) == 61)
         assert np.array_equal(np.stack(way.get_data(), axis=1), exploration.poses[:, :2])
         robot = last.lines[-1]
         assert (robot.get_xdata()[0], robot.get_ydata()[0]) == tuple(exploration.poses[-1, :2])
         tip = robot.get_marker().vertices[0]
         assert np.degrees(np.arctan2(tip[1], tip[0])) % 360 == pytest.approx(exploration.poses[-1, 2])
-
-    def test_the_view_stays_in_the_room(self, home, exploration, last):
         (view,) = last.patches
         corners = view.get_xy()
         assert tuple(corners[0]) == tuple(exploration.poses[-1, :2])
         assert (home.state_at(corners) != CellState.UNKNOWN).all()
-        assert len(panels(plot_exploration(exploration.at((0,))))[0].patches) == 0
 
     def test_a_map_that_drifts_shows_both_ways(self, home):
         drifting = explore_trajectory(home, (40,), 2, sensor=SensorSettings(drift_m_per_m=0.05))
@@ -90,13 +70,17 @@ class TestPlotExploration:
 
     def test_many_moments_are_thinned(self, home):
         many = explore_trajectory(home, range(0, 40), 2)
-        titles = [panel.get_title() for panel in panels(plot_exploration(many))]
+        shown = panels(plot_exploration(many))
+        titles = [panel.get_title() for panel in shown]
         assert len(titles) == MAX_PANELS
-        assert titles[-1] == f"step 39: {many.observed_fractions[-1]:.0%} seen"
+        assert (titles[0], titles[-1]) == ("step 0: 0% seen", f"step 39: {many.observed_fractions[-1]:.0%} seen")
+        assert (len(shown[0].patches), len(shown[-1].patches)) == (0, 1)
 
 
 class TestAnimateExploration:
-    def test_frames(self, exploration, way):
+    def test_frames_and_colours(self, exploration, tmp_path):
+        way = tmp_path / "way.gif"
+        animate_exploration(exploration, way)
         with Image.open(way) as animation:
             assert animation.n_frames == len(exploration.steps)
             assert animation.info["loop"] == 0
@@ -106,13 +90,9 @@ class TestAnimateExploration:
                 pixels = np.asarray(animation.convert("RGB"))
                 fractions.append((pixels == 255).all(axis=2).mean())
             assert animation.info["duration"] > 1000
+            found = {colour for _, colour in animation.convert("RGB").getcolors(1 << 20)}
         assert fractions[0] < fractions[1] < fractions[-1]
         assert way.stat().st_size < 200_000
-
-    def test_its_colours_are_those_that_are_drawn(self, way):
-        with Image.open(way) as animation:
-            animation.seek(animation.n_frames - 1)
-            found = {colour for _, colour in animation.convert("RGB").getcolors(1 << 20)}
         assert {tuple(round(255 * value) for value in to_rgb(colour)) for colour in (BLUE, RED)} <= found
         view = 0.65 + 0.35 * np.array(to_rgb(YELLOW))
         assert min(np.abs(np.array(list(found)) - 255 * view).max(axis=1)) <= 2
@@ -120,12 +100,17 @@ class TestAnimateExploration:
     def test_equal_explorations_give_equal_bytes(self, exploration, tmp_path):
         names = [tmp_path / "first.gif", tmp_path / "again.GIF"]
         for name in names:
-            animate_exploration(exploration.at((60,)), name)
+            animate_exploration(exploration.at((0, 60)), name)
         assert names[0].read_bytes() == names[1].read_bytes()
-        with Image.open(names[1]) as animation:
-            assert (animation.format, animation.n_frames) == ("GIF", 1)
 
-    def test_another_suffix(self, exploration, tmp_path):
-        with pytest.raises(SettingsError, match=r"path = '.*way\.mp4' is not allowed: give a name that ends with"):
-            animate_exploration(exploration, tmp_path / "way.mp4")
+    @pytest.mark.parametrize(
+        ("given", "name", "message"),
+        [
+            (None, "way.mp4", r"path = '.*way\.mp4' is not allowed: give a name that ends with"),
+            ("exploration", "way.gif", "exploration = 'str' is not allowed: give what explore_trajectory"),
+        ],
+    )
+    def test_refused(self, exploration, tmp_path, given, name, message):
+        with pytest.raises(SettingsError, match=message):
+            animate_exploration(given or exploration, tmp_path / name)
         assert list(tmp_path.iterdir()) == []

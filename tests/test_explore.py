@@ -1,6 +1,5 @@
 import functools
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -10,11 +9,10 @@ from extruded import drawn
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from meshes import OBSERVED, room, scene_mesh, surface_m2
-from scipy.ndimage import distance_transform_edt
 from small_maps import HOUSE, VACUUM
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import Exploration, explore, explore_trajectory
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
@@ -171,13 +169,15 @@ def test_stages_do_not_depend_on_which_are_asked_for(home, sensor):
             ({"seed": seed}, r"seed = .* is not allowed: give a whole number of 0 or more\.")
             for seed in (-1, 0.5, "1", False)
         ),
+        ({"policy": "haste"}, "policy = 'haste' is not allowed: choose one of random, coverage"),
+        ({"policy": "coverage", "tx": (99.0, 0.0)}, "tx = .* is outside the map"),
         ({"sensor": 0.1}, r"sensor = 0\.1 is not allowed: give SensorSettings\(\.\.\.\), or None"),
         ({"home": "home.yaml"}, r"home is of type str: give a PartialMap, such as load_map returns\."),
         ({"home": plan("##\n?#")}, r"home has 0 free cells: .* give a map with free cells\."),
     ],
 )
 def test_refused(arguments, message):
-    with pytest.raises((SettingsError, MapError), match=message):
+    with pytest.raises(SionnaPartialError, match=message):
         explore(**{"home": plan(CLOSET), **arguments})
 
 
@@ -198,13 +198,11 @@ def test_observed_fractions_on_real_homes(homes, expected):
 
 
 class TestFractions:
-    """Stages by the observed fraction of the free area."""
-
     def test_each_is_reached_and_not_long_before(self, home):
-        exploration = explore_trajectory(home, (0, 0.25, 0.5, 0.75), 3)
+        exploration = explore_trajectory(home, (0, 0.25, 0.5), 3)
         assert exploration.steps[0] == 0
         for fraction, step, observed in zip(
-            (0.25, 0.5, 0.75), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
+            (0.25, 0.5), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
         ):
             assert observed >= fraction
             assert explore(home, (step - 1,), 3)[0].observed_fraction < fraction
@@ -255,11 +253,9 @@ class TestTrajectory:
         assert (some.steps, some.maps) == ((30,), exploration.maps[1:2])
         assert np.array_equal(some.poses, explore_trajectory(home, (30,), 3).poses)
         assert len(some.believed_poses) == 31
-
-    @pytest.mark.parametrize("steps", [(), (30, 31)])
-    def test_moments_that_are_not_there(self, exploration, steps):
-        with pytest.raises(SettingsError, match=r"steps = .* is not allowed: choose from the steps that were kept"):
-            exploration.at(steps)
+        for steps in ((), (30, 31)):
+            with pytest.raises(SettingsError, match=r"steps = .* is not allowed: choose from the steps that were kept"):
+                exploration.at(steps)
 
     def test_progress(self):
         reported = []
@@ -275,22 +271,15 @@ class TestSensor:
         first, later = explore_trajectory(home, (30, 60), 3, sensor=NOISY).states
         assert not ((first != CellState.UNKNOWN) & (later == CellState.UNKNOWN)).any()
 
-    def test_range_noise_blurs_walls_within_a_few_deviations(self, home):
-        (noisy,) = explore(home, (60,), 3, sensor=SensorSettings(range_noise_m=0.05))
-        off_m = distance_transform_edt(home.state != CellState.WALL)[noisy.state == CellState.WALL] * home.resolution_m
-        assert 0.1 < (off_m > 0).mean() < 0.9
-        assert off_m.max() < 0.3
-        assert np.quantile(off_m, 0.9) < 0.16
-
     def test_wall_noise_grows_with_range_noise(self, home):
-        noises_m = (0.0, 0.01, 0.02, 0.03, 0.05)
+        noises_m = (0.0, 0.02, 0.05)
         for drift in (0.0, 0.002):
             lidars = (SensorSettings(noise_m, drift, field_of_view_deg=360.0, range_m=12.0) for noise_m in noises_m)
             found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
             assert found == sorted(found), drift
             assert drift > 0.0 or found[0] <= LEAST_NOISE
-            assert found[2] > 0.5
-            assert found[-1] > found[2] + 0.02
+            assert found[1] > 0.5
+            assert found[2] > found[1] + 0.02
         assert home.wall_noise == 0.0
 
     @pytest.mark.parametrize("fusion", get_args(Fusion))
@@ -307,26 +296,7 @@ class TestSensor:
         assert error_m == pytest.approx(0.02 * travelled_m, abs=0.02)
         assert np.array_equal(exploration.believed_poses[:, 2], exploration.poses[:, 2])
 
-    def test_missed_walls_stay_unknown_and_hide_what_is_behind(self, home):
-        for fraction in (0.3, 1.0):
-            (partial,) = explore(home, (60,), 3, sensor=SensorSettings(missed_wall_fraction=fraction))
-            known = partial.state != CellState.UNKNOWN
-            assert (partial.state[known] == home.state[known]).all()
-            assert ((partial.state == CellState.WALL).sum() == 0) == (fraction == 1.0)
-
     def test_much_error_does_not_break_the_robot(self):
         for seed in range(4):
             maps = explore(plan(CLOSET), (50, 300), seed, sensor=SensorSettings(1.0, 1.0, 0.5))
             assert [partial.shape for partial in maps] == [(11, 18)] * 2
-
-    def test_a_wider_and_a_longer_view_show_more(self, home):
-        lidar = SensorSettings(field_of_view_deg=360.0)
-        start = explore_trajectory(home, (1,), 3, sensor=lidar)
-        assert start.sensor == lidar
-        narrow, wide, far = (
-            explore(home, (1,), 3, sensor=sensor)[0].state == CellState.FREE
-            for sensor in (None, lidar, replace(lidar, range_m=6.0))
-        )
-        assert narrow.sum() < 0.6 * wide.sum() < 0.6 * far.sum()
-        distances_m = np.hypot(*(np.argwhere(far)[:, ::-1] * home.resolution_m + home.origin_m - start.poses[0, :2]).T)
-        assert 3.2 < distances_m.max() < 6.0 + FORWARD_M + 0.1

@@ -40,15 +40,6 @@ def test_link_features_of_no_links():
     assert len(link_features(HALF, traced((1.5, 2.5, 1.5), np.zeros((0, 3))))) == 0
 
 
-def test_take_and_concatenate():
-    phi = phi_of(3)
-    assert phi.take(slice(1, 3)).distance_m.tolist() == [2.0, 3.0]
-    assert phi.take(np.array([True, False, True])).distance_m.tolist() == [1.0, 3.0]
-    joined = LinkFeatures.concatenate([phi.take(slice(0, 1)), phi.take(slice(1, 3))])
-    for field in dataclasses.fields(phi):
-        assert np.array_equal(getattr(joined, field.name), getattr(phi, field.name))
-
-
 def test_take_and_concatenate_with_context():
     phi = features(HALF, [(1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (3.0, 0.0, 0.0)], tx_m=(0.0, 0.0, 0.0))
     some = phi.take(np.array([2, 0]))

@@ -24,7 +24,6 @@ from sionna_partial.files import (
     atomic_write,
     lies_in,
     locked_folder,
-    output_path,
     read_bytes,
     require_writable,
     temporary_folder,
@@ -63,10 +62,7 @@ def test_only_small_regular_files_are_read(tmp_path: Path, name: str, message: s
 
 
 def test_paths_that_no_file_can_have(tmp_path: Path) -> None:
-    for name in ("a\0b.yaml", "a\ud800b.yaml"):
-        with pytest.raises(OutputError, match="is not a path: give the name of a file or folder"):
-            output_path(name)
-        assert not lies_in(tmp_path, name)
+    assert not any(lies_in(tmp_path, name) for name in ("a\0b.yaml", "a\ud800b.yaml"))
     (tmp_path / "loop").symlink_to("loop")
     assert lies_in(tmp_path, "loop")
 
@@ -102,14 +98,11 @@ def test_write_bytes_and_text(tmp_path: Path) -> None:
         assert not (tmp_path / "a.bin").exists()
     with atomic_write(tmp_path / "a.txt", "w") as stream:
         stream.write("20 °C\r\n")
-    assert tree(tmp_path) == {"a.bin": b"\x00\xff", "a.txt": "20 °C\r\n".encode()}
-
-
-def test_write_makes_parents_and_replaces(tmp_path: Path) -> None:
     for content in (b"first", b"second"):
-        with atomic_write(tmp_path / "new" / "deep" / "a.bin") as stream:
+        with atomic_write(tmp_path / "new" / "a.bin") as stream:
             stream.write(content)
-    assert tree(tmp_path) == {"new": None, "new/deep": None, "new/deep/a.bin": b"second"}
+    found = {"a.bin": b"\x00\xff", "a.txt": "20 °C\r\n".encode(), "new": None, "new/a.bin": b"second"}
+    assert tree(tmp_path) == found
 
 
 def test_files_have_the_usual_permissions(tmp_path: Path) -> None:
@@ -151,26 +144,11 @@ def test_failure_of_the_caller_leaves_nothing_and_passes_through(tmp_path: Path,
     assert tree(tmp_path) == {"a.bin": b"old"}
 
 
-def test_full_device(tmp_path: Path) -> None:
-    """A write to /dev/full fails as one to a full disk does."""
-    message = r"path = '.*out/a\.nc' could not be written \(No space left on device\): the disk is full"
-    with (  # noqa: PT012
-        pytest.raises(OutputError, match=message),
-        atomic_path(tmp_path / "out" / "a.nc") as temporary,
-    ):
-        temporary.symlink_to("/dev/full")
-        temporary.write_bytes(b"some")
-    assert tree(tmp_path) == {}
-
-
 @pytest.mark.parametrize(
     ("number", "remedy"),
     [
         (errno.ENOSPC, "the disk is full; free some space or choose another disk."),
-        (errno.EDQUOT, "your quota is used up; free some space or choose another disk."),
         (errno.EACCES, "choose a folder that you may write to, or change its permissions."),
-        (errno.EPERM, "choose a folder that you may write to, or change its permissions."),
-        (errno.EROFS, "this disk is read-only; choose a folder on another one."),
         (errno.EIO, "check the path and the disk."),
     ],
 )
@@ -207,11 +185,7 @@ IN_THE_WAY = [
         (require_writable, name, "a part of the path is a file; choose another folder")
         for name in ("file", "file/deep")
     ),
-    (
-        require_writable,
-        "/proc/new",
-        r"path = '/proc/new' could not be .* \(No such file.*: nothing can be made there; choose",
-    ),
+    (require_writable, "/proc/new", r"'/proc/new' could not be .* \(No such file.*: nothing can be made there; choose"),
 ]
 """Functions that write, names, and what is said about them."""
 
@@ -286,7 +260,6 @@ def test_failed_scene_leaves_what_was(tmp_path: Path, existing: bool) -> None:
 
 @pytest.mark.parametrize("failing", range(6))
 def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failing: int) -> None:
-    """Whichever of the six moves fails, the old scene is back."""
     write_scene(tmp_path, b"old ")
     moves, move = [], os.replace
 
@@ -303,7 +276,7 @@ def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert tree(tmp_path) == scene_tree(b"old ")
 
 
-@pytest.mark.parametrize("path", [5, None, b"a.bin", "a\0.bin"])
+@pytest.mark.parametrize("path", [5, None, b"a.bin", "a\0.bin", "a\ud800b.yaml"])
 def test_what_is_no_path_is_named(tmp_path: Path, path: object) -> None:
     message = re.escape(f"path = {path!r} is not a path: give the name of a file or folder.")
     for write in (atomic_path, atomic_write, atomic_folder, atomic_files):

@@ -99,18 +99,6 @@ def test_diffraction_is_on_for_plans_and_off_for_meshes(tmp_path: Path) -> None:
         assert (8 in links.interactions) is diffracts
 
 
-def test_parts_of_a_mesh_have_their_own_materials() -> None:
-    floor, rest = box((0, 0, -0.1), (5, 4, 0)), box((0, 0, 2.9), (5, 4, 3))
-    mesh = trimesh.util.concatenate([floor, rest])
-    metal, glass = sp.Material(itu="metal"), sp.Material(relative_permittivity=1.0001, conductivity_s_m=0.0)
-    parts = SceneMesh(mesh.vertices, mesh.faces, np.repeat([0, 1], 12), (metal, glass))
-    partial = mesh_map(parts, MeshReading(resolution_m=0.1))
-    settings = all_paths(max_depth=1, samples_per_tx=20_000)
-    links = sp.trace_links(partial, (1.0, 2.0, 1.0), [[4.0, 2.0, 1.0]], trace_settings=settings)
-    strength = {round(z, 1): abs(a) for a, (_, _, z) in zip(links.a[1:], links.vertices_m[1:, 0], strict=True)}
-    assert strength[0.0] > 100 * strength[2.9]
-
-
 def test_materials_of_a_mesh_must_cover_the_frequency() -> None:
     solid = box((0, 0, 0), (5, 4, 3))
     ground = SceneMesh(solid.vertices, solid.faces, np.zeros(12, int), (sp.Material(itu="wet_ground"),))

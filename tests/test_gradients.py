@@ -129,11 +129,6 @@ class TestGainGradients:
         assert not all_slopes(found)[:, 0].any()
         assert all_slopes(found)[:, 1].all()
 
-    def test_no_receivers(self) -> None:
-        found = gain_gradients(FIELD, TX, [])
-        assert found.tx_db_per_m.shape == (0, 3)
-        assert all(getattr(found, name).shape == (0,) for name in ("gain_db", "link_state", *SLOPES[1:]))
-
     def test_progress_rises_to_one(self) -> None:
         calls: list[tuple[float, str]] = []
         gain_gradients(small_room(), TX_M, RX_M, trace_settings=SETTINGS, progress=lambda *call: calls.append(call))

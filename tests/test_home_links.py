@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from link_tables import assert_same, make_table
 
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
-from sionna_partial.datasets.shards import LinkTable, stage_name
+from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, stage_name, write_shard
 from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
@@ -45,22 +45,25 @@ def table(home: PartialMap) -> LinkTable:
 
 
 class TestPlaces:
-    def test_counts(self, table: LinkTable) -> None:
+    def test_counts(self, home: PartialMap, table: LinkTable) -> None:
+        """Every stage has the same links and truth; receivers outside are in outage."""
         assert len(table) == 2 * 31 * 3
         assert set(table.home) == {"two rooms"}
+        assert table.take(slice(3)).complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
+        first = table.take(table.stage == 0)
         for stage in SETTINGS.stages:
             here = table.take(table.stage == stage)
             assert (here.anywhere.sum(), (~here.anywhere).sum()) == (31, 31)
             _, counts = np.unique(here.context.tx_m, axis=0, return_counts=True)
             assert sorted(counts) == [20, 20, 22]
-
-    def test_every_stage_has_the_same_links_and_truth(self, table: LinkTable) -> None:
-        first, *others = (table.take(table.stage == stage) for stage in SETTINGS.stages)
-        for other in others:
             for name in ("link_state", "gain_db", "inside", "anywhere"):
-                np.testing.assert_array_equal(getattr(other, name), getattr(first, name))
-            np.testing.assert_array_equal(other.context.tx_m, first.context.tx_m)
-            np.testing.assert_array_equal(other.context.rx_m, first.context.rx_m)
+                np.testing.assert_array_equal(getattr(here, name), getattr(first, name))
+            np.testing.assert_array_equal(here.context.tx_m, first.context.tx_m)
+            np.testing.assert_array_equal(here.context.rx_m, first.context.rx_m)
+        outside = first.take(~first.inside)
+        assert len(outside)
+        assert (outside.link_state == LinkState.OUTAGE).all()
+        assert (outside.gain_db == GAIN_FLOOR_DB).all()
 
     def test_where_they_are(self, home: PartialMap, table: LinkTable) -> None:
         state = home.state_at(table.context.rx_m)
@@ -95,6 +98,25 @@ class TestPlaces:
                 assert len(distance_m) == 30
                 assert 15 <= (distance_m <= near_m).sum() < 30
 
+    def test_impulse_responses(self, home: PartialMap, table: LinkTable, tmp_path: Path) -> None:
+        write_shard(home_links(home, "two rooms", replace(SETTINGS, cir_paths=400)), tmp_path / "home.parquet", {})
+        found = read_shard(tmp_path / "home.parquet")
+        np.testing.assert_array_equal(found.gain_db, table.gain_db)
+        assert table.cir == {}
+        real, imaginary, delay_s = (found.cir[name] for name in CIR)
+        power = real.astype(float) ** 2 + imaginary.astype(float) ** 2
+        has_path = found.gain_db > GAIN_FLOOR_DB
+        np.testing.assert_allclose(10 * np.log10(power.sum(axis=1)[has_path]), found.gain_db[has_path], atol=0.2)
+        np.testing.assert_array_equal(np.isnan(delay_s), power == 0.0)
+        assert (np.diff(power, axis=1) <= 1e-6 * power[:, :1]).all()
+        assert not power[~has_path].any()
+        in_sight = found.link_state == LinkState.LOS
+        distance_m = np.nanmin(delay_s[in_sight], axis=1) * SPEED_OF_LIGHT_M_S
+        np.testing.assert_allclose(distance_m, found.features.distance_m[in_sight], rtol=1e-5)
+        few = LinkTable.concatenate([found.take(slice(3)), found.take([0])])
+        np.testing.assert_array_equal(few.cir[CIR[2]], delay_s[[0, 1, 2, 0]])
+        assert LinkTable.concatenate([found, table]).cir == {}
+
     def test_stages_by_observed_fraction(self, home: PartialMap) -> None:
         table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))
         assert np.unique(table.stage).tolist() == [0.0, 0.3, 0.6]
@@ -111,20 +133,6 @@ class TestTruthAndFeatures:
             links = trace_links(home, tx, mine.context.rx_m, trace_settings=SETTINGS.trace)
             np.testing.assert_array_equal(mine.link_state, links.link_state)
             np.testing.assert_allclose(mine.gain_db, links.gain_db, atol=1e-3)
-
-    def test_outside_is_outage(self, table: LinkTable) -> None:
-        outside = table.take(~table.inside)
-        assert len(outside)
-        assert (outside.link_state == LinkState.OUTAGE).all()
-        assert (outside.gain_db == GAIN_FLOOR_DB).all()
-
-    def test_nothing_is_seen_at_stage_0(self, table: LinkTable) -> None:
-        here = table.take(table.stage == 0)
-        assert not here.context.tx_seen.any()
-        assert not here.context.rx_seen.any()
-        assert not here.observed_fraction.any()
-        assert (here.phi.link_state == LinkState.LOS).all()
-        np.testing.assert_allclose(here.phi.unobserved_distance_m, here.phi.distance_m)
 
     def test_features_are_those_of_the_partial_map(self, home: PartialMap, table: LinkTable) -> None:
         assert_same(home_links(home, "two rooms", SETTINGS), table)
@@ -149,10 +157,6 @@ class TestTruthAndFeatures:
                 for name in names:
                     np.testing.assert_array_equal(getattr(found, name), getattr(expected, name), err_msg=name)
 
-    def test_complete_map_comes_along(self, home: PartialMap, table: LinkTable) -> None:
-        assert table.complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
-        assert table.take(slice(3)).complete_maps == table.complete_maps
-
 
 class TestSeeds:
     @pytest.mark.parametrize(("name", "seed"), [("other", 0), ("two rooms", 1)])
@@ -161,21 +165,18 @@ class TestSeeds:
         assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
 
     def test_sensor_is_that_of_the_settings(self, home: PartialMap, table: LinkTable) -> None:
-        sensor = SensorSettings(field_of_view_deg=360.0, range_m=20.0)
-        far = home_links(home, "two rooms", replace(SETTINGS, sensor=sensor))
-        assert (far.observed_fraction >= table.observed_fraction).all()
-        assert (far.observed_fraction > table.observed_fraction).any()
-
-    def test_places_are_not_where_errors_put_walls(self, home: PartialMap) -> None:
-        sensor = SensorSettings(range_noise_m=0.1, drift_m_per_m=0.1)
-        wrong = home_links(home, "two rooms", replace(SETTINGS, sensor=sensor))
-        area = map_area(home, SETTINGS.margin_m)
+        """Positions are not where errors put walls."""
+        far = replace(SETTINGS, sensor=SensorSettings(field_of_view_deg=360.0, range_m=20.0))
+        seen = home_links(home, "two rooms", far).observed_fraction
+        assert (seen >= table.observed_fraction).all()
+        assert (seen > table.observed_fraction).any()
+        wrong = home_links(home, "two rooms", replace(SETTINGS, sensor=SensorSettings(0.1, 0.1)))
         for number, partial in enumerate(wrong.maps):
             here = wrong.map_index == number
             for places_m in (wrong.context.tx_m[here], wrong.context.rx_m[here]):
                 assert (partial.state_at(places_m) != CellState.WALL).all()
         walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.maps])
-        assert (walls & (area.state == CellState.FREE)).any()
+        assert (walls & (map_area(home, SETTINGS.margin_m).state == CellState.FREE)).any()
 
     def test_mixed_sensors_are_drawn_by_name_and_seed(self) -> None:
         settings = replace(SETTINGS, sensor="mixed")
@@ -191,7 +192,7 @@ class TestSeeds:
             assert np.ptp(values) > 0.5 * (high - low), name
         assert home_sensor("home 0", SETTINGS) == SETTINGS.sensor
 
-    def test_size_of_the_grid_is_of_no_account(self, table: LinkTable) -> None:
+    def test_size_of_the_grid_is_of_no_account(self, home: PartialMap, table: LinkTable) -> None:
         moved = two_rooms((200, 300), (120, 44))
         shift = (np.array([44, 120]) - [3, 2]) * 0.1
         moved = replace(moved, origin_m=tuple(np.array(moved.origin_m) - shift))
@@ -199,20 +200,12 @@ class TestSeeds:
         np.testing.assert_allclose(other.context.rx_m, table.context.rx_m, atol=1e-9)
         np.testing.assert_array_equal(other.link_state, table.link_state)
         np.testing.assert_array_equal(other.context.rx_seen, table.context.rx_seen)
-
-
-class TestMapArea:
-    @pytest.mark.parametrize("margin_m", [0.0, 0.25, 3.0])
-    def test_known_cells_and_a_margin(self, margin_m: float) -> None:
-        home = two_rooms()
-        area = map_area(home, margin_m)
-        cells = round(np.ceil(margin_m / 0.1))
-        assert area.shape == (42 + 2 * cells, 62 + 2 * cells)
-        known = np.argwhere(area.state != CellState.UNKNOWN)
-        assert known.min() == cells
-        rows, columns = np.indices(area.shape)
-        centres = np.stack([columns, rows], axis=-1) * 0.1 + 0.05 + area.origin_m
-        np.testing.assert_array_equal(home.state_at(centres), area.state)
+        for margin_m, cells in ((0.0, 0), (0.25, 3), (3.0, 30)):
+            area = map_area(home, margin_m)
+            assert area.shape == (42 + 2 * cells, 62 + 2 * cells)
+            rows, columns = np.indices(area.shape)
+            centres = np.stack([columns, rows], axis=-1) * 0.1 + 0.05 + area.origin_m
+            np.testing.assert_array_equal(home.state_at(centres), area.state)
 
 
 class TestRefused:
@@ -268,16 +261,14 @@ def maps(tmp_path: Path) -> Path:
 
 def test_seeds() -> None:
     assert home_sources(range(3, 5)) == [HomeSource("make_home(3)", 3), HomeSource("make_home(4)", 4)]
-    assert home_sources([3])[0].record == {"name": "make_home(3)", "seed": 3}
-    assert home_sources([3])[0].load() == make_home(3)
-
-
-def test_seeds_of_a_kind() -> None:
-    (hall,) = home_sources([(3, "hall")])
-    assert hall == HomeSource("make_home(3, hall)", 3, "hall")
-    assert hall.record == {"name": "make_home(3, hall)", "seed": 3, "kind": "hall"}
-    assert hall.load() == make_home(3, "hall")
     assert home_sources([(3, None)]) == home_sources([3])
+    for home, name, record in (
+        (3, "make_home(3)", {"seed": 3}),
+        ((3, "hall"), "make_home(3, hall)", {"seed": 3, "kind": "hall"}),
+    ):
+        (source,) = home_sources([home])
+        assert source.record == {"name": name, **record}
+        assert source.load() == make_home(*np.atleast_1d(np.array(home, dtype=object)))
 
 
 def test_folder_of_maps(maps: Path) -> None:
@@ -294,13 +285,6 @@ def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPat
     assert home_sources(["picture.png"])[0].name == "picture"
 
 
-@pytest.mark.parametrize("twice", [[3, 3], ["house", "house/map.yaml"]])
-def test_one_name_twice(maps: Path, monkeypatch: pytest.MonkeyPatch, twice: list[int | str]) -> None:
-    monkeypatch.chdir(maps)
-    with pytest.raises(MapError, match=r"two homes are called '.*', .* and .*: leave one out, or rename"):
-        home_sources(twice)
-
-
 @pytest.mark.parametrize(
     ("homes", "message"),
     [
@@ -309,6 +293,10 @@ def test_one_name_twice(maps: Path, monkeypatch: pytest.MonkeyPatch, twice: list
         ([(3, "castle")], "kind = 'castle' is not allowed"),
         (["empty"], r"empty' holds no map: give a folder with maps \(\.yaml, \.yml, \.npz\), or with"),
         (["nowhere"], "nowhere' is not there: give complete maps"),
+        *(
+            (twice, r"two homes are called '.*', .* and .*: leave one out, or rename")
+            for twice in ([3, 3], ["house", "house/map.yaml"])
+        ),
         *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5, None)),
     ],
 )

@@ -67,7 +67,7 @@ ROOMS = {
     "training": ("predictor", "paths", "walls"),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "reports"),
-    "app": ("jobs", "files", "drawing", "radio", "project", "answer", "session", "picture", "page", "server"),
+    "app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }

@@ -72,25 +72,6 @@ def gains_db(power, crossed_m):
 
 
 class TestPaths:
-    @pytest.mark.parametrize(
-        ("rx", "vertices", "crossed_m"),
-        [
-            (NEAR, [(3.0, 4.0, 1.5)], 0.0),
-            (NEAR, [(9.5, 2.5, 1.5)], 8.0),  # there and back through four unknown cells
-            (NEAR, [(6.5, 2.5, 1.5)], 3.0),
-            (FAR, [(9.5, 2.5, 1.5)], 4.0 + 1.5),
-            (FAR, [(3.5, 2.5, 1.5), (2.5, 2.5, 1.5)], 2.5),
-            (FAR, [(6.5, 2.5, 1.5), (3.5, 2.5, 1.5), (6.5, 2.5, 1.5), (2.5, 2.5, 1.5)], 3 * 1.5 + 1.5 + 2.5),
-            (FAR, [(3.5, 2.5, 0.0)], 2.5 * math.hypot(4.0, 1.5) / 4.0),  # on the floor
-            (FAR, [(5.5, 4.0, 1.5)], math.hypot(4.0, 1.5) / 8.0 + math.hypot(2.0, 1.5)),
-        ],
-        ids=str,
-    )
-    def test_unobserved_length_of_one_path_by_hand(self, rx, vertices, crossed_m):
-        found = of_paths((0.01, vertices), rx=rx)
-        assert found.strongest_unobserved_m == pytest.approx([crossed_m], abs=1e-9)
-        assert found.indirect_gain_db[0] == pytest.approx(gains_db([1e-4], [crossed_m]), abs=1e-9)
-
     def test_direct_path_is_left_out(self):
         bounced = (1e-4, [(6.5, 2.5, 1.5)])
         found, without = of_paths((0.5, []), bounced, rx=NEAR), of_paths(bounced, rx=NEAR)
@@ -98,22 +79,10 @@ class TestPaths:
         assert without.straight_gain_db == [GAIN_FLOOR_DB]
         assert same(dataclasses.replace(found, straight_gain_db=without.straight_gain_db), without)
 
-    @pytest.mark.parametrize("paths", [[], [(0.5, [])]])
-    @pytest.mark.parametrize("partial", [HALF, WHOLE])
-    def test_no_path_but_the_direct_one(self, paths, partial):
-        found = of_paths(*paths, partial=partial)
-        assert found.indirect_gain_db.tolist() == [[GAIN_FLOOR_DB] * len(ATTENUATION_LENGTHS_M)]
-        assert found.strongest_unobserved_m.tolist() == [6.0]
-
     def test_rounding_at_the_border_of_the_unknown_hides_no_path(self):
         found = of_paths((0.01, [(5.0 + 1e-5, 2.5, 1.5)]), rx=NEAR)
         assert found.indirect_gain_db[0, -1] == pytest.approx(-40.0)
         assert of_paths((0.01, [(5.01, 2.5, 1.5)]), rx=NEAR).indirect_gain_db[0, -1] == GAIN_FLOOR_DB
-
-    def test_on_a_complete_map_every_reach_is_the_same(self):
-        found = of_paths((0.01, [(9.5, 2.5, 1.5)]), (0.02, [(12.0, 9.0, 1.5)]), partial=WHOLE)
-        assert found.indirect_gain_db[0] == pytest.approx([10 * math.log10(5e-4)] * len(ATTENUATION_LENGTHS_M))
-        assert found.strongest_unobserved_m.tolist() == [0.0]
 
     def test_on_a_complete_map_paths_between_unknown_cells_are_unobserved(self):
         """Their vertices are on known walls, from which nothing unknown can be reached."""
@@ -166,13 +135,6 @@ class TestLinks:
         assert both.rx_m.tolist() == [list(rx) for rx in self.RXS] * 2
         assert len(both) == 6
 
-    @pytest.mark.parametrize("tx", [TX, TXS])
-    def test_no_receivers(self, tx):
-        found = link_context(HALF, traced(tx, []))
-        assert len(found) == 0
-        assert found.indirect_gain_db.shape == (0, len(ATTENUATION_LENGTHS_M))
-        assert found.tx_seen.shape == found.complete.shape == (0,)
-
     def test_with_the_direct_path_it_is_the_gain_of_the_trace(self):
         partial = room(0.5, unknown_from=7)
         rx = np.array([(1.2, 1.4, 1.5), (3.1, 0.9, 1.2), (4.2, 1.6, 1.5)])
@@ -198,15 +160,6 @@ def context_of(count=3, partial=HALF, tx=TX, rx=NEAR):
 
 
 class TestTakeAndConcatenate:
-    @pytest.mark.parametrize("index", [slice(1, 3), np.array([2, 0]), np.array([True, False, True])], ids=str)
-    def test_take(self, index):
-        links = features(HALF, (NEAR, FAR, NEAR), unobserved_m=[0.0, 2.5, 0.0], indirect_db=-80.0).context
-        some = links.take(index)
-        assert some.strongest_unobserved_m.tolist() == links.strongest_unobserved_m[index].tolist()
-        assert some.rx_seen.tolist() == links.rx_seen[index].tolist()
-        assert some.windows is links.windows
-        assert len(some) == 2
-
     def test_windows_are_shared(self):
         one, two = context_of(2), context_of(3, partial=WHOLE)
         both = LinkContext.concatenate([one, two, one.take(slice(1)), two.take(np.array([2]))])

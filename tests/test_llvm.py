@@ -144,18 +144,6 @@ def test_library_is_loaded_once_and_named_for_dr_jit() -> None:
     assert int(library.version.partition(".")[0]) >= llvm.OLDEST_MAJOR
 
 
-def test_library_of_pip_is_taken_by_its_real_file() -> None:
-    source, path = run_python(TRY).split(maxsplit=1)
-    assert source == "karellen-llvm-core"
-    assert Path(path.strip()).is_file()
-    assert not Path(path.strip()).is_symlink()
-
-
-def test_child_process_takes_the_library_of_its_parent() -> None:
-    path = str(load_llvm().path)
-    assert run_python(TRY, **{llvm.PATH_VARIABLE: path}) == f"{llvm.PATH_VARIABLE} {path}\n"
-
-
 def test_folder_named_coverage_is_not_the_library_that_numba_looks_for(tmp_path: Path) -> None:
     (tmp_path / "coverage").mkdir()
     assert output(run("import sionna_partial, numba", "print(numba.__name__)", folder=tmp_path)) == "numba\n"
@@ -212,25 +200,21 @@ class TestNamedByTheUser:
     def test_missing_file(self, name: str) -> None:
         assert "No such file" in self.refusal(name)
 
-    def test_pipe(self, tmp_path: Path) -> None:
-        os.mkfifo(tmp_path / "libLLVM.so")
-        assert "it is no file" in self.refusal(str(tmp_path / "libLLVM.so"))
+    def test_files_of_other_kinds(self, tmp_path: Path) -> None:
+        import _ctypes
+
+        pipe, text = tmp_path / "libLLVM.so", tmp_path / "libLLVM-99.so"
+        os.mkfifo(pipe)
+        text.write_bytes(b"not really a library")
+        messages = {pipe: "it is no file", text: "file too short", _ctypes.__file__: "it is no LLVM of version 17 or"}
+        for path, message in messages.items():
+            assert message in self.refusal(str(path))
 
     @pytest.mark.parametrize("path", OLD_LIBRARIES, ids=lambda path: path.name)
     def test_old_library_is_refused_before_it_aborts(self, path: Path) -> None:
         if not path.exists():
             pytest.skip(f"{path} is not on this machine")
         assert "it is no LLVM of version 17 or newer" in self.refusal(str(path))
-
-    def test_file_that_is_no_library(self, tmp_path: Path) -> None:
-        path = tmp_path / "libLLVM-99.so"
-        path.write_bytes(b"not really a library")
-        assert "file too short" in self.refusal(str(path))
-
-    def test_library_of_another_kind(self) -> None:
-        import _ctypes
-
-        assert "it is no LLVM of version 17 or newer" in self.refusal(_ctypes.__file__)
 
 
 def test_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -17,6 +17,7 @@ from hypothesis.extra.numpy import array_shapes, arrays
 from meshes import OBSERVED, room, surface_m2
 from small_maps import HOUSE
 
+import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
@@ -40,7 +41,7 @@ partials = st.builds(
 SMALL = PartialMap(np.array([[0, 1], [2, 0]]), 0.05, (1.5, -2.0), 2.5, 3)
 
 
-@pytest.mark.parametrize("suffix", [".YAML", ".npz"])
+@pytest.mark.parametrize("suffix", [".yml", ".NPZ"])
 @settings(max_examples=40)
 @given(partial=partials)
 def test_round_trip(tmp_path_factory: pytest.TempPathFactory, suffix: str, partial: PartialMap) -> None:
@@ -49,12 +50,6 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, suffix: str, parti
     assert load_map(folder / f"home{suffix}") == partial
     assert load_map(f"{folder}/home{suffix}", wall_height_m=4.0) == replace(partial, wall_height_m=4.0)
     assert len(list(folder.iterdir())) == (1 if "NPZ" in suffix.upper() else 2)
-
-
-@pytest.mark.parametrize("suffix", [".yaml", ".yml", ".NPZ"])
-def test_other_suffixes(tmp_path: Path, suffix: str) -> None:
-    save_map(SMALL, tmp_path / f"home{suffix}")
-    assert load_map(tmp_path / f"home{suffix}") == SMALL
 
 
 def test_what_is_not_written(tmp_path: Path) -> None:
@@ -77,7 +72,6 @@ def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> N
 
 
 def export(folder: Path, image: str = "map.pgm") -> Path:
-    """Write what load_map needs of an exported scene."""
     save_map(SMALL, folder / "map.yaml", extra={"scene_offset": [1.0, 2.0]})
     (folder / "scene.xml").write_text("<scene/>")
     sheet = yaml.safe_load((folder / "map.yaml").read_text())
@@ -114,20 +108,9 @@ def two_scenes(folder: Path) -> None:
             for image in ("../map.pgm", "/etc/map.pgm", "meshes/../../map.pgm")
         ),
         (link_to_the_outside, "", rf"image = 'map\.pgm' {OUTSIDE}"),
-        (
-            lambda folder: (folder / "scene.xml").unlink(),
-            "",
-            "is no scene: it has 0 .xml files; give the path of one, or",
-        ),
+        (lambda folder: (folder / "scene.xml").unlink(), "", "is no scene: it has 0 .xml files; give the path of one"),
         (two_scenes, "", r"is no scene: it has 2 .xml files; give the path of one, or a ROS map YAML"),
-        *(
-            (
-                lambda folder: (folder / "map.yaml").unlink(),
-                name,
-                r"scene.xml' holds no shape: give a Mitsuba scene with",
-            )
-            for name in ("", "scene.xml")
-        ),
+        (lambda folder: (folder / "map.yaml").unlink(), "", "scene.xml' holds no shape: give a Mitsuba scene with"),
         *(
             (lambda folder: None, f"sub/{name}", NOT_THERE)
             for name in ("gone.yaml", "gone.npz", "gone", "gone.xml", "a" * 300, "a\0b", "a\ud800b", "")
@@ -138,7 +121,6 @@ def two_scenes(folder: Path) -> None:
                 ("map.png", r"is a bare image without resolution and origin: give its YAML, .*map.yaml'"),
                 ("map.dae", r"map\.dae' is of no known kind: give a ROS map YAML"),
                 ("coverage.nc", "is a coverage, no map: give the map that it was computed from"),
-                ("coverage.tif", "is a coverage, no map: give the map that it was computed from"),
             )
         ),
     ],
@@ -150,9 +132,8 @@ def test_refused(tmp_path: Path, spoil: Callable[[Path], object], name: str, mes
 
 
 def test_arguments_of_another_type(tmp_path: Path) -> None:
-    for path in (None, SMALL):
-        with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
-            load_map(path)  # type: ignore[arg-type]
+    with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
+        load_map(SMALL)  # type: ignore[arg-type]
     with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
         load_map(tmp_path, strict=1)  # type: ignore[arg-type]
 
@@ -220,9 +201,7 @@ def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> 
 def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     save_map(SMALL, tmp_path / "home.npz")
     folder = export(tmp_path / "scene")
-    with pytest.raises(
-        MapError, match=r"resolution_m is for scans, drawings, .* alone, but path = '.*home.npz' is none: leave"
-    ):
+    with pytest.raises(MapError, match=r"resolution_m is for scans, .* alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
     with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its"):
         load_map(folder, up="z")
@@ -252,14 +231,10 @@ DAMAGED = "is damaged or was not written by save_map"
         *(
             (npz_bytes(**WHOLE | changes), message)
             for changes, message in (
-                ({"resolution_m": [0.1, 0.2]}, DAMAGED),
                 ({"state": np.array([[None]])}, DAMAGED),
-                ({"interior_cells": "many"}, DAMAGED),
                 ({"material": "brick"}, DAMAGED),
                 ({"resolution_m": 50.0}, "resolution_m = 50.0 is not allowed"),
                 ({"origin_m": (np.nan, 0.0)}, "origin_m = nan is not allowed"),
-                ({"origin_m": (0.0, 0.0, 0.0)}, "origin_m = "),
-                ({"wall_height_m": -1.0}, "wall_height_m = -1.0 is not allowed"),
                 ({"state": np.array([[7]])}, "values 7 to 7"),
             )
         ),
@@ -318,9 +293,6 @@ def test_occupancy_grid() -> None:
     assert partial.origin_m == (1.0, 2.0)
     tight = map_from_occupancy(np.array(data, np.int16), 0.1, occupied_percent=50, free_percent=0)
     assert tight.state.tolist() == [[2, 0, 2], [2, 1, 1], [1, 1, 2]]
-    flat = np.array([-1, 0, 100], dtype=np.int8)
-    assert map_from_occupancy(flat.reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
-    assert map_from_occupancy(flat.view(np.uint8).reshape(1, 3), 0.1).state.tolist() == [[2, 0, 1]]
 
 
 def test_habitat_with_border() -> None:
@@ -347,15 +319,7 @@ def test_habitat_drawings() -> None:
     assert state.tolist() == [[0, 2, 0, 0, 2, 0, 0, 0, 0, 0]]
 
 
-@given(arrays(np.uint8, (6, 7), elements=st.integers(0, 2)), arrays(bool, (6, 7)))
-def test_habitat_zero_is_never_free_and_hidden_never_free(top_down: np.ndarray, seen: np.ndarray) -> None:
-    state = np.flipud(map_from_habitat(top_down, seen, 0.1).state)
-    assert ((state == FREE) == (seen & (top_down == 1))).all()
-    assert (state[~seen & (top_down != 0)] == UNKNOWN).all()
-
-
 def test_slam_channels() -> None:
-    """An obstacle that was not explored is unknown; row 0 is the smallest y."""
     obstacle, explored = [[0.0, 0.9, 0.9], [0.5, 0.49, 0.0]], [[1.0, 1.0, 0.2], [0.5, 0.6, 0.49]]
     partial = map_from_slam(obstacle, explored, 0.05, origin_m=(-1.0, -2.0), wall_height_m=2.0)
     assert partial == PartialMap(np.array([[0, 1, 2], [1, 0, 2]]), 0.05, (-1.0, -2.0), 2.0)
@@ -364,52 +328,27 @@ def test_slam_channels() -> None:
     assert booleans.state.tolist() == [[WALL, UNKNOWN, FREE]]
 
 
-FUNCTIONS = {
-    "array": map_from_array,
-    "occupancy": map_from_occupancy,
-    "habitat": map_from_habitat,
-    "slam": map_from_slam,
-}
-
-
 @pytest.mark.parametrize(
     ("kind", "arrays", "options", "message"),
     [
         ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
-        ("array", ([["wall"]],), {}, "array = [['wall']] is not numeric: give integers"),
-        ("array", ([[None]],), {}, "array has dtype float64: give integers"),
-        ("array", ([[0, 1], [0]],), {}, "array = [[0, 1], [0]] is not numeric: give integers, in a two-dimensional"),
-        ("array", ([0, 1],), {}, "array has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
         ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
-        ("array", (np.zeros((0, 2), int),), {}, "array has shape (0, 2): give a two-dimensional array"),
-        ("array", (3,), {}, "array has shape (): give a two-dimensional array"),
         ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
-        ("array", ([[-1, 0]],), {}, "values -1 to 0: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
         ("array", ([[-1, 0, 100]],), {}, "UNKNOWN 2, or map_from_occupancy for -1 to 100 percent."),
         ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
-        ("occupancy", ([[-2]],), {}, "data holds -2: give -1 for unknown"),
-        ("occupancy", ([[0.5]],), {}, "data has dtype float64: give integers"),
         ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
-        ("occupancy", ([[0]],), {"free_percent": -1}, "free_percent = -1 and occupied_percent = 65 are not allowed"),
         ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
         ("occupancy", ([[0]],), {"occupied_percent": 0.65, "free_percent": 0.25}, "such as 25 and 65"),
         ("slam", ([[0]], [[1]]), {"threshold": "0.5"}, "threshold = '0.5' is not allowed"),
         ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
-        ("habitat", ([[True]], [[1]]), {}, "top_down has dtype bool: give integers"),
-        ("habitat", ([[1]], [[0.5]]), {}, "fog_of_war has dtype float64: give integers"),
         ("habitat", ([[1, -1]], [[1, 1]]), {}, "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
-        ("habitat", ([[1, 256]], [[1, 1]]), {}, "top_down holds values 1 to 256: give Habitat's map, 0 to 255"),
-        ("slam", ([[0, 1]], [[1]]), {}, "explored has shape (1, 1) and obstacle (1, 2): give arrays of one shape"),
         ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
-        ("slam", ([[0]], [[255]]), {}, "explored holds values outside [0, 1] (or NaN): give probabilities or booleans"),
-        ("slam", ([["a"]], [[1]]), {}, "obstacle = [['a']] is not numeric: give numbers"),
         ("slam", ([[0]], [[1]]), {"threshold": 0.0}, "threshold = 0.0 is not allowed: give a number in (0, 1]"),
-        ("slam", ([[0]], [[1]]), {"threshold": np.nan}, "threshold = nan is not allowed"),
     ],
 )
 def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, float], message: str) -> None:
     with pytest.raises(MapError, match=re.escape(message)):
-        FUNCTIONS[kind](*arrays, 0.05, **options)  # type: ignore[operator]
+        getattr(sp, f"map_from_{kind}")(*arrays, 0.05, **options)
 
 
 @pytest.mark.parametrize("folder", ["gibson", "ros", None])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 from extruded import blocks_of
-from mesh_rays import TURN, joined, load_meshes, opaque, shapes_of
+from mesh_rays import TURN, load_meshes, opaque, shapes_of
 from numpy.typing import NDArray
 
 from sionna_partial.settings import TraceSettings
@@ -94,36 +94,8 @@ class TestBox:
         for k, lengths in enumerate(by_receiver(found, lengths_m(found, tx, rx), len(rx))):
             np.testing.assert_allclose(lengths, image_distances_m(RX[k], 4), atol=1e-5)
 
-    def test_no_reflection_is_line_of_sight(self, tmp_path: Path) -> None:
-        box = trimesh.creation.box(SIZE)
-        found = candidates_of(load_meshes(tmp_path, box), [box], TX, RX, depth=0, rays=100)
-        assert found.rx.tolist() == list(range(len(RX)))
-        assert (found.face == -1).all()
-        assert found.face.shape == (len(RX), 1)
-
 
 class TestRoom:
-    def test_candidates_obey_the_law_of_reflection(self, scene: Any) -> None:
-        found = candidates_of(scene, room(), TX, RX)
-        vertices, triangles = joined(*room())
-        normal = trimesh.Trimesh(vertices, triangles, process=False).face_normals
-        chosen = (found.face >= 0).sum(axis=1) == 3
-        assert chosen.sum() > 500
-        face, points = found.face[chosen], found.vertices_m[chosen]
-        np.testing.assert_allclose(((points - vertices[triangles[face, 0]]) * normal[face]).sum(axis=2), 0.0, atol=1e-9)
-        ends = RX[found.rx[chosen]][:, None]
-        legs = np.diff(np.concatenate([np.broadcast_to(TX, ends.shape), points, ends], axis=1), axis=1)
-        legs /= np.linalg.norm(legs, axis=2, keepdims=True)
-        mirrored = legs[:, :-1] - 2.0 * (legs[:, :-1] * normal[face]).sum(axis=2)[:, :, None] * normal[face]
-        np.testing.assert_allclose(legs[:, 1:], mirrored, atol=1e-6)
-
-    def test_no_chain_twice_and_each_in_one_piece(self, scene: Any) -> None:
-        found = candidates_of(scene, room(), TX, RX)
-        assert len(np.unique(np.column_stack([found.rx, found.face]), axis=0)) == len(found.rx)
-        flat = np.isclose(found.vertices_m[:, 0, 2], -1.5)
-        floor = flat & (found.face[:, 0] >= 0) & (found.face[:, 1] < 0)
-        assert np.ptp(np.flatnonzero(floor)) == floor.sum() - 1
-
     def test_a_receiver_has_its_candidates_whoever_is_beside(self, scene: Any) -> None:
         crowd = np.random.default_rng(2).uniform(-0.45 * SIZE, 0.45 * SIZE, (3000, 3))
         whole = candidates_of(scene, room(), TX, crowd)
@@ -156,7 +128,3 @@ class TestOpenMesh:
         np.testing.assert_array_equal(reflected[~near], inside[~near])
         assert (found.face[:, 1] == -1).all()
         assert np.bincount(found.rx).tolist() == (1 + reflected.astype(int)).tolist()
-
-    def test_without_rays_there_is_line_of_sight(self) -> None:
-        kind = MeshReflections(opaque(self.TRIANGLE), TX, RX, TraceSettings(max_depth=2), [])
-        assert [part.rx.tolist() for part, _ in blocks_of(kind.listed(np.zeros(len(RX))))] == [list(range(len(RX)))]

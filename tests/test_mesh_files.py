@@ -39,7 +39,6 @@ TO_Y_UP = [[1, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]]
 
 
 def written(folder: Path, suffix: str, scene: trimesh.Scene | None = None) -> Path:
-    """Write the room as a mesh file."""
     scene = scene or room()
     if suffix in ("glb", "gltf"):
         scene.apply_transform(TO_Y_UP)
@@ -155,10 +154,8 @@ def test_every_truncation(tmp_path: Path, suffix: str) -> None:
     ("z", "last", "message"),
     [
         ("nan", 3, r"vertices_m\[1\] = \(nan, nan, nan\) is not allowed: give finite numbers of metres"),
-        ("inf", 3, "is not allowed: give finite numbers of metres"),
         ("1e30", 3, "is not allowed: give finite numbers of metres, at most 1e"),
         ("0", 4, r"has a triangle with vertex 4, but 4 vertices: export the mesh again"),
-        ("0", -1, r"has a triangle with vertex -1, but 4 vertices: export the mesh again"),
     ],
 )
 def test_wrong_vertices(tmp_path: Path, z: str, last: int, message: str) -> None:
@@ -172,8 +169,8 @@ def test_wrong_vertices(tmp_path: Path, z: str, last: int, message: str) -> None
     ("suffix", "old", "new", "message"),
     [
         ("ply", "3 0 2 3\n", "", "it announces 6 vertices, faces and others, and has 5"),
+        ("ply", "3 0 2 3\n", "2 0 2\n", "it announces 2 faces, and has 1"),
         ("ply", "face 2", "face 4", "it announces 8 vertices, faces and others, and has 6"),
-        ("ply", "face 2", "face 1", "it announces 5 vertices, faces and others, and has 6"),
         ("stl", "endsolid", "", "it ends before its endsolid"),
     ],
 )
@@ -188,13 +185,10 @@ def test_cut_text(tmp_path: Path, suffix: str, old: str, new: str, message: str)
         read_mesh(path)
 
 
-def test_points_alone(tmp_path: Path) -> None:
+def test_no_surface(tmp_path: Path) -> None:
     trimesh.PointCloud(np.eye(3)).export(tmp_path / "points.ply")
     with pytest.raises(MapError, match="holds 0 triangles: give a mesh with surfaces, not points or lines alone"):
         read_mesh(tmp_path / "points.ply")
-
-
-def test_degenerate_triangles_alone(tmp_path: Path) -> None:
     (tmp_path / "room.obj").write_text("v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n")
     with pytest.raises(MapError, match=r"room.obj' holds degenerate triangles alone: give a mesh with surfaces, in"):
         read_mesh(tmp_path / "room.obj")

@@ -20,7 +20,6 @@ CONCRETE = Material(itu="concrete")
 
 
 def scene(folder: Path, content: str) -> Path:
-    """Write a scene file, and a box beside it."""
     (folder / "meshes").mkdir(exist_ok=True)
     box((0, 0, 0), (5, 4, 3)).export(folder / "meshes" / "box.ply")
     path = folder / "any.xml"
@@ -41,10 +40,8 @@ def moved(*steps: str) -> str:
     ("name", "triangles", "materials"),
     [
         ("box", 12, {"metal"}),
-        ("floor_wall", 4, {"concrete", "brick"}),
         ("simple_wedge", 4, {"concrete"}),
         ("simple_street_canyon", 74, {"glass", "wood", "marble", "brick", "concrete"}),
-        ("simple_street_canyon_with_cars", 234, {"glass", "wood", "marble", "brick", "concrete", "metal"}),
     ],
 )
 def test_scenes_of_sionna(name: str, triangles: int, materials: set[str]) -> None:
@@ -102,9 +99,7 @@ def test_other_materials_are_those_of_the_settings(tmp_path: Path) -> None:
     [
         ([], (0, 0, 0), (5, 4, 3)),
         (['<translate x="1" z="-2"/>'], (1, 0, -2), (6, 4, 1)),
-        (['<translate value="1, 2, 3"/>'], (1, 2, 3), (6, 6, 6)),
         (['<scale value="2"/>'], (0, 0, 0), (10, 8, 6)),
-        (['<scale y="2"/>'], (0, 0, 0), (5, 8, 3)),
         (['<rotate z="2" angle="90"/>'], (-4, 0, 0), (0, 5, 3)),
         (['<rotate value="1 0 0" angle="90"/>'], (0, -3, 0), (5, 0, 4)),
         (['<translate x="1"/>', '<scale value="2"/>'], (2, 0, 0), (12, 8, 6)),
@@ -132,7 +127,6 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
     [
         ("", "holds no shape: give a Mitsuba scene with meshes"),
         ('<include filename="/etc/passwd"/>' + shape("cube"), "has an <include>, which is not followed: put"),
-        ('<path value="/etc"/>' + shape("cube"), "has an <path>, which is not followed"),
         (shape("sphere") + shape("disk"), "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba"),
         (RADIO + shape("obj"), "shape 'it' has the filename '', which is not allowed: put it into"),
         (shape("cube"), "shape 'it' refers to 'wall', which is no bsdf of the scene: add it, or correct the id"),
@@ -146,30 +140,14 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
             RADIO + shape("cube", moved("").replace("to_world", "toWorld")),
             "<shape> 'it' has the property 'toWorld', which is not read: give the names of Mitsuba 3 (filename, to_wor",
         ),
-        (
-            '<bsdf type="radio-material" id="a"><float name="relativePermittivity" value="2"/></bsdf>' + shape("cube"),
-            "<bsdf> 'a' has the property 'relativePermittivity', which is not read: give the names of Mitsuba 3 (type,",
-        ),
         (RADIO + shape("cube", moved('<translate X="1"/>')), "has a to_world with <translate {'X': '1'}>, which"),
         (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
         (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
-        (RADIO + shape("cube", moved('<rotate x="1"/>')), "has a to_world with <rotate {'x': '1'}>, which cannot"),
-        (RADIO + shape("cube", moved('<matrix value="1 2"/>')), "has a to_world with <matrix {'value': '1 2'}>, which"),
-        (
-            RADIO + shape("cube", moved('<scale value="nan"/>')),
-            "which cannot be read (a transform is not finite): ",
-        ),
-        (
-            RADIO + shape("cube", moved('<scale value="0"/>')),
-            "which cannot be read (it flattens the shape): ",
-        ),
+        (RADIO + shape("cube", moved('<scale value="nan"/>')), "cannot be read (a transform is not finite): "),
+        (RADIO + shape("cube", moved('<scale value="0"/>')), "which cannot be read (it flattens the shape): "),
         (
             RADIO + shape("cube", moved('<matrix value="1 0 0 0  0 1 0 0  0 0 1 0  0.1 0 0 1"/>')),
             "which cannot be read (a transform is projective, with the last row [0.1, 0.0, 0.0, 1.0]): give matrix",
-        ),
-        (
-            RADIO + shape("cube", moved('<matrix value="1 0 0 0  0 1 0 0  0 0 1 0  0 0 0 2"/>')),
-            "a transform is projective, with the last row [0.0, 0.0, 0.0, 2.0]",
         ),
     ],
 )
@@ -224,12 +202,9 @@ def test_other_shapes_than_exported(tmp_path: Path) -> None:
     ("record", "offset_m"),
     [
         (None, [0, 0, 0]),
-        ({}, [0, 0, 0]),
-        ({"height_range": [0, 1], "materials": ["concrete"]}, [0, 0, 0]),
         ({"height_range": [0, 1], "materials": [{"itu": "cheese"}]}, [0, 0, 0]),
         ({"height_range": [0], "materials": []}, [0, 0, 0]),
         ({"height_range": [0, 1], "materials": [None]}, [0, 0]),
-        ({"height_range": [0, 1], "materials": [None]}, None),
     ],
 )
 def test_damaged_entry_of_an_exported_mesh(tmp_path: Path, record: dict | None, offset_m: list[float] | None) -> None:  # type: ignore[type-arg]

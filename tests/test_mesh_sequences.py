@@ -65,12 +65,6 @@ class TestShootRays:
         stock = mi.warp.square_to_uniform_sphere(fibonacci_lattice(2000)).numpy().T
         np.testing.assert_allclose(rays.direction[:, 0], stock, atol=1e-6)
 
-    def test_an_empty_scene_stops_no_ray(self, tmp_path: Path) -> None:
-        assert (shoot(tmp_path).face == -1).all()
-
-    def test_one_ray(self, tmp_path: Path) -> None:
-        assert shoot(tmp_path, trimesh.creation.box((8, 6, 3)), count=1, max_depth=2).face.shape == (1, 2)
-
     def test_parts_join_to_the_same_bytes(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         box = trimesh.creation.box((8, 6, 3))
         whole = shoot(tmp_path, box)

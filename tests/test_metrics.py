@@ -3,9 +3,8 @@ import math
 
 import numpy as np
 import pytest
-from predictor_links import LOS, NLOS, OUTAGE, make_links, p_kept, true_gain
+from predictor_links import LOS, NLOS, OUTAGE, make_links
 
-from sionna_partial.constants import LinkState
 from sionna_partial.evaluation import (
     CONFIDENCE_BINS,
     DEFINITIONS,
@@ -39,18 +38,6 @@ def drawn(count, seed=0, narrow=1.0):
     return answer, state, mean_db + narrow * std_db * rng.normal(size=count)
 
 
-def the_model():
-    """Links of the tests' model, and its true distribution as the prediction."""
-    phi, state, gain_db = make_links(40_000, seed=3)
-    kept, partial = p_kept(phi), phi.link_state
-    other = np.where(partial == OUTAGE, NLOS, OUTAGE)
-    probabilities = np.array([kept * (partial == each) + (1.0 - kept) * (other == each) for each in LinkState])
-    (los_db, los_std_db), (nlos_db, nlos_std_db) = (true_gain(phi, np.full(len(phi), each)) for each in (LOS, NLOS))
-    means_db = np.stack([np.full(len(phi), -150.0), los_db, nlos_db])
-    stds_db = np.stack([np.zeros(len(phi)), los_std_db, nlos_std_db])
-    return LinkPrediction.of_parts(probabilities, means_db, stds_db), state, gain_db
-
-
 class TestMeasure:
     def test_by_hand(self):
         answer = prediction([0.5, 0.1, 0.0], [0.3, 0.7, 0.2], [0.2, 0.2, 0.8])
@@ -72,31 +59,14 @@ class TestMeasure:
         assert one == other
         assert one["rmse_db"] == 0.0
 
-    @pytest.mark.parametrize("links", [lambda: drawn(40_000), the_model])
-    def test_one_that_knows_the_model_is_calibrated(self, links):
-        found = measure(*links())
+    def test_one_that_knows_the_model_is_calibrated(self):
+        found = measure(*drawn(40_000))
         assert found.calibration_error < 0.015
         assert found.coverage_90 == pytest.approx(0.9, abs=0.006)
-
-    def test_likelihood_is_that_of_the_model_on_average(self):
-        answer, state, gain_db = drawn(100_000)
-        p = np.array([answer.p_outage, answer.p_los, answer.p_nlos])
-        entropy = -(p * np.log(p)).sum(axis=0).mean()
-        gain = sum(
-            p[state].mean() * np.log(std * math.sqrt(2 * math.pi * math.e)) for state, std in ((1, 2.0), (2, 8.0))
-        )
-        found = measure(answer, state, gain_db)
-        assert found.nll_state == pytest.approx(entropy, abs=0.01)
-        assert found.nll == pytest.approx(entropy + gain, abs=0.02)
 
     def test_too_narrow_and_too_wide_intervals_are_told(self):
         assert measure(*drawn(20_000, narrow=2.0)).coverage_90 < 0.86
         assert measure(*drawn(20_000, narrow=0.3)).coverage_90 > 0.93
-
-    def test_overconfidence_is_told(self):
-        confident = prediction(np.full(1000, 0.05), np.full(1000, 0.9), np.full(1000, 0.05))
-        state = np.where(np.arange(1000) < 600, LOS, NLOS).astype(np.uint8)
-        assert measure(confident, state, np.full(1000, -60.0)).calibration_error == pytest.approx(0.3)
 
     def test_a_trace_has_no_interval(self):
         phi, state, gain_db = make_links(500)
@@ -131,11 +101,6 @@ class TestMeasure:
 
 
 class TestPitShares:
-    LEVELS = np.linspace(0.0, 1.0, 11)
-
-    def test_calibrated_answers_return_the_levels(self):
-        np.testing.assert_allclose(pit_fractions(*drawn(100_000), self.LEVELS), self.LEVELS, atol=0.005)
-
     def test_an_outage_is_spread_over_its_probability(self):
         answer, state = prediction([0.4], [0.6], [0.0]), np.array([OUTAGE], dtype=np.uint8)
         found = pit_fractions(answer, state, np.array([-150.0]), np.array([0.1, 0.2, 0.4, 0.9]))
@@ -163,9 +128,6 @@ class TestReliability:
         assert found.error == pytest.approx(2 / 3 * 0.1)
         assert len(found.links) == CONFIDENCE_BINS
 
-    def test_no_links(self):
-        assert math.isnan(reliability(prediction([], [], []), np.zeros(0, dtype=np.uint8)).error)
-
 
 class TestCalibration:
     def test_histogram_is_flat_when_calibrated(self):
@@ -173,3 +135,4 @@ class TestCalibration:
         assert found.gain_pit.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(found.gain_pit, 1.0 / PIT_BINS, atol=0.004)
         assert found.state.error < 0.01
+        assert math.isnan(reliability(prediction([], [], []), np.zeros(0, dtype=np.uint8)).error)

@@ -1,5 +1,6 @@
 """Wall outlines: literal tiny maps, synthetic nasty maps, properties; and staircases."""
 
+import functools
 from itertools import pairwise
 from pathlib import Path
 
@@ -22,12 +23,10 @@ from sionna_partial.settings import SceneSettings
 SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 
 
-def drawn(text: str, resolution_m: float = 0.05) -> PartialMap:
-    return extruded.drawn(text, resolution_m)
+drawn = functools.partial(extruded.drawn, resolution_m=0.05)
 
 
 def in_cells(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
-    """Segments (S, 2, 2) in cells."""
     return np.round(outlines.vertices_m / partial.resolution_m, 4)[outlines.segments]
 
 
@@ -37,12 +36,10 @@ def segment_set(partial: PartialMap, **options: float) -> set[tuple[tuple[float,
 
 
 def path(*points: tuple[float, float]) -> set[tuple[tuple[float, ...], ...]]:
-    """Segments of a polyline."""
     return {tuple(sorted(pair)) for pair in pairwise(points)}
 
 
 def ring(x0: float, y0: float, x1: float, y1: float) -> set[tuple[tuple[float, ...], ...]]:
-    """Segments of a rectangle."""
     return path((x0, y0), (x1, y0), (x1, y1), (x0, y1), (x0, y0))
 
 
@@ -73,7 +70,6 @@ def ragged_room(seed: int, thickness: int, fraction: float) -> PartialMap:
 
 
 def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
-    """Largest distance of an outline point from the next WALL cell centre [cells]."""
     row, column = np.nonzero(partial.state == CellState.WALL)
     pairs = in_cells(partial, outlines)
     fraction = np.linspace(0.0, 1.0, 401)[:, None, None]
@@ -82,15 +78,10 @@ def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
 
 
 def distances_from_outlines(partial: PartialMap, outlines: Outlines) -> NDArray[np.float64]:
-    """Distances of the WALL cells that touch FREE ones from the next outline [cells]."""
     wall = partial.state == CellState.WALL
     row, column = np.nonzero(wall & ndimage.binary_dilation(partial.state == CellState.FREE))
     lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, outlines)))
     return np.asarray(shapely.distance(lines, shapely.points(column + 0.5, row + 0.5)))
-
-
-def farthest_from_outlines(partial: PartialMap, outlines: Outlines) -> float:
-    return float(distances_from_outlines(partial, outlines).max())
 
 
 def kept_regions(partial: PartialMap, outlines: Outlines, scale: int = 5) -> int:
@@ -110,7 +101,6 @@ def kept_regions(partial: PartialMap, outlines: Outlines, scale: int = 5) -> int
 
 
 def lines_of(outlines: Outlines) -> int:
-    """Number of lines that the segments make where they meet."""
     lines = shapely.union_all(shapely.linestrings(outlines.vertices_m[outlines.segments]))
     return shapely.get_num_geometries(shapely.line_merge(lines))
 
@@ -176,7 +166,7 @@ def test_tolerance_zero_keeps_every_corner() -> None:
 
 def test_only_the_layer_that_faces_free_cells_was_seen() -> None:
     for behind in ("########", "?##?#?#?", "????????"):
-        partial = drawn(f"???????????? ??{behind}?? ??########?? ............", 0.05)
+        partial = drawn(f"???????????? ??{behind}?? ??########?? ............")
         assert segment_set(partial) == {((2.0, 1.5), (10.0, 1.5))}
 
 
@@ -239,7 +229,7 @@ def test_joints_are_closed(text: str) -> None:
 )
 def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float) -> None:
     """A gap that is too long, or across which FREE cells were seen; where it is unknown, walls reach its border."""
-    partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m)
+    partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m=resolution_m)
     first, last = row.index("#"), row.rindex("#")
     opening = row.strip(".").replace("?", ".").split(".")
     left, right = first + len(opening[0]) - 1, last - len(opening[-1]) + 1
@@ -253,13 +243,12 @@ def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float)
 @pytest.mark.parametrize("cells", [1, 5, 6])
 def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None:
     wall = f"....####{'?' * cells}####...."
-    partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", 0.1)
+    partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", resolution_m=0.1)
     assert len(wall_outlines(partial).segments) == (1 if cells <= 5 else 2)
 
 
 @pytest.mark.parametrize("cells", [1, 3, 5])
 def test_gap_around_a_corner_is_closed(cells: int) -> None:
-    """Both walls end before they meet: the line between their ends."""
     size = 16
     state = np.full((size, size), CellState.FREE, dtype=np.uint8)
     state[0], state[:, 0] = CellState.UNKNOWN, CellState.UNKNOWN
@@ -283,7 +272,7 @@ def test_unobserved_regions_become_no_walls() -> None:
         ................................??
         ##################################
         """,
-        0.1,
+        resolution_m=0.1,
     )
     outlines = wall_outlines(partial)
     assert len(outlines.segments) == 6
@@ -318,28 +307,7 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         found = np.degrees(np.arctan2(end[1] - start[1], end[0] - start[0]))
         assert abs((found - angle_deg + 90) % 180 - 90) < 0.6
         assert 97 < np.hypot(*(end - start)) < 101
-        assert farthest_from_outlines(partial, outlines) < 0.8
-
-
-@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 4), (17, 6), (45, 4), (45, 6)])
-def test_thick_tilted_wall_has_few_segments(angle_deg: float, thickness: float) -> None:
-    partial = tilted(angle_deg, thickness, 0.2)
-    outlines = wall_outlines(partial)
-    assert 4 <= len(outlines.segments) <= 8
-    assert_sound(outlines)
-
-
-@pytest.mark.parametrize(
-    ("thickness", "fraction"), [(1, 0.0), (1, 0.2), (2, 0.05), (3, 0.2), (5, 0.0), (5, 0.05), (5, 0.2)]
-)
-def test_ragged_rooms_keep_their_regions(thickness: int, fraction: float) -> None:
-    partial = ragged_room(7, thickness, fraction)
-    outlines = wall_outlines(partial)
-    assert_sound(outlines)
-    assert kept_regions(partial, outlines) == 2
-    assert farthest_from_walls(partial, outlines) < 1.6
-    assert farthest_from_outlines(partial, outlines) < 2.3
-    assert len(outlines.segments) < 70 + 900 * fraction
+        assert distances_from_outlines(partial, outlines).max() < 0.8
 
 
 def noisy_plan(thickness: int, fraction: float, around: float) -> PartialMap:
@@ -374,7 +342,7 @@ def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: 
     assert 8 <= len(outlines.segments) <= most
     assert kept_regions(partial, outlines, scale=3) > 0
     assert farthest_from_walls(partial, outlines) < 2.0
-    assert farthest_from_outlines(seen_from_inside(partial), outlines) < 3.5
+    assert distances_from_outlines(seen_from_inside(partial), outlines).max() < 3.5
 
 
 def seen_from_inside(partial: PartialMap) -> PartialMap:
@@ -385,7 +353,6 @@ def seen_from_inside(partial: PartialMap) -> PartialMap:
 
 
 def test_niche_of_a_clean_wall_stays() -> None:
-    """One recess is no raggedness: the outline keeps its corners and stays parallel to the axes."""
     wall = np.zeros((12, 70), dtype=bool)
     wall[2:7, 5:65] = True
     wall[5:7, 30:40] = False
@@ -455,7 +422,6 @@ def random_state(seed: int, kind: str) -> NDArray[np.uint8]:
 def test_outlines_turn_and_move_with_the_map(
     seed: int, kind: str, orientation: tuple[bool, int, int], origin: float, padding: tuple[int, int, int, int]
 ) -> None:
-    """A map that is turned, mirrored, moved and padded has the same outlines, turned, mirrored, moved."""
     state = random_state(seed, kind)
     assume(not any(np.array_equal(transformed(state, *other), state) for other in SYMMETRIES))
     here = wall_outlines(PartialMap(state, 0.05))
@@ -470,31 +436,13 @@ def test_outlines_turn_and_move_with_the_map(
 
 
 def test_map_that_is_its_own_mirror_image_has_sound_outlines() -> None:
-    """Of two equal choices one is taken; a plain room needs none."""
     partial = ragged_room(5, 3, 0.2)
     quarter = partial.state[:70, :70]
     quarter = np.where(quarter < quarter.T, quarter, quarter.T)
     half = np.concatenate([quarter, quarter[::-1]])
     whole = PartialMap(np.concatenate([half, half[:, ::-1]], axis=1), 0.05)
     assert_sound(wall_outlines(whole))
-    room = drawn("######## #......# #......# #......# #......# #......# #......# ########")
-    corners = in_cells(room, wall_outlines(room)).reshape(-1, 2)
-    for orientation in SYMMETRIES:
-        assert (transformed(whole.state, *orientation) == whole.state).all()
-        turned = transformed_points(corners, (8, 8), *orientation)
-        assert {tuple(p) for p in turned.tolist()} == {tuple(p) for p in corners.tolist()}
-
-
-def test_large_warehouse_is_quick_and_few() -> None:
-    """A hall of 50 x 30 m with racks at 0.03 m, unknown all around."""
-    state = np.full((1200, 1870), CellState.UNKNOWN, dtype=np.uint8)
-    state[96:1104, 96:1774] = CellState.WALL
-    state[100:1100, 100:1770] = CellState.FREE
-    for row in range(200, 1000, 100):
-        for column in range(200, 1400, 370):
-            state[row : row + 33, column : column + 300] = CellState.WALL
-    outlines = wall_outlines(PartialMap(state, 0.03))
-    assert len(outlines.segments) == 4 + 4 * 8 * 4
+    assert all((transformed(whole.state, *orientation) == whole.state).all() for orientation in SYMMETRIES)
 
 
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")
@@ -513,35 +461,16 @@ def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        pytest.param("....... .#####. .......", path((1.5, 1.5), (5.5, 1.5)), id="lying"),
-        pytest.param("... .#. .#. .#. ...", path((1.5, 1.5), (1.5, 3.5)), id="upright"),
-        pytest.param(
-            "....... ...###. .###... .......", path((1.5, 1.5), (3.5, 1.5), (3.5, 2.5), (5.5, 2.5)), id="tilted"
-        ),
         pytest.param(
             "....... ....##. .###... .......", path((1.5, 1.5), (3.5, 1.5), (4.5, 2.5), (5.5, 2.5)), id="corner touch"
         ),
-        pytest.param("..... .#... ..#.. ...#. .....", path((1.5, 3.5), (3.5, 1.5)), id="diagonal"),
         pytest.param("##. #.. ...", path((0.5, 1.5), (0.5, 2.5), (1.5, 2.5)), id="no diagonal where edges touch"),
-        pytest.param("##### #...# #...# #####", ring(0.5, 0.5, 4.5, 3.5), id="room"),
         pytest.param(".#. #.# .#.", path((0.5, 1.5), (1.5, 2.5), (2.5, 1.5), (1.5, 0.5), (0.5, 1.5)), id="diamond"),
         pytest.param(
             "##### ..#.. ..#..", path((0.5, 2.5), (2.5, 2.5), (4.5, 2.5)) | path((2.5, 0.5), (2.5, 2.5)), id="junction"
         ),
-        *[
-            pytest.param("###### " * rows, ring(0.5, 0.5, 5.5, rows - 0.5), id=f"{rows} cells thick")
-            for rows in (2, 3, 5)
-        ],
+        pytest.param("###### ###### ######", ring(0.5, 0.5, 5.5, 2.5), id="thick"),
         pytest.param("... .#. ...", ring(1.0, 1.0, 2.0, 2.0), id="lone cell"),
-        *[
-            pytest.param(
-                f"....... .##{gap}##. .......",
-                path((1.5, 1.5), (2.5, 1.5)) | path((4.5, 1.5), (5.5, 1.5)),
-                id=f"gap {gap}",
-            )
-            for gap in ".?"
-        ],
-        pytest.param(".... ....", set(), id="no wall"),
     ],
 )
 def test_staircases(text: str, expected: set[tuple[tuple[float, ...], ...]]) -> None:
@@ -560,14 +489,9 @@ def random_map(seed: int, ny: int, nx: int, fraction: float) -> PartialMap:
 
 @settings(max_examples=60, deadline=None)
 @given(MAPS)
-def test_staircases_are_sound(case: tuple[int, int, int, float]) -> None:
-    assert_sound(lattice_outlines(random_map(*case)))
-
-
-@settings(max_examples=60, deadline=None)
-@given(MAPS)
 def test_where_two_segments_meet_one_ends_the_other_begins_and_they_turn(case: tuple[int, int, int, float]) -> None:
     outlines = lattice_outlines(random_map(*case))
+    assert_sound(outlines)
     count = len(outlines.vertices_m)
     begins, ends = (np.bincount(outlines.segments[:, side], minlength=count) for side in (0, 1))
     two = begins + ends == 2

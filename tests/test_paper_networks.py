@@ -24,16 +24,8 @@ from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import (
-    GAIN_INPUTS,
     GAIN_NETWORKS,
-    OUTPUT_WIDTHS,
-    assemble,
-    evaluate_paper,
     free_space_gain_db,
-    import_keras,
-    network_ranges,
-    own_input,
-    parts,
 )
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
@@ -52,27 +44,21 @@ def test_free_space():
     np.testing.assert_allclose(found, [-21.391, -21.391, -61.391, -67.412], atol=2e-3)
 
 
-@pytest.mark.parametrize(
-    ("name", "inputs", "units"),
-    [
+def test_gain_networks_are_the_papers(quick):
+    """The table of the paper: inputs and hidden units by name; each row once."""
+    for name, inputs, units in (
         ("gain_los_given_los", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
         ("gain_los_given_nlos_outage", ["distance_m"], 10),
         ("gain_nlos_given_nlos_outage", ["distance_m", "unobserved_distance_m", "gain_db"], 20),
         ("gain_nlos_given_los", ["distance_m"], 10),
-    ],
-)
-def test_gain_network_is_that_of_the_table(quick, name, inputs, units):
-    network = quick.model.get_layer(name)
-    assert list(network.input) == inputs
-    assert network.output.shape == (None, 2)
-    dense = [layer for layer in network.layers if type(layer).__name__ == "Dense"]
-    hidden, heads = dense[:2], dense[2:]
-    assert [layer.kernel.shape for layer in hidden] == [(len(inputs), units), (units, units)]
-    assert [layer.activation.__name__ for layer in hidden] == ["relu", "relu"]
-    assert [layer.kernel.shape for layer in heads] == [(units, 1), (units, 1)]
-
-
-def test_rows_cover_the_table_once():
+    ):
+        network = quick.model.get_layer(name)
+        assert list(network.input) == inputs
+        assert network.output.shape == (None, 2)
+        dense = [layer for layer in network.layers if type(layer).__name__ == "Dense"]
+        kernels = [(len(inputs), units), (units, units), (units, 1), (units, 1)]
+        assert [layer.kernel.shape for layer in dense] == kernels
+        assert [layer.activation.__name__ for layer in dense[:2]] == ["relu", "relu"]
     served = [(row.link_state, partial) for row in GAIN_NETWORKS for partial in row.partial_states]
     assert sorted(served) == [(state, partial) for state in (LOS, NLOS) for partial in LinkState]
 
@@ -101,44 +87,6 @@ def test_sane_far_beyond_the_training_links(quick, partial_state):
         for gain_db in (-150.0, -40.0, 1e300):
             states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
             assert_valid(quick.predict(LinkFeatures(states, fraction * distance_m, distance_m, gains_db)))
-
-
-def times(factor, name):
-    """Return a network that multiplies five numbers."""
-    keras = import_keras()
-    position = keras.Input((5,), name="five")
-    return keras.Model(position, keras.layers.Rescaling(factor, name="times")(position), name=name)
-
-
-@pytest.fixture(scope="module")
-def model(quick):
-    """The networks of the paper, and others, put together."""
-    factors = {"twice": 2.0, "never": 0.0, "once": 1.0, "double": 2.0}
-    return assemble(parts(quick.model) | {name: times(factor, name) for name, factor in factors.items()})
-
-
-class TestAssemble:
-    def test_others_have_inputs_and_outputs_of_their_own(self, model):
-        others = ["double", "never", "once", "twice"]
-        assert own_input("double") == "input_of_double"
-        assert list(model.input) == [*GAIN_INPUTS, *map(own_input, others)]
-        assert list(model.output) == [*OUTPUT_WIDTHS, *others] == list(parts(model))
-        inputs = {name: np.ones((3, 1), dtype=np.float32) for name in GAIN_INPUTS}
-        inputs |= {own_input(name): np.full((3, 5), number, dtype=np.float32) for number, name in enumerate(others)}
-        outputs = model(inputs)
-        for name, expected in {"double": 0.0, "never": 0.0, "once": 2.0, "twice": 6.0}.items():
-            np.testing.assert_array_equal(outputs[name], np.full((3, 5), expected))
-        np.testing.assert_array_equal(parts(model)["double"](np.ones((2, 5))), np.full((2, 5), 2.0))
-
-    def test_evaluation_of_the_papers_leaves_others_out(self, quick, model):
-        phi = make_links(30, seed=3)[0]
-        alone, found = (evaluate_paper(parts(each), phi, 28e9) for each in (quick.model, model))
-        for one, other in zip(alone, found, strict=True):
-            np.testing.assert_array_equal(one, other)
-
-    def test_ranges_are_those_of_the_papers_in_their_order(self, quick, model):
-        assert network_ranges(model) == network_ranges(quick.model)
-        assert list(network_ranges(model)) == list(OUTPUT_WIDTHS)
 
 
 @pytest.fixture(scope="module")
@@ -172,17 +120,6 @@ def test_same_training_same_weights_whatever_the_gain_of_outages(quick):
         not np.array_equal(one, other)
         for one, other in zip(quick.model.get_weights(), other_seed.model.get_weights(), strict=True)
     )
-
-
-@pytest.mark.parametrize("partial_state", LinkState)
-def test_line_of_sight_fades_with_distance_like_free_space(trained, partial_state):
-    distance_m = np.geomspace(0.1, 60.0, 60)
-    free_db = free_space_gain_db(distance_m, FREQUENCY_HZ)
-    traced_db = free_db if partial_state == LOS else np.full(60, -150.0)
-    phi = LinkFeatures(np.full(60, partial_state), np.zeros(60), distance_m, traced_db)
-    answer = trained.predict(phi)
-    assert np.abs(answer.gain_los_mean_db - free_db).max() < 6.0
-    assert np.diff(answer.gain_los_mean_db[::4]).max() < 0.0
 
 
 def test_cells_without_links_fall_back_to_prior_knowledge():

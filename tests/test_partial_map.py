@@ -32,37 +32,13 @@ def test_state_is_a_read_only_copy() -> None:
         partial.state[0, 0] = WALL
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        PartialMap(np.full((3, 4), 1), 0.5, (10.0, -4.0), 2.5),
-        PartialMap(PLAN.state, 0.25, (10.0, -4.0), 2.5),
-        PartialMap(PLAN.state, 0.5, (10.0, -4.5), 2.5),
-        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.4),
-        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5, 2),
-        PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5, material=Material()),
-        "a text",
-    ],
-)
-def test_equality(other: object) -> None:
-    assert PartialMap(PLAN.state, 0.5, (10.0, -4.0), 2.5) == PLAN
-    assert other != PLAN
-
-
-def test_ragged_state_is_refused() -> None:
-    with pytest.raises(MapError, match=r"state = .* is not numeric: give CellState integers"):
-        PartialMap([[0], [0, 1]], 0.1)  # type: ignore[arg-type]
-
-
-def test_cell_index() -> None:
-    points = np.array(
-        [[10.0, -4.0, 1.5], [10.49, -3.51, 9.0], [11.99, -2.51, 0.0], [9.9, -4.1, 0.0], [12.0, -2.5, 0.0]]
-    )
-    row, column = PLAN.cell_index(points)
-    assert row.tolist() == [0, 0, 2, -1, 3]
-    assert column.tolist() == [0, 0, 3, -1, 4]
-    assert [int(index) for index in PLAN.cell_index(np.array([11.2, -3.2]))] == [1, 2]
-    assert PLAN.cell_index(np.zeros((2, 3, 2)))[0].shape == (2, 3)
+def test_equality() -> None:
+    mesh, other = scene_mesh(box((0, 0, 0), (1, 1, 1))), scene_mesh(box((0, 0, 0), (1, 1, 2)))
+    changes = {"state": np.full((3, 4), 1), "resolution_m": 0.25, "origin_m": (10.0, -4.5), "wall_height_m": 2.4}
+    for name, value in {**changes, "interior_cells": 2, "material": Material(), "mesh": mesh}.items():
+        assert replace(PLAN, **{name: value}) != PLAN  # type: ignore[arg-type]
+    assert replace(PLAN) == PLAN != "a text"
+    assert replace(PLAN, mesh=replace(mesh)) == replace(PLAN, mesh=mesh) != replace(PLAN, mesh=other)
 
 
 @given(states, st.floats(1e-3, 10.0), st.tuples(st.floats(-1e6, 1e6), st.floats(-1e6, 1e6)))
@@ -106,15 +82,8 @@ def test_a_corner_has_the_freest_state_around_it(block: list[list[int]], state: 
     assert {int(partial.state_at(np.array([7.75 + d, -23.95 - d]))) for d in (-1e-9, 0.0, 1e-9)} == {state}
 
 
-def test_an_edge_has_the_freer_state_of_its_two_cells() -> None:
-    points = np.array([[10.5, -3.25], [10.75, -3.5], [11.5, -3.25], [11.75, -3.5]])
-    assert PLAN.state_at(points).tolist() == [FREE, FREE, FREE, UNKNOWN]
-    assert PLAN.state_at(np.array([[10.5, -3.75], [10.25, -3.5]])).tolist() == [WALL, WALL]
-
-
 @given(states)
 def test_is_complete(state: np.ndarray) -> None:
-    """No free cell shares an edge with an unknown one, as all those beyond the grid are."""
     padded = np.pad(state, 1, constant_values=UNKNOWN)
     free = np.argwhere(padded == FREE)
     steps = ((0, 1), (1, 0), (0, -1), (-1, 0))
@@ -144,20 +113,14 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
     ("arguments", "message"),
     [
         ({"state": [0, 1]}, "state has shape (2,): give a two-dimensional array (ny, nx) with at least one cell"),
-        ({"state": np.zeros((0, 3), int)}, "state has shape (0, 3): give a two-dimensional array"),
+        ({"state": [[0], [0, 1]]}, "state = [[0], [0, 1]] is not numeric: give CellState integers"),
+        ({"mesh": "room.ply"}, "mesh is of type str: give a SceneMesh, or None for a plan."),
         ({"state": [[0, 3]]}, "state has values 0 to 3: use CellState integers FREE 0, WALL 1, UNK"),
-        ({"state": [[-1]]}, "values -1 to -1: use CellState integers"),
         ({"state": [[0.0]]}, "state has dtype float64: give CellState integers"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
         ({"resolution_m": 50}, "resolution_m = 50 is not allowed"),
-        ({"resolution_m": np.nan}, "resolution_m = nan is not allowed"),
-        ({"resolution_m": "fine"}, "resolution_m = 'fine' is not allowed"),
-        ({"resolution_m": None}, "resolution_m = None is not allowed"),
         ({"origin_m": (0.0,)}, "origin_m = (0.0,): give the (x, y) of the lower-left corner in metres"),
-        ({"origin_m": 3.0}, "origin_m = 3.0: give the (x, y)"),
         ({"origin_m": (0.0, (1.0, 2.0))}, "origin_m = (0.0, (1.0, 2.0)) is not numeric: give the (x, y)"),
-        ({"origin_m": (0.0, 10**400)}, "is not numeric: give the (x, y)"),
-        ({"resolution_m": True}, "resolution_m = True is not allowed: give a number of metres"),
         ({"resolution_m": 10**5000}, "resolution_m = a value of type int is not allowed: give a number of metres"),
         ({"interior_cells": True}, "interior_cells = True is not allowed: give the number of free cells, or None"),
         ({"interior_cells": 10**20}, "interior_cells = 100000000000000000000 is not allowed"),
@@ -195,24 +158,17 @@ def test_positions_may_be_free_or_unknown() -> None:
         ((10.75, -3.25), "tx has shape (2,): give x, y, z in metres, (3,) or (N, 3)"),
         (np.zeros((1, 1, 3)), "tx has shape (1, 1, 3): give x, y, z"),
         ("here", "tx = 'here' is not numeric: give x, y, z in metres"),
-        ((10**400, 1.0, 1.5), "is not numeric: give x, y, z in metres"),
         ((1e308, -3.25, 1.5), "tx = (1e+308, -3.25, 1.5) is outside the map"),
-        ([(1, 2, 3), (1, 2)], "is not numeric: give x, y, z in metres"),
         ((np.nan, -3.25, 1.5), "tx = (nan, -3.25, 1.5) is not finite: give finite numbers in metres"),
         ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
         ((9, -3.25, 1.5), "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: m"),
-        ((12.5, -3.25, 1.5), "is outside the map"),
         (np.ma.masked_array((10.75, -3.25, 1.5), [0, 0, 1]), "tx has masked values, whose data would be read"),
-        (np.array([10.75, -3.25, 1.5 + 0j]), "is not numeric: give x, y, z in metres"),
         ((True, False, True), "tx has dtype bool: give x, y, z in metres"),
-        ((10.75, -4.1, 1.5), "is outside the map"),
-        ((10.75, -2.4, 1.5), "is outside the map"),
         ((10.75, -3.25, 2.5), "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its hei"),
-        ((10.75, -3.25, 0.0), "is not between floor and ceiling"),
         ((10.25, -3.25, 1.5), "tx = (10.25, -3.25, 1.5) is inside a wall: move it to a free or unknown cell"),
         (
             [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5), (10.75, -2.75, 1.5)],
-            "tx[1] = (10.25, -3.25, 1.5) (and 1 more) is inside a wall",
+            "tx[1] = (10.25, -3.25, 1.5) (and 1 more) is",
         ),
         ([(10.75, -3.25, 1.5), (np.nan, 0.0, 0.0)], "tx[1] = (nan, 0.0, 0.0) is not finite"),
     ],
@@ -274,18 +230,6 @@ def test_mesh_says_how_high_radios_may_be() -> None:
     for z in (1.5, 100.0, 104.0):
         with pytest.raises(PositionError, match=r"is not between floor and ceiling \(100 to 104 m\)"):
             partial.require_positions("tx", (10.75, -3.25, z))
-
-
-def test_mesh_is_compared() -> None:
-    mesh, other = scene_mesh(box((0, 0, 0), (1, 1, 1))), scene_mesh(box((0, 0, 0), (1, 1, 2)))
-    assert replace(PLAN, mesh=mesh) == replace(PLAN, mesh=replace(mesh))
-    assert replace(PLAN, mesh=mesh) != PLAN
-    assert replace(PLAN, mesh=mesh) != replace(PLAN, mesh=other)
-
-
-def test_mesh_of_another_kind() -> None:
-    with pytest.raises(MapError, match=r"mesh is of type str: give a SceneMesh, or None for a plan\."):
-        replace(PLAN, mesh="room.ply")  # type: ignore[arg-type]
 
 
 def furnished() -> np.ndarray:

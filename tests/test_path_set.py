@@ -148,19 +148,8 @@ class TestLinks:
         np.testing.assert_allclose(power, expected, rtol=1e-3, atol=1e-6 * expected.max())
         np.testing.assert_allclose(vertices_m - move, expected_m, atol=1e-5)
 
-    def test_outage(self) -> None:
-        state = np.zeros((22, 60), dtype=np.uint8)
-        state[[0, -1], :] = state[:, [0, 29, -1]] = CellState.WALL
-        ends = (1.0, 1.1, 1.5), [(4.5, 0.8, 1.2), (1.7, 0.7, 1.1)]
-        partial = sp.PartialMap(state, 0.1)
-        self.assert_same(sp.Simulation(partial).paths(*ends).links(), sp.trace_links(partial, *ends))
-
 
 class TestSeveralTransmitters:
-    def test_links_are_those_of_the_trace(self, several: PathSet) -> None:
-        links = sp.trace_links(small_room(), SEVERAL_TX_M, RX_M, trace_settings=SETTINGS)
-        TestLinks.assert_same(several.links(), links)
-
     def test_each_moves_as_it_does_alone(self, room: sp.Simulation, several: PathSet) -> None:
         move = np.array([[4e-3, -3e-3, 5e-3], [0.0, 2e-3, -1e-3]])
         there = changed(several, tx_m=move)
@@ -310,30 +299,6 @@ class TestSlopes:
         np.testing.assert_allclose(vertices_m, positions, atol=2e-3)
         assert (np.abs(vertices_m).max(axis=(1, 2, 3)) > 0.1).any()
 
-    def test_reflection_off_the_floor_by_hand(self) -> None:
-        """The reflection point divides the length as the heights; the power falls with the square of the length."""
-        tx, rx = np.array([1.03, 1.92, 1.4]), np.array([3.2, 2.1, 1.1])
-        metal = replace(FLOOR, material=sp.Material(1.0, 1e7, 0.1))
-        paths = sp.Simulation(FIELD, scene_settings=metal).paths(tx, rx[None])
-        reflected, fraction = int(np.flatnonzero(~paths.is_direct)[0]), tx[2] / (tx[2] + rx[2])
-        np.testing.assert_allclose(paths.vertices_m[reflected, 0], [*(tx + fraction * (rx - tx))[:2], 0.0], atol=1e-5)
-        power, vertices_m = paths.transmitter_slopes(paths.base)
-        per_z = rx[2] / (tx[2] + rx[2]) ** 2 * (rx - tx)[:2]
-        expected = [[1 - fraction, 0, per_z[0]], [0, 1 - fraction, per_z[1]], [0, 0, 0]]
-        np.testing.assert_allclose(vertices_m[reflected, 0], expected, atol=1e-5)
-        away = tx - rx * [1, 1, -1]
-        length_m = np.linalg.norm(away)
-        free = (SPEED_OF_LIGHT_M_S / 28e9 / (4 * np.pi * length_m)) ** 2
-        np.testing.assert_allclose(paths.power[reflected], free, rtol=2e-3)
-        np.testing.assert_allclose(power[reflected], -2 * free / length_m**2 * away, rtol=4e-3)
-
-    def test_away_from_where_they_were_found(self, paths: PathSet) -> None:
-        there = changed(paths, tx_m=[5e-3, 5e-3, 5e-3], relative_permittivity=[2.0])
-        found = paths.slopes(there, ["relative_permittivity"])["relative_permittivity"]
-        ends = [replace(there, relative_permittivity=there.relative_permittivity + by) for by in (4e-3, -4e-3)]
-        expected = (paths.at(ends[0])[0] - paths.at(ends[1])[0]) / 8e-3
-        np.testing.assert_allclose(sums(paths, found)[:, 0], sums(paths, expected[:, None])[:, 0], rtol=0.01)
-
     def test_together(self, mesh_paths: PathSet) -> None:
         apart, together = (mesh_paths.slopes(mesh_paths.base, together=each) for each in (False, True))
         assert [*apart] == [*together] == [*PARAMETERS]
@@ -365,14 +330,6 @@ class TestSlopes:
 
 
 class TestNothingIsLeftBehind:
-    def test_after_a_call(self, room: sp.Simulation, paths: PathSet) -> None:
-        before = room.paths(TX_M, RX_M).links().a.tobytes()
-        there = changed(paths, tx_m=[0.1, 0.1, 0.1], relative_permittivity=[3.0], frequency_hz=-2e9)
-        paths.at(there)
-        paths.slopes(there)
-        assert room.paths(TX_M, RX_M).links().a.tobytes() == before
-        np.testing.assert_array_equal(room.parameters(TX_M).relative_permittivity, paths.base.relative_permittivity)
-
     def test_after_an_itu_material_followed_the_frequency(self, itu_paths: PathSet) -> None:
         before = itu_paths._simulation.paths(TX_M, RX_M).links().a.tobytes()
         itu_paths.slopes(changed(itu_paths, frequency_hz=3e9, conductivity_s_m=[0.5]))
@@ -387,14 +344,6 @@ class TestNothingIsLeftBehind:
                 call(there)
         assert room.paths(TX_M, RX_M).links().a.tobytes() == before
         assert all(np.isfinite(each).all() for each in paths.slopes(paths.base).values())
-
-    def test_what_was_given_may_change(self, room: sp.Simulation) -> None:
-        tx, rx = TX_M.copy(), RX_M.copy()
-        paths = room.paths(tx, rx)
-        tx += 1.0
-        rx += 1.0
-        np.testing.assert_array_equal(paths.base.tx_m, TX_M)
-        np.testing.assert_array_equal(paths.rx_m, RX_M)
 
 
 class TestNothingThere:
@@ -431,14 +380,6 @@ class TestNothingThere:
         np.testing.assert_allclose(paths.slopes(paths.base)["tx_m"], [[free, 0.0, 0.0]], rtol=1e-5)
         together = paths.slopes(paths.base, together=True)
         assert [together[name].tolist() for name in MATERIAL_PARAMETERS] == [[[0.0]]] * 3
-
-    def test_progress(self, room: sp.Simulation) -> None:
-        calls: list[tuple[float, str]] = []
-        room.paths(TX_M, RX_M, progress=lambda fraction, message: calls.append((fraction, message)))
-        fractions = [fraction for fraction, _ in calls]
-        assert fractions == sorted(fractions)
-        assert fractions[-1] == pytest.approx(1.0)
-        assert {message for _, message in calls} == {"verifying reflections", "verifying diffractions", "traced"}
 
 
 class TestErrors:

@@ -10,14 +10,12 @@ import trimesh
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
-import sionna_partial as sp
 from sionna_partial.constants import POINT_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh import points as points_module
 from sionna_partial.maps.mesh.points import map_from_points
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
-from sionna_partial.resources import scenes_folder
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)
@@ -90,15 +88,12 @@ FORMATS = ("room.las", "room.laz", "room_ascii.pcd", "room_binary.pcd", "room.pc
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_room(tmp_path: Path, name: str) -> None:
+    assert {Path(each).suffix for each in FORMATS} == {*POINT_SUFFIXES, ".ply"}
     path = write(tmp_path / name, ROOM)
     partial = load_map(path)
     require_room(partial)
     assert load_map(path, wall_height_m=2.2).wall_height_m == 2.2
     assert map_from_points(path) == partial
-
-
-def test_every_suffix_is_tried() -> None:
-    assert {Path(name).suffix for name in FORMATS} == {*POINT_SUFFIXES, ".ply"}
 
 
 @pytest.mark.parametrize("floor_m", [-1.23, 512.34])
@@ -145,7 +140,6 @@ def test_y_up() -> None:
 
 
 def test_two_storeys() -> None:
-    """The band selects the storey; by default it is the lowest."""
     upper = np.add(ROOM, (10.0, 0.0, 2.9))
     both = np.concatenate([ROOM, upper])
     require_room(map_from_points(both, observed=[(0, 0), (5.1, 0), (5.1, 3.1), (0, 3.1)]))
@@ -165,43 +159,13 @@ def test_walls_alone() -> None:
     assert states(around, (4.5, 1.25)) == [FREE]
 
 
-def test_parts_and_order_change_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = map_from_points(ROOM)
-    monkeypatch.setattr(points_module, "PART", 700)
-    assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
-
-
-def test_text_in_parts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_parts_and_order_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "room.xyz", ROOM)
-    whole = load_map(path)
+    whole, text = map_from_points(ROOM), load_map(path)
+    monkeypatch.setattr(points_module, "PART", 700)
     monkeypatch.setattr(points_module, "PART_BYTES", 5000)
-    assert load_map(path) == whole
-
-
-def test_shipped_scene_comes_back() -> None:
-    """A scan of the shipped apartment has its rooms: what is free there is free, and walls are beside its walls."""
-    home = sp.load_map(scenes_folder() / "apartment" / "complete")
-    rng, cell = np.random.default_rng(0), home.resolution_m
-    free = np.argwhere(home.state == FREE)
-    flat = np.repeat(free[:, ::-1] + rng.random(free.shape), 8, axis=0) + rng.uniform(0, 1, (8 * len(free), 2)) - 0.5
-    z = np.where(rng.random(len(flat)) < 0.5, 0.0, home.wall_height_m)
-    sides = [(0, 1), (0, -1), (1, 0), (-1, 0)]
-    faces = [np.argwhere((home.state == FREE) & (np.roll(home.state, (-y, -x), (0, 1)) == WALL)) for y, x in sides]
-    upright = np.concatenate(
-        [
-            np.repeat(each[:, ::-1] + 0.5 + 0.6 * np.array([x, y]), 80, axis=0)
-            for each, (y, x) in zip(faces, sides, strict=True)
-        ]
-    )
-    points = np.concatenate(
-        [np.column_stack([flat * cell, z]), np.column_stack([upright * cell, rng.uniform(0, 3, len(upright))])]
-    )
-    scan = map_from_points(points + rng.normal(0, 0.003, points.shape))
-    y, x = np.nonzero(home.state == FREE)
-    assert (scan.state_at((np.column_stack([x, y]) + 0.5) * cell + home.origin_m) == FREE).mean() > 0.97
-    y, x = np.nonzero(scan.state == WALL)
-    at = (np.column_stack([x, y]) + 0.5) * cell + scan.origin_m
-    assert (home.state_at(at) == WALL).mean() > 0.9
+    assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
+    assert load_map(path) == text
 
 
 @pytest.mark.parametrize(
@@ -209,20 +173,16 @@ def test_shipped_scene_comes_back() -> None:
     [
         ({"points": np.zeros((3, 2))}, "points has shape (3, 2): give x, y, z in metres, (N, 3), or the path of a"),
         ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
-        ({"points": np.full((5, 3), np.nan)}, "points holds no finite point"),
-        ({"points": [["a"] * 3]}, "points = [['a', 'a', 'a']] is not numeric: give x, y, z in metres, (N, 3)"),
         ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: give unit_m, the length of its unit in metres"),
         ({"points": ROOM * 1000}, "give unit_m, the length of its unit in metres, 0.01 for centimetres"),
         ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
         ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
         ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
         ({"sensor_positions_m": (1.0, 2.0)}, "sensor_positions_m has shape (2,) or values that are not finite: give x"),
-        ({"sensor_positions_m": [(1.0, np.inf)]}, "sensor_positions_m has shape (1, 2) or values that are not finite"),
         ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
+        ({"sensor_positions_m": [(1e7, 0.0)]}, "sensor_positions_m has [10000000.0, 0.0], more than 200 m from the"),
         ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
-        ({"up": "x"}, "up = 'x' is not allowed"),
         ({"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres, such as 0.3048 for feet"),
-        ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed"),
     ],
 )
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
@@ -247,11 +207,9 @@ def test_every_truncation(tmp_path: Path, name: str) -> None:
     ("name", "old", "new"),
     [
         ("room_binary.pcd", rb"POINTS \d+", b"POINTS 999999999999"),
-        ("room_ascii.pcd", rb"POINTS \d+", b"POINTS 999999999999"),
         ("room_ascii.pcd", rb"POINTS \d+", b"POINTS 5"),
         ("room_binary.pcd", rb"FIELDS x y z", b"FIELDS a b c"),
         ("room.ply", rb"element vertex \d+", b"element vertex 99999999999"),
-        ("room.ply", rb"element vertex \d+", b"element vertex 5000"),
         ("room.xyz", rb"//X,Y,Z,R", b"\n" * 60),
         ("room.xyz", rb"\n", b"\nx,y,z\n"),
     ],
@@ -296,8 +254,3 @@ def test_files_that_announce_more_than_they_hold(tmp_path: Path, name: str, cont
     (tmp_path / name).write_bytes(content)
     with pytest.raises(MapError, match=message):
         map_from_points(tmp_path / name)
-
-
-def test_sensors_far_from_the_points() -> None:
-    with pytest.raises(MapError, match=r"sensor_positions_m has \[10000000.0, 0.0\], more than 200 m"):
-        map_from_points(np.random.default_rng(0).uniform(0, 3, (5000, 3)), sensor_positions_m=[(1e7, 0.0)])

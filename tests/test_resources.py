@@ -31,11 +31,6 @@ def test_scenes_of_the_package_come_before_those_of_the_repository(package: Path
     assert resources.scenes_folder() == in_package
 
 
-def test_homes_have_their_transmitters(package: Path) -> None:
-    add_homes(package / "scenes")
-    assert resources.demo_homes() == {"flat": {"seed": 3, "transmitter": (1.0, 2.0, 1.5)}}
-
-
 def test_no_scenes(package: Path) -> None:
     (package / "scenes").mkdir(parents=True)
     with pytest.raises(SceneError, match=r"demo scenes are missing in '.*scenes': install sionna-partial again\."):

@@ -1,6 +1,5 @@
 """ROS map_server YAML and image, read as nav2_map_server reads them."""
 
-import logging
 import math
 import re
 from pathlib import Path
@@ -36,7 +35,6 @@ FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
 
 def write_sheet(folder: Path, *, without: str = "", **changes: object) -> Path:
-    """Write map.yaml: SHEET with changes."""
     sheet = {key: value for key, value in {**SHEET, **changes}.items() if key != without}
     path = folder / "map.yaml"
     path.write_text(yaml.safe_dump(sheet))
@@ -58,7 +56,6 @@ def load_state(folder: Path, shades: object, *, strict: bool = False, **changes:
 
 
 def test_orientation_and_place(tmp_path: Path) -> None:
-    """Image row 0 is the largest y; the origin is the lower-left corner."""
     partial = load_map(write_map(tmp_path, [[0, 205, 205], [254, 254, 205]]))
     assert partial.state.tolist() == [[FREE, FREE, UNKNOWN], [WALL, UNKNOWN, UNKNOWN]]
     assert partial.origin_m == (-1.0, 2.0)
@@ -70,13 +67,10 @@ def test_orientation_and_place(tmp_path: Path) -> None:
 
 PGMS = {
     "binary": b"P5\n3 1\n255\n\x00\xcd\xfe",
-    "binary with comments": b"P5 # made by\n# CREATOR: me 0.050 m/pix\n3 # wide\n1\n255\n\x00\xcd\xfe",
     "text": b"P2\n3 1\n255\n0 205 254\n",
     "text with comments": b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
     "binary, maxval 100": b"P5\n3 1\n100\n\x00\x32\x64",
-    "text, maxval 4": b"P2\n3 1\n4\n0 2 4\n",
     "binary, 16 bit": b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
-    "binary, maxval 1000": b"P5\n3 1\n1000\n\x00\x00\x02\x58\x03\xe8",
     "text, 16 bit": b"P2\n3 1\n65535\n0 40000 65535\n",
 }
 
@@ -107,15 +101,6 @@ def test_thresholds_are_strict(tmp_path: Path) -> None:
     """nav2: occupancy > occupied_thresh is wall, < free_thresh is free; negated 51 and 204 have exactly 0.2 and 0.8."""
     thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}
     assert load_state(tmp_path, [[50, 51, 52, 203, 204, 205]], **thresholds) == [[FREE, 2, 2, 2, 2, WALL]]
-
-
-def test_negate(tmp_path: Path) -> None:
-    shades = np.arange(256)[None]
-    for negate in (1, True):
-        there = load_state(tmp_path, shades, negate=negate)
-        assert there == load_state(tmp_path, 255 - shades, negate=0)
-        assert there[0][0] == FREE
-        assert there[0][255] == WALL
 
 
 @pytest.mark.parametrize("mode", ["trinary", "Trinary", "scale", "SCALE"])
@@ -170,18 +155,14 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
 
 
 def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
-    """In a map with another value for unknown, 205 may be free."""
     assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
 
-
-def test_one_stray_unknown_pixel_does_not_open_the_trap(tmp_path: Path) -> None:
     with pytest.warns(MapWarning, match="2 cells of shade 205"):
         assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
 
 
 @pytest.mark.parametrize("negate", [False, True])
 def test_dark_grey_walls(tmp_path: Path, negate: bool) -> None:
-    """Dark pixels between the thresholds are unknown; more of them than of walls get a warning."""
     shades = np.repeat(np.array([[90, 90, 254], [0, 205, 254]], dtype=np.uint8), 60, axis=0)
     path = write_map(tmp_path, 255 - shades if negate else shades, negate=int(negate))
     message = r"120 dark grey cells \(occupancy from 0\.65\) are read as unknown: if they are walls, set occupied_thr"
@@ -224,7 +205,6 @@ def test_numbers_as_people_write_them(tmp_path: Path) -> None:
 
 
 def test_image_beside_and_elsewhere(tmp_path: Path) -> None:
-    """The image is found relative to the YAML, or by an absolute path."""
     (tmp_path / "pictures").mkdir()
     (tmp_path / "pictures" / "a b.pgm").write_bytes(PGMS["binary"])
     for image in ("pictures/a b.pgm", str(tmp_path / "pictures" / "a b.pgm")):
@@ -244,33 +224,24 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
     [
         (
             "resolution",
-            (0, -0.05, 50, 1e-9, 1e300, 10**400, math.nan, math.inf, "fine", None, True, [0.05], {}),
-            r"give a number of metres per cell \(not cells per metre\) in \[0.001, 10\]",
+            (0, 50, 1e-9, 10**400, math.nan, "fine", None, True, [0.05], {}),
+            r"a number of metres per cell",
         ),
         ("occupied_thresh", (-0.1, 65, math.nan, "high", None), r"give a number in \[0, 1\]"),
         ("free_thresh", (-0.1, 19.6, math.nan, "low", None), r"give a number in \[0, 1\]"),
         ("free_thresh", (0.65, 0.9), "give less than occupied_thresh, which is 0.65"),
-        (
-            "origin",
-            ([0, 0], [0, 0, 0, 0], [0, math.nan, 0], [math.inf, 0, 0], [0, 0, "north"], 7, None, "0, 0, 0"),
-            r"give \[x, y, yaw\] of the lower-left corner, in metres and radians",
-        ),
+        ("origin", ([0, 0], [0] * 4, [0, math.nan, 0], [0, 0, "north"], 7, None, "0, 0"), r"give \[x, y, yaw\] of the"),
         ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
         ("negate", (2, -1, 0.0, "maybe", None), "give 0 .dark is wall. or 1 .bright is wall."),
         ("mode", ("ternary", 3, None), "choose one of trinary, scale, raw"),
         ("image", ("", None, 3, ["map.pgm"], "a\0b", "a\ud800b"), "give the file name of the map image"),
         ("image", ("gone.pgm", ".", "a" * 300, "loop"), "there is no file '.*'; put the image there"),
         ("wall_height", (0, -3, math.nan, "tall"), r"give a number of metres in \[0.1, 100\]"),
-        (
-            "material",
-            (3, {"color": "red"}, {"relative_permittivity": 0.5}),
-            "give a name, or relative_permittivity, .*thickness_m, itu, conductivity_exponent",
-        ),
+        ("material", (3, {"color": "red"}, {"relative_permittivity": 0.5}), "give a name, or relative_perm.*itu"),
         ("interior_cells", (-1, 2.5, "many", True), "give the number of free cells"),
     ],
 )
 def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
-    """The error names the file, the field, the value and the remedy."""
     (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
     (tmp_path / "loop").symlink_to("loop")
     for value in values:
@@ -281,22 +252,12 @@ def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], messa
         assert len(shown) > 100 or shown in str(caught.value) or {"\0", "\ud800"} & {*shown}
 
 
-def test_origin_too_far(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0]], origin=[0.0, -2e8, 0.0])
-    with pytest.raises(MapError, match=r"origin_m = -200000000.0 is not allowed: give a number of metres in"):
-        load_map(path)
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (b"", "holds None in place of keys such as image, resolution and origin"),
-        (b"- 1\n- 2\n", r"holds \[1, 2\] in place of keys"),
-        (b"just a text", "holds 'just a text' in place of keys"),
         (b"image: [unclosed", "is not valid YAML"),
-        (b"image: a\n\tresolution: 1", "is not valid YAML"),
         (b"\x00\x01\xff\xfe rubbish", "is not valid YAML"),
-        (bytes(range(128, 256)) * 10, "is not valid YAML"),
         (b"P5\n3 1\n255\n\x00\xcd\xfe", "is not valid YAML"),
         (b"image: a.pgm\nimage: b.pgm", r"is not valid YAML \(it has the key 'image' twice\)"),
         (b"a: 2020-99-99", r"is not valid YAML \(month must be"),
@@ -329,7 +290,6 @@ NO_IMAGE, TOO_MANY = "it is damaged or not a PGM, PNG or BMP", "it has more than
     [
         *((NO_IMAGE, b"P5" + end) for end in (b"", b"\n# only a comment")),
         *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"255\n\x00\xcd", b"100\n\x00\x32", b"65535\n\x00\x00\xcd")),
-        *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"0\n\x00\xcd\xfe", b"70000\n\x00\xcd\xfe")),
         *((NO_IMAGE, b"P5\n%s 1\n255\n\x00\xcd\xfe" % width) for width in (b"0", b"-3", b"three")),
         *((NO_IMAGE, b"P2\n3 1\n255\n0 205" + end) for end in (b"", b" 300", b" white")),
         *((NO_IMAGE, b"\x89PNG\r\n\x1a\n" + end) for end in (b"\x00\x00\x00\rIHDR", b"rubbish" * 20)),
@@ -353,13 +313,6 @@ def test_truncated_png(tmp_path: Path) -> None:
         (tmp_path / "map.png").write_bytes(whole[: int(share * len(whole))])
         with pytest.raises(MapError, match=r"it is damaged or not a PGM, PNG or BMP \(.*\); save the map again"):
             load_map(path)
-
-
-def test_yaw_turns_about_the_lower_left_corner(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0, 205, 205], [254, 254, 205]], origin=[-1.0, 2.0, 1.5708])
-    partial = load_map(path)
-    assert partial.state.tolist() == [[WALL, FREE], [UNKNOWN, FREE], [UNKNOWN, UNKNOWN]]
-    assert partial.origin_m == (-1.1, 2.0)
 
 
 def test_interior_cells_follow_the_cell_size(tmp_path: Path) -> None:
@@ -426,7 +379,6 @@ grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elem
 
 @given(grids, st.integers(-4, 4))
 def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
-    """A world point has the state that the grid has at the point turned back about the corner."""
     yaw = turns * math.pi / 2
     partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw))[:1], 1.0, turn_grid(state, 1.0, (3.0, -2.0, yaw))[2])
     v, u = np.mgrid[: state.shape[0], : state.shape[1]] + 0.5
@@ -472,6 +424,8 @@ def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -
     new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
     assert PartialMap(new, resolution_m, origin_m).is_complete
     assert label(new != WALL, np.ones((3, 3)))[1] == 2 or not corners
+    state[1, 2] = FREE
+    assert not PartialMap(turn_grid(state, 0.1, (0.0, 0.0, yaw))[0], resolution_m).is_complete
 
 
 def test_diagonal_walls_stay_closed() -> None:
@@ -487,26 +441,13 @@ def test_diagonal_walls_stay_closed() -> None:
             assert (new == FREE).sum() == pytest.approx(4 * (state == FREE).sum(), rel=0.06)
 
 
-def test_frontiers_stay_open() -> None:
-    """Turning closes no opening towards unknown cells."""
-    state = room(10, 10)
-    state[1, 4:8] = FREE
-    new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, 0.4))
-    assert not PartialMap(new, resolution_m, origin_m).is_complete
-    assert (new == WALL).sum() == pytest.approx(4 * (state == WALL).sum(), rel=0.05)
-
-
-def test_small_tilt_is_below_the_resolution() -> None:
+def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) -> None:
     state = room(96, 96)
     limit = 0.5 / math.hypot(100, 100)
     assert turn_grid(state, 0.1, (0.0, 0.0, 0.99 * limit))[1] == 0.1
+    assert not caplog.text
     assert turn_grid(state, 0.1, (0.0, 0.0, 1.01 * limit))[1] == 0.05
-
-
-def test_turning_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    with caplog.at_level(logging.WARNING):
-        turn_grid(GRID, 0.1, (0.0, 0.0, 0.3))
-    assert "origin yaw 0.3 rad: the map is turned onto cells of 0.05 m" in caplog.text
+    assert "rad: the map is turned onto cells of 0.05 m" in caplog.text
 
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,7 +15,7 @@ from meshes import OBSERVED, room
 from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
-from sionna_partial.errors import MapError, OutputError, SettingsError
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.environment import FAR_M, merged_mesh
 from sionna_partial.maps.map_files import load_map
@@ -55,7 +55,6 @@ def test_a_material_that_is_not_used_is_named(caplog: pytest.LogCaptureFixture) 
 
 
 def covered(rectangles_m: NDArray[np.float64], partial: PartialMap) -> NDArray[np.int_]:
-    """How many rectangles cover each cell."""
     count = np.zeros(partial.shape, dtype=int)
     for x0, y0, x1, y1 in np.rint(rectangles_m / partial.resolution_m).astype(int):
         count[y0:y1, x0:x1] += 1
@@ -74,7 +73,6 @@ def load(folder: Path):  # type: ignore[no-untyped-def]
 
 
 def count_paths(scene, tx: tuple[float, ...], rx: tuple[float, ...]) -> int:  # type: ignore[no-untyped-def]
-    """Number of paths of at most two interactions."""
     import sionna.rt as rt
 
     scene.frequency = 28e9
@@ -114,24 +112,16 @@ def test_without_a_ceiling_there_is_no_such_shape(tmp_path: Path) -> None:
         ("........ ###..### ........", {(2.5, 1.5): False, (5.5, 1.5): False, (0.0, 1.5): True, (8.0, 1.5): True}),
         # The same wall, seen in part: what lies beyond its end may be more of it.
         ("........ ###????? ........", {(3.0, 1.5): True, (0.0, 1.5): True}),
-        ("..?..... ###..... ..?.....", {(2.5, 1.5): False, (0.0, 1.5): True}),
-        # Upright.
-        (".#. .#. .#. ... ...", {(1.5, 2.5): False, (1.5, 5.0): True}),
         (".#. .#. .#. .?. ...", {(1.5, 2.0): True, (1.5, 5.0): True}),
         # Where two walls meet there is no end.
         ("..... .###. .#... .#... .....", {(1.5, 3.5): False, (3.5, 3.5): False, (1.5, 1.5): False}),
     ],
-    ids=["door", "half seen", "unseen beside", "upright", "upright half seen", "corner"],
+    ids=["door", "half seen", "upright half seen", "corner"],
 )
 def test_open_ends(text: str, ends: dict[tuple[float, float], bool]) -> None:
     geometry = build_scene(drawn(text, 1.0))
     found = dict(zip(map(tuple, geometry.vertices_m.tolist()), geometry.open_end.tolist(), strict=True))
     assert found == ends
-
-
-def test_no_floor() -> None:
-    partial = drawn(ROOM)
-    assert build_scene(partial, SceneSettings(floor_extent="none")).floor_m.shape == (0, 4)
 
 
 @settings(max_examples=40, deadline=None)
@@ -188,13 +178,6 @@ def test_walls_that_meet_share_their_vertices(tmp_path: Path) -> None:
         assert {tuple(corner) for corner in corners[:, :2]} == expected
 
 
-def test_nothing_stands_in_unknown_space(tmp_path: Path) -> None:
-    partial = drawn("????????? ?###????? ?#.#????? ?###????? ?????????")
-    folder = export_scene(partial, tmp_path / "scene")
-    for name in ("walls", "floor", "ceiling"):
-        assert mesh(folder, name).bounds[1, 0] <= 2.0 + 1e-6
-
-
 def test_stock_sionna_loads_and_solves_the_scene(tmp_path: Path) -> None:
     folder = export_scene(drawn(ROOM), tmp_path / "scene")
     scene = load(folder)
@@ -237,13 +220,6 @@ def test_frequency_outside_the_material_is_refused_and_nothing_written(tmp_path:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_foreign_folder_is_refused_and_kept(tmp_path: Path) -> None:
-    (tmp_path / "letter.txt").write_text("dear")
-    with pytest.raises(OutputError, match="choose a new or an empty folder"):
-        export_scene(drawn(ROOM), tmp_path)
-    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
-
-
 def test_same_bytes_twice(tmp_path: Path) -> None:
     first, second = (export_scene(drawn(ROOM), tmp_path / name) for name in ("one", "two"))
     files = sorted(path.relative_to(first) for path in first.rglob("*") if path.is_file())
@@ -282,8 +258,6 @@ def test_far_maps_are_moved_to_the_origin(origin_m: tuple[float, float], tmp_pat
 
 
 class TestMeshScene:
-    """A map with a mesh: its parts, one for each material."""
-
     WOOD = Material(itu="wood", thickness_m=0.05)
 
     def partial(self, shift_m: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> PartialMap:
@@ -320,13 +294,6 @@ class TestMeshScene:
         assert thickness_m == pytest.approx({"material0": 0.2, "material2": 0.05})
         assert load_map(folder) == partial
 
-    def test_wide_meshes_come_back_to_the_last_digit(self, tmp_path: Path) -> None:
-        whole = self.partial().mesh
-        assert whole is not None
-        wide = replace(whole, vertices_m=whole.vertices_m * (1234.56789, 0.1, 1.0) - (0.1, 0.2, 0.3))
-        partial = mesh_map(wide, MeshReading(resolution_m=1.0))
-        assert load_map(export_scene(partial, tmp_path / "scene")) == partial
-
     def test_scene_without_its_map_is_a_mitsuba_scene(self, tmp_path: Path) -> None:
         folder = export_scene(self.partial(), tmp_path / "scene")
         (folder / "map.yaml").unlink()
@@ -334,13 +301,6 @@ class TestMeshScene:
         assert read.mesh is not None
         assert read.mesh.materials == (Material(), self.WOOD)
         np.testing.assert_array_equal(read.state, self.partial().state)
-
-    def test_plan_scene_without_its_map_is_a_mitsuba_scene(self, tmp_path: Path) -> None:
-        folder = export_scene(drawn(ROOM), tmp_path / "scene")
-        (folder / "map.yaml").unlink()
-        read = load_map(folder, resolution_m=0.5)
-        assert read.mesh is not None
-        np.testing.assert_allclose(read.mesh.bounds_m, [[0.5, 0.5, 0.0], [5.5, 3.5, 3.0]])
 
     def test_nothing_observed(self, tmp_path: Path) -> None:
         nothing = cut_to_known(replace(self.partial(), state=np.full((3, 3), CellState.UNKNOWN)))
@@ -357,11 +317,6 @@ class TestMeshScene:
             expected = whole.corners_m[whole.material == index] - (1.0, 2.0, 0.0)
             np.testing.assert_array_equal(part.vertices[part.faces], expected)
             assert len(part.vertices) == 8
-
-    def test_frequency_outside_a_material_is_refused(self, tmp_path: Path) -> None:
-        with pytest.raises(SettingsError, match=r"frequency_hz = 500000000000.0 .*wood"):
-            export_scene(self.partial(), tmp_path / "scene", frequency_hz=5e11)
-        assert list(tmp_path.iterdir()) == []
 
 
 def test_only_maps_and_scene_settings_are_taken() -> None:

@@ -4,8 +4,11 @@ import base64
 import json
 import re
 import zlib
+from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -53,41 +56,31 @@ def shard(links: LinkTable, tmp_path: Path) -> Path:
 
 
 class TestShard:
-    def test_materials_of_maps_come_back(self, links: LinkTable, tmp_path: Path) -> None:
+    def test_round_trip(self, links: LinkTable, shard: Path, tmp_path: Path) -> None:
+        assert_same(read_shard(shard), links)
         brick = Material(itu="brick", thickness_m=0.12)
         maps = {name: replace(each, material=brick) for name, each in links.complete_maps.items()}
-        write_shard(replace(links, complete_maps=maps), tmp_path / "brick.parquet", NOTES)
-        assert read_shard(tmp_path / "brick.parquet").complete_maps == maps
+        wifi = replace(links, complete_maps=maps, features=replace(links.features, frequency_hz=5e9))
+        write_shard(wifi, tmp_path / "wifi.parquet", NOTES)
+        assert read_shard(tmp_path / "wifi.parquet").complete_maps == maps
+        assert read_shard(tmp_path / "wifi.parquet").features.frequency_hz == 5e9
 
-    def test_round_trip(self, links: LinkTable, shard: Path) -> None:
-        assert_same(read_shard(shard), links)
-
-    def test_every_column_of_the_table_is_in_the_file_with_its_unit(self, shard: Path) -> None:
-        names = set(pq.read_schema(shard).names)
+    def test_columns_and_notes_of_the_file(self, links: LinkTable, shard: Path) -> None:
+        columns = pq.read_table(shard)
         positions = {f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"}
         phi = {"partial_link_state", "partial_gain_db", "unobserved_distance_m", "distance_m"}
         indirect = {f"indirect_gain_reach_{reach}_m_db" for reach in ("inf", "4", "1", "0.25", "0")}
         straight = {"straight_gain_db", "straight_walls", "wall_loss_db"}
         others = {"strongest_unobserved_m", "map_index"}
-        assert names == {*COLUMNS} | positions | phi | indirect | straight | others
-
-    def test_columns_hold_what_they_say(self, links: LinkTable, shard: Path) -> None:
-        columns = pq.read_table(shard)
+        assert {*columns.column_names} == {*COLUMNS} | positions | phi | indirect | straight | others
         np.testing.assert_array_equal(columns["rx_y_m"], links.context.rx_m[:, 1])
         np.testing.assert_array_equal(columns["indirect_gain_reach_4_m_db"], links.context.indirect_gain_db[:, 1])
         np.testing.assert_array_equal(columns["partial_gain_db"], links.phi.gain_db)
         np.testing.assert_array_equal(columns["gain_db"], links.gain_db)
         np.testing.assert_array_equal(columns["partial_link_state"], links.phi.link_state)
-
-    def test_notes(self, shard: Path) -> None:
         notes = shard_metadata(shard)
         expected = {"format": FORMAT, "frequency_hz": None, **NOTES}
         assert {name: notes[name] for name in notes if name != "maps"} == expected
-
-    def test_frequency_comes_back(self, links: LinkTable, tmp_path: Path) -> None:
-        wifi = replace(links, features=replace(links.features, frequency_hz=5e9))
-        write_shard(wifi, tmp_path / "wifi.parquet", NOTES)
-        assert read_shard(tmp_path / "wifi.parquet").features.frequency_hz == 5e9
 
     def test_equal_links_give_equal_bytes(self, links: LinkTable, shard: Path, tmp_path: Path) -> None:
         write_shard(links, tmp_path / "again.parquet", dict(reversed(NOTES.items())))
@@ -96,24 +89,68 @@ class TestShard:
         assert (tmp_path / "other.parquet").read_bytes() != shard.read_bytes()
 
 
-class TestDamaged:
-    def test_missing(self, tmp_path: Path) -> None:
-        with pytest.raises(PredictorError, match=r"no\.parquet' cannot be read \(No such file"):
-            read_shard(tmp_path / "no.parquet")
+def rewrite(path: Path, **changes: Any) -> None:
+    """Write a shard again with other maps, or without, or with other distances."""
+    table = pq.read_table(path)
+    notes = {**table.schema.metadata}
+    maps = json.loads(notes.pop(b"sionna_partial.maps"))
+    if changes.get("maps") is not None:
+        notes[b"sionna_partial.maps"] = json.dumps(maps | changes["maps"]).encode()
+    if "distance_m" in changes:
+        column = table.column_names.index("distance_m")
+        values = pa.array(np.full(len(table), changes["distance_m"]))
+        table = table.set_column(column, table.schema.field("distance_m"), values)
+    pq.write_table(table.replace_schema_metadata(notes), path)
 
-    @pytest.mark.parametrize("share", [0.0, 0.3, 0.99])
-    def test_truncated(self, shard: Path, share: float) -> None:
-        content = shard.read_bytes()
-        shard.write_bytes(content[: int(share * len(content))])
-        with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged, or no Parquet file .*: delete it and"):
+
+def flip_a_byte_of_a_column(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    column = pq.read_metadata(path).row_group(0).column(5)
+    content[column.dictionary_page_offset + column.total_compressed_size - 1] ^= 0xFF
+    path.write_bytes(content)
+
+
+DAMAGED = "is damaged, or no Parquet file"
+MAPS_THAT_ARE_NONE = [
+    (None, "'maps'"),
+    ({"partial": None}, "NoneType"),
+    ({"partial": []}, "tuple index out of range"),
+    ({"complete": {"villa": {}}}, "shape"),
+    ({"complete": {"villa": {"cells": "AAAA", **PLAIN}}}, "Error -3"),
+    ({"complete": {"villa": {"cells": packed(b"\0" * 7), **PLAIN}}}, "reshape"),
+    ({"complete": {"villa": {"shape": [20_000, 20_000]}}}, "more than 100,000,000"),
+    ({"complete": {"villa": {"cells": packed(b"\0" * 5), **PLAIN}}}, "reshape"),
+    ({"complete": {"villa": {"cells": packed(b"\7" * 6), **PLAIN}}}, "state has values 7 to 7"),
+]
+SPOILS: list[tuple[Callable[[Path], object], str]] = [
+    (Path.unlink, r"villa\.parquet' cannot be read \(No such file"),
+    *(
+        (
+            lambda path, kept=kept: path.write_bytes(path.read_bytes()[: int(kept * path.stat().st_size)]),
+            f"{DAMAGED} .*: delete",
+        )
+        for kept in (0.0, 0.3, 0.99)
+    ),
+    (flip_a_byte_of_a_column, DAMAGED),
+    (lambda path: pq.write_table(pa.table({"a": [1]}), path), "is no shard of this version .* build the data"),
+    (lambda path: rewrite(path, distance_m=-1.0, maps={}), rf"{DAMAGED} \(distance_m\[0\] = -1"),
+    *(
+        (lambda path, maps=maps: rewrite(path, maps=maps), rf"{DAMAGED} \(.*{words}")
+        for maps, words in MAPS_THAT_ARE_NONE
+    ),
+]
+
+
+class TestDamaged:
+    @pytest.mark.parametrize(("spoil", "message"), SPOILS)
+    def test_refused(self, shard: Path, spoil: Callable[[Path], object], message: str) -> None:
+        spoil(shard)
+        with pytest.raises(PredictorError, match=message):
             read_shard(shard)
 
-    def test_one_byte_of_a_column(self, shard: Path) -> None:
-        content = bytearray(shard.read_bytes())
-        column = pq.read_metadata(shard).row_group(0).column(5)
-        content[column.dictionary_page_offset + column.total_compressed_size - 1] ^= 0xFF
-        shard.write_bytes(content)
-        with pytest.raises(PredictorError, match=r"villa\.parquet' is damaged"):
+    def test_too_many_links(self, shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(shards, "_MAX_LINKS", 1)
+        with pytest.raises(PredictorError, match="has more than 1 links: give a shard of one home"):
             read_shard(shard)
 
     @pytest.mark.parametrize("start", [b"rx_x_m", b"ARROW:schema"])
@@ -128,51 +165,6 @@ class TestDamaged:
                 refused.append(str(error))
         assert len(refused) > 100
         assert all(re.search("is damaged|is no shard", message) for message in refused)
-
-    def test_foreign(self, tmp_path: Path) -> None:
-        pq.write_table(pa.table({"a": [1]}), tmp_path / "foreign.parquet")
-        with pytest.raises(PredictorError, match=r"foreign\.parquet' is no shard of this version .* build the data"):
-            read_shard(tmp_path / "foreign.parquet")
-
-    def test_values_that_no_link_has(self, shard: Path) -> None:
-        table = pq.read_table(shard)
-        column = table.column_names.index("distance_m")
-        field = table.schema.field("distance_m")
-        pq.write_table(table.set_column(column, field, pa.array(-np.ones(len(table)))), shard)
-        with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \(distance_m\[0\] = -1"):
-            read_shard(shard)
-
-    @pytest.mark.parametrize(
-        ("change", "words"),
-        [
-            ({"partial": None}, "NoneType"),
-            ({"partial": []}, "tuple index out of range"),
-            ({"complete": {"villa": {}}}, "shape"),
-            ({"complete": {"villa": {"cells": "AAAA", **PLAIN}}}, "Error -3"),
-            ({"complete": {"villa": {"cells": packed(b"\0" * 7), **PLAIN}}}, "reshape"),
-            ({"complete": {"villa": {"shape": [20_000, 20_000]}}}, "more than 100,000,000"),
-            ({"complete": {"villa": {"cells": packed(b"\0" * 5), **PLAIN}}}, "reshape"),
-            ({"complete": {"villa": {"cells": packed(b"\7" * 6), **PLAIN}}}, "state has values 7 to 7"),
-        ],
-    )
-    def test_maps_that_are_none(self, shard: Path, change: dict[str, object], words: str) -> None:
-        maps = json.dumps(shard_metadata(shard)["maps"] | change)  # type: ignore[operator]
-        table = pq.read_table(shard)
-        pq.write_table(table.replace_schema_metadata({**table.schema.metadata, b"sionna_partial.maps": maps}), shard)
-        with pytest.raises(PredictorError, match=rf"is damaged, or no Parquet file \(.*{words}"):
-            read_shard(shard)
-
-    def test_too_many_links(self, shard: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(shards, "_MAX_LINKS", 1)
-        with pytest.raises(PredictorError, match="has more than 1 links: give a shard of one home"):
-            read_shard(shard)
-
-    def test_no_maps(self, shard: Path) -> None:
-        table = pq.read_table(shard)
-        metadata = {name: text for name, text in table.schema.metadata.items() if name != b"sionna_partial.maps"}
-        pq.write_table(table.replace_schema_metadata(metadata), shard)
-        with pytest.raises(PredictorError, match=r"is damaged, or no Parquet file \('maps'\)"):
-            read_shard(shard)
 
 
 def test_names_of_files_are_short() -> None:
@@ -191,23 +183,25 @@ class TestDataset:
             write_shard(fake_links(None, name, DatasetSettings(links_per_home=4)), shard_path(tmp_path, name), {})
         return tmp_path
 
-    def test_all_homes_in_the_order_of_the_list(self, folder: Path) -> None:
+    def test_homes_in_the_order_of_the_list(self, folder: Path) -> None:
         links = read_dataset(folder)
         assert list(dict.fromkeys(links.home.tolist())) == ["b", "a", "c"]
         assert_same(links.take(links.home == "a"), read_shard(shard_path(folder, "a")))
-
-    def test_some_homes(self, folder: Path) -> None:
         assert list(dict.fromkeys(read_dataset(folder, ["c", "b"]).home.tolist())) == ["c", "b"]
 
-    @pytest.mark.parametrize("name", ["missing", "d"])
-    def test_home_that_is_not_there(self, folder: Path, name: str) -> None:
-        with pytest.raises(PredictorError, match=rf"home '{name}' is not in '.*': choose from 'b', 'a', 'c'\."):
-            read_dataset(folder, [name])
-
-    @pytest.mark.parametrize("homes", ["b", 5, [1], np.full((2, 2), 7)])
-    def test_homes_that_are_no_names(self, folder: Path, homes: object) -> None:
-        with pytest.raises(PredictorError, match=r"homes = .* is not allowed: give names of homes, or None for all\."):
-            read_dataset(folder, homes)  # type: ignore[arg-type]
+    @pytest.mark.parametrize(
+        ("homes", "message"),
+        [
+            *(([name], rf"home '{name}' is not in '.*': choose from 'b', 'a', 'c'\.") for name in ("missing", "d")),
+            *(
+                (homes, r"homes = .* is not allowed: give names of homes, or None for all\.")
+                for homes in ("b", 5, [1], np.full((2, 2), 7))
+            ),
+        ],
+    )
+    def test_homes_that_are_not_there(self, folder: Path, homes: Any, message: str) -> None:
+        with pytest.raises(PredictorError, match=message):
+            read_dataset(folder, homes)
 
     def test_nothing_built(self, folder: Path) -> None:
         for name in ("a", "b", "c"):
@@ -215,14 +209,20 @@ class TestDataset:
         with pytest.raises(PredictorError, match="has no home yet: run `sionna-partial dataset` again"):
             read_dataset(folder)
 
-    def test_no_dataset(self, tmp_path: Path) -> None:
-        with pytest.raises(PredictorError, match=r"is no data set, it has no dataset\.json: give a folder that"):
-            read_dataset(tmp_path)
-
-    @pytest.mark.parametrize("text", ["", "[]", '{"homes": [3]}'])
-    def test_damaged_list(self, tmp_path: Path, text: str) -> None:
-        (tmp_path / "dataset.json").write_text(text)
-        with pytest.raises(PredictorError, match=r"dataset\.json' is damaged .*: build the data set again in a new"):
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            (None, r"is no data set, it has no dataset\.json: give a folder that"),
+            *(
+                (text, r"dataset\.json' is damaged .*: build the data set again")
+                for text in ("", "[]", '{"homes": [3]}')
+            ),
+        ],
+    )
+    def test_damaged_list(self, tmp_path: Path, text: str | None, message: str) -> None:
+        if text is not None:
+            (tmp_path / "dataset.json").write_text(text)
+        with pytest.raises(PredictorError, match=message):
             read_dataset(tmp_path)
 
 
@@ -230,16 +230,13 @@ _AT = (("one", 28e9), ("two", 60e9))
 
 
 class TestOpenLinks:
-    def test_table_does_not_say_how_it_was_traced(self):
-        table = make_table(homes=1)
-        assert open_links(table) == (table, None)
-
     @pytest.mark.parametrize(("noted", "found"), [(None, True), (True, True), (False, False)])
     def test_folder_says_how_it_was_traced(self, noted, found, tmp_path):
         table = make_table(homes=2)
         links, traces = open_links(make_dataset(tmp_path, table, frequency_hz=60e9, diffraction=noted))
         assert len(links) == len(table)
         assert traces == LinkTraces(60e9, found)
+        assert open_links(table) == (table, None)
 
     def test_no_links_with_receivers_indoors(self):
         table = make_table(homes=1)
@@ -279,10 +276,6 @@ class TestOpenLinks:
         with pytest.raises(PredictorError, match=re.escape(message)):
             open_links(dataset)
 
-    def test_no_data_set_there(self, tmp_path):
-        with pytest.raises(PredictorError, match="is no data set"):
-            open_links(tmp_path)
-
     def test_index_without_settings(self, tmp_path):
         folder = make_dataset(tmp_path, make_table(homes=1))
         index = json.loads((folder / "dataset.json").read_text())
@@ -291,33 +284,24 @@ class TestOpenLinks:
             open_links(folder)
 
 
-class TestSettingsFor:
-    def test_those_of_the_data_set(self):
-        found = settings_for(LinkTraces(60e9, False), networks="paths", passes=7, seed=8)
-        assert found == PredictorSettings("paths", frequency_hz=60e9, diffraction=False, passes=7, seed=8)
-
-    def test_by_default_it_sees_the_map(self):
-        assert settings_for(None) == PredictorSettings("map")
+def test_settings_for_are_those_of_the_data_set() -> None:
+    found = settings_for(LinkTraces(60e9, False), networks="paths", passes=7, seed=8)
+    assert found == PredictorSettings("paths", frequency_hz=60e9, diffraction=False, passes=7, seed=8)
+    assert settings_for(None) == PredictorSettings("map")
 
 
-class TestRequireLike:
-    TRACES = LinkTraces(28e9, True)
-
-    @pytest.mark.parametrize("found", [None, LinkTraces(28e9, True), LinkTraces(28e9 + 1.0, True)])
-    def test_the_same(self, found):
-        require_like(found, self.TRACES, "predictor 'x' was trained", "choose another.")
-
-    @pytest.mark.parametrize(
-        ("found", "words"),
-        [
-            (LinkTraces(60e9, True), "at 60 GHz with diffraction"),
-            (LinkTraces(28e9, False), "at 28 GHz without diffraction"),
-            (LinkTraces(28e9, True, True), "at 28 GHz through walls with diffraction"),
-        ],
-    )
-    def test_others(self, found, words):
-        message = f"dataset was traced {words}, predictor 'x' was trained at 28 GHz with diffraction: choose another."
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            require_like(
-                found, LinkTraces.of_settings(PredictorSettings()), "predictor 'x' was trained", "choose another."
-            )
+@pytest.mark.parametrize(
+    ("found", "words"),
+    [
+        (None, ""),
+        (LinkTraces(28e9, True), ""),
+        (LinkTraces(28e9 + 1.0, True), ""),
+        (LinkTraces(60e9, True), "at 60 GHz with diffraction"),
+        (LinkTraces(28e9, False), "at 28 GHz without diffraction"),
+        (LinkTraces(28e9, True, True), "at 28 GHz through walls with diffraction"),
+    ],
+)
+def test_traces_must_be_like_the_predictors(found: LinkTraces | None, words: str) -> None:
+    message = f"dataset was traced {words}, predictor 'x' was trained at 28 GHz with diffraction: choose another."
+    with pytest.raises(PredictorError, match=re.escape(message)) if words else nullcontext():
+        require_like(found, LinkTraces.of_settings(PredictorSettings()), "predictor 'x' was trained", "choose another.")

@@ -96,15 +96,6 @@ class TestLengths:
         expected_m = quadrature(partial, kind, start_m, end_m)
         np.testing.assert_allclose(SmoothLengths(partial, kind)(start_m, end_m), expected_m, atol=1e-6)
 
-    @pytest.mark.parametrize("shape", [(1, 1), (1, 7), (5, 1), (2, 2)])
-    @pytest.mark.parametrize("kind", [WALL, UNKNOWN])
-    def test_agree_with_quadrature_on_small_maps(self, shape, kind):
-        partial = PartialMap(np.full(shape, WALL), RESOLUTION_M, ORIGIN_M)
-        start_m, end_m = ends_around(partial, 50, margin_m=0.5)
-        expected_m = quadrature(partial, kind, start_m, end_m)
-        assert expected_m.any()
-        np.testing.assert_allclose(SmoothLengths(partial, kind)(start_m, end_m), expected_m, atol=1e-6)
-
     @pytest.mark.parametrize("kind", CellState)
     def test_between_zero_and_the_distance(self, kind):
         # Long segments through cells of the kind, between quarters of cells: rounding would exceed 1.
@@ -116,34 +107,12 @@ class TestLengths:
         assert (found_m >= 0.0).all()
         assert (found_m <= np.linalg.norm(end_m - start_m, axis=1)).all()
 
-    def test_no_segments(self):
-        smooth, none = SmoothLengths(random_map(), UNKNOWN), np.zeros((0, 3))
-        assert smooth(none, none).shape == smooth(np.zeros(3), none).shape == (0,)
-        assert [slope.shape for slope in smooth.slopes(none, none)] == [(0, 3), (0, 3)]
-
     def test_not_a_number(self):
         smooth = SmoothLengths(random_map(), UNKNOWN)
         start_m, end_m = np.full((3, 3), 1.0), np.full((3, 3), 2.0)
         start_m[[0, 1], [0, 2]] = np.nan
         assert np.isnan(smooth(start_m, end_m)).tolist() == [True, True, False]
         assert np.isnan(smooth.slopes(start_m, end_m)[1]).any(axis=1).tolist() == [True, True, False]
-
-
-class TestBesideTheExactLength:
-    def test_within_a_quarter_of_a_cell_diagonal_for_each_border_and_end(self):
-        partial = random_map(8, block=8, resolution_m=RESOLUTION_M / 4)
-        start_m, end_m = ends_around(partial, 2_000, margin_m=0.0)
-        step_m = np.abs(end_m - start_m)[:, :2]
-        askew = step_m.min(axis=1) > 0.3 * step_m.max(axis=1)
-        start_m, end_m = start_m[askew], end_m[askew]
-        t = np.linspace(0.0, 1.0, 2_000)[:, None, None]
-        unknown = partial.state_at(start_m + t * (end_m - start_m)) == UNKNOWN
-        allowed = 2 + (unknown[1:] != unknown[:-1]).sum(axis=0)
-        slant = np.linalg.norm(end_m - start_m, axis=1) / np.linalg.norm((end_m - start_m)[:, :2], axis=1)
-        exact_m = unobserved_lengths_m(partial, start_m, end_m)
-        error_m = np.abs(SmoothLengths(partial, UNKNOWN)(start_m, end_m) - exact_m)
-        assert (error_m <= allowed * slant * 0.25 * np.sqrt(2) * partial.resolution_m).all()
-        assert error_m.mean() < 0.1 * partial.resolution_m
 
 
 class TestSlopes:
@@ -156,24 +125,6 @@ class TestSlopes:
         error = np.abs(np.subtract(found, expected)).max(axis=(0, 2))
         assert np.quantile(error, 0.9) < 1e-7
         assert error.max() < 1e-5
-
-    @pytest.mark.parametrize(
-        ("start", "end"),
-        [
-            pytest.param((4.9, 1.0, 1.0), (4.9, 8.0, 2.0), id="along edge"),
-            pytest.param((5.0 + HALF_M, 1.0, 1.0), (5.0 + HALF_M, 8.0, 2.0), id="along middles"),
-            pytest.param((5.0 - HALF_M, 1.0, 1.0), (5.0 - HALF_M, 8.0, 2.0), id="along other middles"),
-            pytest.param((1.0, 3.0, 1.0), (8.0, 3.0, 1.0), id="across"),
-            pytest.param((1.0, 3.0 + HALF_M, 1.0), (8.0, 3.0 + HALF_M, 1.0), id="across in middles"),
-            pytest.param((5.05, 3.0, 1.0), (5.05, 3.0, 2.0), id="upright"),
-            pytest.param((5.0 + HALF_M, 3.0 + HALF_M, 1.0), (5.0 + HALF_M, 3.0 + HALF_M, 2.0), id="upright, middle"),
-        ],
-    )
-    def test_agree_with_finite_differences_along_axes(self, start, end):
-        smooth = SmoothLengths(half_plane(5.0), UNKNOWN)
-        start_m, end_m = np.array([start]), np.array([end])
-        expected = differences(smooth, start_m, end_m, 1e-3)
-        np.testing.assert_allclose(smooth.slopes(start_m, end_m), expected, atol=1e-5)
 
     def test_do_not_jump(self):
         partial, angle = random_map(13), np.linspace(0.1, np.pi / 2 - 0.1, 20_000)

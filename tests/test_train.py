@@ -43,17 +43,26 @@ class TestSplitHomes:
             assert split_homes(HOMES, 0.0, seed) == (tuple(HOMES), ())
 
     @pytest.mark.parametrize(
-        ("homes", "share", "count"), [([], 0.3, "0 homes"), (["a"], 0.3, "1 home"), ([], 0.0, "0 homes")]
+        ("homes", "share", "error", "message"),
+        [
+            *(
+                (
+                    homes,
+                    share,
+                    PredictorError,
+                    f"dataset has {count}: give at least 2 to train on some and test on others, or",
+                )
+                for homes, share, count in (([], 0.3, "0 homes"), (["a"], 0.3, "1 home"), ([], 0.0, "0 homes"))
+            ),
+            *(
+                (HOMES, share, SettingsError, r"test_fraction = .* is not allowed: give a number in \[0, 0.99\]")
+                for share in (-0.1, 1.0, np.nan, "a")
+            ),
+        ],
     )
-    def test_too_few(self, homes, share, count):
-        message = f"dataset has {count}: give at least 2 to train on some and test on others, or test_fraction"
-        with pytest.raises(PredictorError, match=re.escape(message)):
+    def test_refused(self, homes, share, error, message):
+        with pytest.raises(error, match=message):
             split_homes(homes, share, 0)
-
-    @pytest.mark.parametrize("share", [-0.1, 1.0, np.nan, "a"])
-    def test_bad_share(self, share):
-        with pytest.raises(SettingsError, match=r"test_fraction = .* is not allowed: give a number in \[0, 0.99\]"):
-            split_homes(HOMES, share, 0)
 
 
 class TestTrain:

@@ -132,12 +132,6 @@ def test_better_than_as_many_walls_on_every_metre(unseen_home):
     assert rmse < 0.85 * other
 
 
-def test_missing_weights(monkeypatch, tmp_path):
-    monkeypatch.setattr("sionna_partial.prediction.unseen_walls.WEIGHTS_FILE", tmp_path / "unseen_walls.npz")
-    with pytest.raises(PredictorError, match=r"unseen_walls\.npz' cannot be read"):
-        UnseenWalls.shipped.__wrapped__(UnseenWalls)
-
-
 def test_damaged_weights(monkeypatch, tmp_path):
     """The package lists the SHA-256: neither weights that are not finite nor bytes that are no archive are read."""
     path = tmp_path / "unseen_walls.npz"
@@ -150,6 +144,9 @@ def test_damaged_weights(monkeypatch, tmp_path):
         path.write_bytes(content)
         with pytest.raises(PredictorError, match=r"unseen_walls\.npz' has SHA-256 .* was changed; install"):
             UnseenWalls.shipped.__wrapped__(UnseenWalls)
+    path.unlink()
+    with pytest.raises(PredictorError, match=r"unseen_walls\.npz' cannot be read"):
+        UnseenWalls.shipped.__wrapped__(UnseenWalls)
 
 
 def test_training_repeats_itself(unseen_home, tmp_path):

@@ -92,26 +92,19 @@ def with_layer(**changes: Any) -> dict[str, Any]:
     ("content", "message"),
     [
         ([1], "path = '*' holds no ValetudoMap: give a map in the JSON of Valetudo"),
-        (spoilt(__class="Map"), "path = '*' holds no ValetudoMap"),
         ({"map": None}, "path = '*' holds no ValetudoMap"),
         (spoilt(pixelSize=0), "pixelSize = 0 is not allowed: give a length in centimetres."),
-        (spoilt(pixelSize="5"), "pixelSize = '5' is not allowed"),
         (spoilt(size=None), "size.y = None is not allowed: give a length in centimetres."),
-        (spoilt(size={"y": 1e300}), "size.y = 1e+300 is not allowed"),
         (spoilt(layers=None), "layers = None is not allowed: give a map in the JSON of Valetudo"),
         (spoilt(layers=[]), "layers has no pixels of a floor or a segment (none): let the robot map a room first."),
-        (spoilt(layers=[{"type": "wall", "pixels": [1, 1]}]), "layers has no pixels of a floor or a segment (wall)"),
         (spoilt(layers=[7]), "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo writes."),
         (spoilt(entities=3), "entities = 3 is not allowed"),
         (with_layer(pixels=[1, 2, 3]), "layers[4].pixels has shape (3,): give whole numbers from 0 to"),
         (with_layer(pixels=[-1, 2]), "layers[4].pixels has values from -1 to 2: give whole numbers from 0 to"),
         (with_layer(pixels=[1.5, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
-        (with_layer(pixels=["a", 2]), "layers[4].pixels = ['a', 2] is not numeric: give whole numbers"),
         (with_layer(pixels=[10**30, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
-        (with_layer(pixels=[10**9, 2]), "layers[4].pixels has values from 2 to 1000000000: give whole numbers"),
         (with_layer(pixels=[10**7, 10**7]), "layers span 9999991 x 9999981 pixels, more than 100,000,000"),
         (with_layer(compressedPixels=[1, 1, 0]), "layers[4].compressedPixels has lengths of 0 to 0: give rows of"),
-        (with_layer(compressedPixels=[1, 1, 10**8] * 9), "compressedPixels has lengths of 100000000 to 100000000"),
     ],
 )
 def test_what_is_no_map(tmp_path: Path, content: object, message: str) -> None:
@@ -152,7 +145,6 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_coverage_of_rooms(tmp_path: Path) -> None:
-    """Rooms are a variable of the coverage, and rows of its area."""
     partial = sp.load_map(write_json(tmp_path / "home.json", valetudo_map()))
     coverage = sp.predict_map(partial, {"a": (6.0, 8.0, 1.5), "b": (10.0, 8.0, 1.5)}, spacing_m=0.5)
     assert coverage["room"].attrs["flag_meanings"] == "none bedroom kitchen"
@@ -171,35 +163,14 @@ def test_coverage_of_rooms(tmp_path: Path) -> None:
     plt.close("all")
 
 
-def test_position_of_an_access_point(tmp_path: Path) -> None:
-    """The powers of a recording and its map are in one frame, so that a transmitter is found where it is."""
-    content = recording()
-    partial = sp.load_map(write_json(tmp_path / "home.json", content["map"]))
-    rng, tx = np.random.default_rng(0), (10.6, 8.6, 1.5)
-    x_cm, y_cm = rng.uniform(560, 1140, 20), rng.uniform(1060, 1290, 20)
-    rx = np.column_stack([x_cm / 100, SIZE_CM / 100 - y_cm / 100, np.full(20, 0.1)])
-    good = partial.radios_can_stand(rx)
-    gain_db = sp.trace_links(partial, tx, rx[good]).gain_db
-    content["measurements"] = [
-        {"x": x, "y": y, "wifi": 0, "data": [gain + 18.0]}
-        for x, y, gain in zip(x_cm[good], y_cm[good], gain_db, strict=True)
-    ]
-    path = write_json(tmp_path / "home.vwm", content)
-    coverage = sp.predict_map(partial, None, measurements=path, spacing_m=1.0)
-    np.testing.assert_allclose(coverage.attrs["transmitter_m"][:2], tx[:2], atol=1.0)
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"measurements": []}, "has no measurements: let the robot drive while Valeronoi records."),
         ({"measurements": None}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 9, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
-        ({"measurements": [{"x": 1, "y": 2, "wifi": -2, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx[0, 0] = nan is not allowed"),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": ["-5"]}]}, "gain_db[0] = nan is not allowed"),
-        ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": [40]}]}, "gain_db[0] = 40 is not allowed"),
-        ({"wifis": {}}, "is damaged or no recording of Valeronoi ("),
         ({"map": {}}, "holds no ValetudoMap"),
     ],
 )

@@ -44,14 +44,6 @@ def all_seen() -> sp.PartialMap:
     return sp.PartialMap(state, 0.1)
 
 
-def test_loss_of_a_wall() -> None:
-    drywall = sp.Material.named("drywall")
-    losses = [wall_loss_db(drywall, 1e9 * band) for band in (2.4, 5.0, 28.0)]
-    assert losses == sorted(losses)
-    assert 2.0 < losses[0] < 4.0
-    assert wall_loss_db(sp.Material.named("metal"), 5e9) == MOST_LOSS_DB
-
-
 def test_walls_of_a_map_count_by_their_cells() -> None:
     partial, settings = half_seen(), (WIFI, sp.SceneSettings())
     losses = [wall_loss_db(sp.Material.named(name), 5e9) for name in ("drywall", "metal")]
@@ -77,13 +69,6 @@ def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
     np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0)
 
 
-def test_outages_stay() -> None:
-    phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
-    lost = replace(phi, gain_db=np.array([-150.0]), link_state=np.array([LinkState.OUTAGE], dtype=np.uint8))
-    found = LinkPrediction.of_mean_losses(lost, np.array([2.0]))
-    assert (found.p_outage.item(), found.gain_mean_db.item(), found.gain_std_db.item()) == (1.0, -150.0, 0.0)
-
-
 def some_links(count: int, wall_loss_db: float = 5.0) -> LinkFeatures:
     """Return equal links that are traced in LOS, with walls of some loss."""
     phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
@@ -92,14 +77,15 @@ def some_links(count: int, wall_loss_db: float = 5.0) -> LinkFeatures:
     return replace(phi, context=replace(phi.context, wall_loss_db=np.full(count, wall_loss_db)))
 
 
-def test_nothing_is_uncertain_about_walls_where_none_are_unseen() -> None:
-    phi, walls = some_links(2), np.zeros(2)
-    phi = replace(phi, link_state=np.array([LinkState.LOS, LinkState.NLOS], dtype=np.uint8))
-    found = LinkPrediction.of_mean_losses(phi, walls)
-    assert found.p_los.tolist() == [1.0, 0.0]
-    assert found.p_outage.tolist() == [0.0, 0.0]
+def test_without_unseen_walls_and_in_outage_nothing_is_uncertain() -> None:
+    phi = some_links(3)
+    states = np.array([LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE], dtype=np.uint8)
+    phi = replace(phi, link_state=states, gain_db=np.append(phi.gain_db[:2], -150.0))
+    found = LinkPrediction.of_mean_losses(phi, np.array([0.0, 0.0, 2.0]))
+    assert found.p_los.tolist() == [1.0, 0.0, 0.0]
+    assert found.p_outage.tolist() == [0.0, 0.0, 1.0]
     np.testing.assert_allclose(found.gain_mean_db, phi.gain_db)
-    np.testing.assert_allclose(found.gain_std_db, SEEN_STD_DB)
+    np.testing.assert_allclose(found.gain_std_db, [SEEN_STD_DB, SEEN_STD_DB, 0.0])
 
 
 def test_links_through_more_walls_than_a_path_may_cross_are_often_in_outage() -> None:

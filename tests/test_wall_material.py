@@ -96,28 +96,21 @@ class TestFiles:
         assert np.array_equal(read.wall_material, room().wall_material)  # type: ignore[arg-type]
 
     @pytest.mark.parametrize(
-        ("value", "message"),
+        ("key", "value", "message"),
         [
-            (["brick"], "has shades up to 2 for 1 materials"),
-            (["brick", None], "names none of its materials at entry 2"),
-            (["brick", "cheese"], "wall_material = 'cheese' is not allowed"),
-            ("brick", "give an image and a list of materials"),
+            ("materials", ["brick"], "has shades up to 2 for 1 materials"),
+            ("materials", ["brick", None], "names none of its materials at entry 2"),
+            ("materials", ["brick", "cheese"], "wall_material = 'cheese' is not allowed"),
+            ("materials", "brick", "give an image and a list of materials"),
+            ("material", ["brick"], r"wall_material has the unknown keys \['material'\]: give image and materi"),
         ],
     )
-    def test_damaged_ones_are_refused(self, value: object, message: str, tmp_path: Path) -> None:
+    def test_damaged_ones_are_refused(self, key: str, value: object, message: str, tmp_path: Path) -> None:
         sp.save_map(room(), tmp_path / "map.yaml")
         sheet = yaml.safe_load((tmp_path / "map.yaml").read_text())
-        sheet["wall_material"]["materials"] = value
+        sheet["wall_material"][key] = value
         (tmp_path / "map.yaml").write_text(yaml.safe_dump(sheet))
         with pytest.raises(MapError, match=message):
-            sp.load_map(tmp_path / "map.yaml")
-
-    def test_unknown_keys_are_refused(self, tmp_path: Path) -> None:
-        sp.save_map(room(), tmp_path / "map.yaml")
-        sheet = yaml.safe_load((tmp_path / "map.yaml").read_text())
-        sheet["wall_material"]["material"] = ["brick"]
-        (tmp_path / "map.yaml").write_text(yaml.safe_dump(sheet))
-        with pytest.raises(MapError, match=r"wall_material has the unknown keys \['material'\]: give image and materi"):
             sp.load_map(tmp_path / "map.yaml")
 
     def test_layers_of_a_drawing(self, tmp_path: Path) -> None:

@@ -20,7 +20,6 @@ OFFSET_DB = -35.0
 
 
 def flat() -> sp.PartialMap:
-    """Return four rooms in a row, complete, with a door in none of their walls."""
     cells = np.zeros((34, 98), dtype=np.uint8)
     cells[[0, 1, -2, -1]] = cells[:, [0, 1, 24, 25, 48, 49, 72, 73, -2, -1]] = sp.CellState.WALL
     return sp.PartialMap(cells, resolution_m=0.1)
@@ -77,6 +76,18 @@ class TestCandidates:
         found = WallMaterials.at(2.4e9)
         assert found.text(np.eye(16)[0]) == "drywall 1.00"
         assert found.text(0.6 * np.eye(16)[0] + 0.4 * np.eye(16)[7]) == "drywall .60, concrete .40"
+
+    def test_predictions_need_fewer_paths(self):
+        settings, power = sp.TraceSettings(2.4e9, diffraction=False), np.zeros(len(RX))
+        simulation, count = sp.Simulation(FLAT, settings), 0
+        for block in simulation.blocks(np.array(TX), RX, lambda *_: None):
+            np.add.at(power, block.path_rx, block.power)
+            count += len(block.a)
+        every = simulation.links(TX, RX)
+        missing_db = every.gain_db - path_gain_db(power)
+        assert count < 0.8 * len(every.a)
+        assert np.median(missing_db) < 0.1
+        assert missing_db.mean() < 0.2
 
 
 class TestPrediction:

@@ -25,7 +25,6 @@ POINTS = [{"bssid": f"00:11:22:33:44:{end}", "ssid": "home", "signal": -50} for 
 
 
 def valetudo_map(rows: str = ROOMS, *, compressed: bool = True, pixel_cm: int = PIXEL_CM) -> dict[str, Any]:
-    """Return a ValetudoMap as its JSON has it."""
     cells = np.array([[*row] for row in rows.split()])
     layers = []
     for mark in np.unique(cells):
@@ -61,11 +60,9 @@ def recording() -> dict[str, Any]:
 
 
 def write_json(path: Path, content: object) -> Path:
-    """Write a JSON file."""
     path.write_text(json.dumps(content), encoding="utf-8")
     return path
 
 
 def write_recording(path: Path) -> Path:
-    """Write the recording."""
     return write_json(path, recording())

@@ -1,4 +1,4 @@
-"""The newest answer of a window: coverage of its transmitters, their network, and what the page shows of them."""
+"""Newest coverage of a window, and the layers that the page shows."""
 
 import math
 from dataclasses import dataclass, field
@@ -16,12 +16,12 @@ from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.prediction.predictor import LinkPrediction
 
 LEVELS = ("power_mean_dbm", "gain_mean_db", "snr_mean_db")
-"""Layers whose scales have the threshold of received power."""
+"""Layers whose scales follow the threshold."""
 
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """Coverage of all transmitters on (tx, y, x), of several their network, and the same in the home as it is."""
+    """Coverage (tx, y, x), SINR of several transmitters, and the coverage of the whole home where it is known."""
 
     coverage: xr.Dataset
     eirp_dbm: Floats
@@ -32,11 +32,7 @@ class Answer:
     made: date = field(default_factory=date.today)
 
     def layers_of(self, name: str, threshold_dbm: float, *, truth: bool = False) -> xr.Dataset:
-        """Return the variables (y, x) of `predict_map` and `radio` of a transmitter, or of the strongest for "".
-
-        `power_mean_dbm`, `snr_mean_db`, `p_above` (the received power exceeds the threshold), and of several
-        transmitters `sinr_mean_db` and `best_server`.
-        """
+        """Return `p_above` and the other layers (y, x) of a transmitter, or of the strongest for ""."""
         coverage = self.truth if truth and self.truth is not None else self.coverage
         radio, eirp_dbm = coverage.radio, self.eirp_dbm
         power = radio.power(eirp_dbm=eirp_dbm)
@@ -55,7 +51,7 @@ class Answer:
         return one.assign(found)
 
     def thresholds(self, name: str, threshold_dbm: float) -> dict[str, float]:
-        """Return the threshold as received power [dBm], and as path gain and SNR [dB] of a transmitter, by layer."""
+        """Return the threshold by layer: received power [dBm], path gain and SNR of a transmitter [dB]."""
         names = [str(each) for each in self.coverage["tx"].to_numpy()]
         eirp_dbm = self.eirp_dbm[names.index(name)] if name in names else self.eirp_dbm.max()
         noise_dbm = LinkBudget(bandwidth_hz=self.settings.bandwidth_hz).noise_dbm
@@ -63,7 +59,7 @@ class Answer:
         return {name: threshold_dbm - offset for name, offset in zip(LEVELS, offsets, strict=True)}
 
     def agreement(self) -> tuple[float, float] | None:
-        """Return the fraction of correct link states on the free floor of the home, and the RMSE of the gain [dB]."""
+        """Return the fraction of correct link states on the free floor, and the RMSE of the gain [dB]."""
         if self.truth is None:
             return None
         here = (self.truth["valid"] & self.coverage["valid"]).to_numpy() == 1

@@ -1,11 +1,10 @@
-"""Floor plans as pictures whose scale is drawn on them, and corrections that are drawn on a map."""
+"""Floor plans as pictures, and corrections that are drawn on a map."""
 
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 
-import numpy as np
 import shapely
 
 from sionna_partial.app.files import stored_map
@@ -16,28 +15,26 @@ from sionna_partial.constants import PICTURE_SUFFIXES, WALL_THICKNESS_M, CellSta
 from sionna_partial.errors import MapError
 from sionna_partial.maps.drawings import read_picture, wall_shades
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import WALL_MATERIALS
 
-LENGTH, WALL, FREE = "length", "wall", "free"
-"""Strokes that measure a picture, add a wall and make cells free; others are names of materials."""
-
+LENGTH, WALL, FREE, BRUSH, AREA = "length", "wall", "free", "brush", "area"
 STROKES = {
     LENGTH: "measures a known length",
     WALL: "adds a straight wall",
     FREE: "erases walls",
-    **{name: f"makes walls of {name}" for name in WALL_MATERIALS},
+    BRUSH: "gives walls a material (brush)",
+    AREA: "gives walls a material (polygon)",
 }
-"""Kinds of strokes on the map, and what they do."""
+"""Kinds of strokes on the map, and their effects."""
 
-STRAIGHT = (LENGTH, WALL)
-"""Strokes that are lines from their first to their last point."""
+STRAIGHT, BRUSHES, PAINTS = (LENGTH, WALL), (FREE, BRUSH), (BRUSH, AREA)
+"""Strokes that are lines from their first to their last point, have a width, and have a material."""
 
 _MOST_POINTS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """A floor plan as a picture: shades with dark walls (rows, columns), and the edge of a pixel [m], if known."""
+    """A picture of a floor plan: shades (rows, columns), dark for walls, and the edge of a pixel [m], if known."""
 
     name: str
     content: bytes
@@ -47,12 +44,12 @@ class Plan:
 
     @property
     def size_m(self) -> tuple[float, float]:
-        """Width and height of the picture [m], in pixels before its scale is known."""
+        """Width and height [m], or [pixels] before the scale is known."""
         rows, columns = self.shade.shape
         return columns * (self.pixel_m or 1.0), rows * (self.pixel_m or 1.0)
 
     def read(self) -> PartialMap:
-        """Return the map of the plan, whose scale must be known."""
+        """Return the map of a plan with a scale."""
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
             path = stored_map([(self.name, self.content)], Path(folder))
             try:
@@ -63,7 +60,7 @@ class Plan:
 
 
 def uploaded_plan(files: Sequence[tuple[str, bytes]]) -> Plan | None:
-    """Read a picture of uploaded files (name, content); None if they are something else."""
+    """Read a picture from uploaded files (name, content); None for other files."""
     if len(files) != 1 or PurePath(files[0][0]).suffix.lower() not in PICTURE_SUFFIXES:
         return None
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
@@ -71,28 +68,34 @@ def uploaded_plan(files: Sequence[tuple[str, bytes]]) -> Plan | None:
     return Plan(*files[0], shade, threshold)
 
 
+def drawn(partial: PartialMap, strokes: Sequence["Stroke"]) -> PartialMap:
+    for stroke in strokes:
+        partial = stroke.on(partial)
+    return partial
+
+
 @dataclass(frozen=True)
 class Stroke:
-    """A correction of a map: one of `STROKES` along points [m], with a brush [m] unless it adds a wall."""
+    """A correction of a map along, or of the area within, points [m]; `BRUSHES` have a width [m]."""
 
     kind: str
     points_m: tuple[tuple[float, float], ...]
-    width_m: float
+    width_m: float = 0.0
+    material: str = ""
 
     def on(self, partial: PartialMap) -> PartialMap:
-        """Return the corrected map.
-
-        Raises
-        ------
-        MapError
-            If it has a mesh.
-        """
-        require(0 < len(self.points_m) <= _MOST_POINTS, "points", len(self.points_m), "draw a shorter line.")
-        points = np.array(self.points_m if len(self.points_m) > 1 else self.points_m * 2)
-        width_m = WALL_THICKNESS_M if self.kind == WALL else self.width_m
-        area = shapely.LineString(points).buffer(max(width_m, 1.5 * partial.resolution_m) / 2.0)
-        if self.kind not in (WALL, FREE):
-            return partial.with_wall_material(self.kind, area)
+        """Return the corrected map; only materials can be changed on a mesh (MapError)."""
+        count = len(self.points_m)
+        require(0 < count <= _MOST_POINTS, "points", count, "draw a shorter line.")
+        if self.kind == AREA:
+            require(count > 2, "corners of an area", count, "drag around it, or click on three or more corners.")
+            area = shapely.make_valid(shapely.Polygon(self.points_m))
+        else:
+            width_m = WALL_THICKNESS_M if self.kind == WALL else self.width_m
+            line = shapely.LineString(self.points_m if count > 1 else self.points_m * 2)
+            area = line.buffer(max(width_m, 1.5 * partial.resolution_m) / 2.0)
+        if self.kind in PAINTS:
+            return partial.with_wall_material(self.material, area)
         if partial.mesh is not None:
             raise MapError("walls are drawn on floor plans alone, and this map has a mesh: change its file.")
         state = partial.state.copy()

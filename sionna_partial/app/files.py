@@ -1,15 +1,19 @@
-"""Files of a window: uploaded maps, whose names are not trusted, and downloads of an answer."""
+"""Uploaded maps and projects, which are not trusted, and downloads."""
 
+import json
 import re
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
+from typing import Any
 
 import xarray as xr
 
 from sionna_partial.app.jobs import logged_warnings
+from sionna_partial.app.radio import MOST_TRANSMITTERS, RadioSettings, Transmitter, require_name
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import shown
+from sionna_partial.checks import require, shown
 from sionna_partial.constants import (
     BAG_SUFFIXES,
     DRAWING_SUFFIXES,
@@ -21,14 +25,16 @@ from sionna_partial.constants import (
 )
 from sionna_partial.errors import MapError
 from sionna_partial.export import save_coverage, save_network
-from sionna_partial.files import unzipped, zipped
-from sionna_partial.maps.map_files import load_map
+from sionna_partial.files import decoding, unzipped, zipped
+from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
+from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.plots.coverage_plot import report_pdf
+from sionna_partial.tracing.antennas import Antenna
 
 MOST_BYTES = 200_000_000
-"""Size of the files that are uploaded together [bytes]."""
+"""Largest upload [bytes]."""
 
 _IMAGES, _SHEETS = (".pgm", *PICTURE_SUFFIXES), (".yaml", ".yml")
 
@@ -36,11 +42,9 @@ MAP_SUFFIXES = (
     *(*_SHEETS, ".npz", *MESH_SUFFIXES, *POINT_SUFFIXES, *DRAWING_SUFFIXES, *IFC_SUFFIXES, *BAG_SUFFIXES),
     *VACUUM_SUFFIXES,
 )
-"""Maps that can be uploaded; a ROS map with its image, or as a zip of both."""
+"""Suffixes of maps; a ROS map comes with its image, or as a zip of both."""
 
 UPLOADED_SUFFIXES = (*MAP_SUFFIXES, *_IMAGES, ".zip")
-"""Files that can be uploaded for a map."""
-
 
 FILES = {
     "png": "coverage.png",
@@ -51,29 +55,23 @@ FILES = {
     "pdf": "report.pdf",
     "project": "project.zip",
 }
-"""Kinds of files that can be downloaded, and their names."""
+"""Downloads: kind and file name."""
+
+_MAP, _TEXT, _VERSION, _MOST_TEXT = "map.npz", "project.json", 1, 20_000_000
+_ARRAYS = ("tx", "rx", "gain_db", "std_db")
 
 
 def uploaded_map(files: Sequence[tuple[str, bytes]]) -> PartialMap:
-    """Read a map of files (name, content); warnings of its reader are logged.
-
-    Raises
-    ------
-    MapError
-        If it cannot be read.
-    """
+    """Read a map from files (name, content), or raise a MapError; the reader's warnings are logged."""
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():
         path = stored_map(files, Path(folder))
         return read_ros_map(path, confined=True) if path.suffix in _SHEETS else load_map(path)
 
 
 def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
-    """Write an uploaded map, or a picture, under names of ours: of the names of its files only the suffixes count.
+    """Write an uploaded map or picture under our own file names; only the suffixes are kept.
 
-    Raises
-    ------
-    MapError
-        For other files than a map of `MAP_SUFFIXES`, or more than `MOST_BYTES`.
+    Other files than one map of `MAP_SUFFIXES`, or more than `MOST_BYTES` unzipped, raise a MapError.
     """
     if len(files) == 1 and PurePath(files[0][0]).suffix.lower() == ".zip":
         files = _unzipped(files[0][1])
@@ -97,7 +95,6 @@ def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
 
 
 def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
-    """Return the files of a zip, which may not unpack to more than `MOST_BYTES`."""
     try:
         return [*unzipped(content, MOST_BYTES).items()]
     except ValueError as error:
@@ -112,10 +109,7 @@ def coverage_file(
     threshold_dbm: float,
     heading: Sequence[str] = (),
 ) -> bytes:
-    """Return a file of one of `FILES` of a coverage; a ROS map is a zip, of several transmitters of their network.
-
-    `heading` is for the report.
-    """
+    """Return the content of one of `FILES`; a ROS map is a zip. `heading` is for the report."""
     if kind == "pdf":
         return report_pdf(coverage, eirp_dbm, threshold_dbm, heading)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
@@ -126,3 +120,98 @@ def coverage_file(
             save_coverage(coverage.isel(tx=0) if kind == "yaml" else coverage, path)
         made = {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}
         return made[path.name] if kind != "yaml" else zipped(made)
+
+
+@dataclass(frozen=True)
+class Project:
+    """State of a window."""
+
+    partial: PartialMap
+    title: str
+    transmitters: Mapping[str, Transmitter] = field(default_factory=dict)
+    settings: RadioSettings | None = None
+    measured: Measurements | None = None
+
+
+def project_file(project: Project) -> bytes:
+    """Return a zip of an `.npz` map and a JSON."""
+    measured = project.measured
+    record = {
+        "version": _VERSION,
+        "title": project.title,
+        "transmitters": {name: asdict(each) for name, each in project.transmitters.items()},
+        "settings": None if project.settings is None else asdict(project.settings),
+        "measured": None if measured is None else _measured_record(measured),
+    }
+    with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
+        save_map(project.partial, Path(folder) / _MAP)
+        return zipped({_MAP: (Path(folder) / _MAP).read_bytes(), _TEXT: json.dumps(record, indent=1).encode()})
+
+
+def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
+    """Read a project from uploaded files (name, content); None for other files.
+
+    A damaged project, or values out of range, raise a SionnaPartialError.
+    """
+    if len(files) != 1 or PurePath(files[0][0]).suffix.lower() != ".zip":
+        return None
+    try:
+        contents = unzipped(files[0][1], MOST_BYTES)
+    except ValueError:  # `uploaded_map` raises an error with the reason
+        return None
+    if _TEXT not in contents:
+        return None
+    with decoding(Path("project.zip"), "was not saved by the app", MapError, "save it again."):
+        require(len(contents[_TEXT]) <= _MOST_TEXT, _TEXT, len(contents[_TEXT]), f"give up to {_MOST_TEXT:,} bytes.")
+        record = json.loads(contents[_TEXT])
+        require(record["version"] == _VERSION, "version", record["version"], f"this version reads {_VERSION}.")
+        with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
+            (Path(folder) / _MAP).write_bytes(contents[_MAP])
+            partial = load_map(Path(folder) / _MAP)
+        return _project(partial, record)
+
+
+def _project(partial: PartialMap, record: dict[str, Any]) -> Project:
+    title, settings, measured, transmitters = str(record["title"])[:100], record["settings"], record["measured"], {}
+    require(
+        len(record["transmitters"]) <= MOST_TRANSMITTERS, "transmitters", len(record["transmitters"]), "give fewer."
+    )
+    for name, values in record["transmitters"].items():
+        require_name(name)
+        transmitters[name] = Transmitter(**values | {"antenna": Antenna(**values["antenna"])})
+    return Project(
+        partial,
+        title,
+        transmitters,
+        None if settings is None else RadioSettings(**settings),
+        None if measured is None else Measurements(**measured),
+    )
+
+
+def _measured_record(measured: Measurements) -> dict[str, Any]:
+    arrays = {name: getattr(measured, name) for name in _ARRAYS}
+    listed = {name: None if values is None else values.tolist() for name, values in arrays.items()}
+    return {**listed, "sensitivity_db": measured.sensitivity_db}
+
+
+def script(project: Project, python_map: Sequence[str]) -> str:
+    """Return the Python lines that compute the coverage of a project, whose map some lines read."""
+    settings, transmitters = project.settings or RadioSettings(), project.transmitters.values()
+    powers, antennas = [each.eirp_dbm for each in transmitters], [each.antenna for each in transmitters]
+    trace = [f"frequency_hz={settings.frequency_hz!r}"]
+    trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
+    given = [f"rx_height_m={settings.rx_height_m!r}", f"spacing_m={settings.spacing_m!r}"]
+    given += [f"trace_settings=sp.TraceSettings({', '.join(trace)})"]
+    given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
+    given += ['measurements="measured.csv"'] if project.measured is not None else []
+    if any(each != Antenna() for each in antennas):
+        given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
+    tx_m = {name: each.position_m for name, each in project.transmitters.items()}
+    lines = [
+        *("import sionna_partial as sp", "", *python_map, f"tx = {tx_m!r}"),
+        *("coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"),
+        f"power = coverage.radio.power(eirp_dbm={powers!r})",
+        f"area = coverage.radio.area({settings.threshold_dbm!r}, eirp_dbm={powers!r})",
+        'coverage.radio.save("coverage.nc")',
+    ]
+    return "\n".join(lines) + "\n"

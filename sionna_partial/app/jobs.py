@@ -1,4 +1,4 @@
-"""Jobs of the app: they can be cancelled, take turns with the jobs of other windows, and collect warnings."""
+"""Jobs that can be cancelled, take turns with the jobs of other windows, and collect warnings."""
 
 import logging
 import threading
@@ -10,12 +10,12 @@ from dataclasses import dataclass
 
 
 class CancelledError(Exception):
-    """A job that is not wanted any more."""
+    """A job was cancelled."""
 
 
 @dataclass(frozen=True)
 class Status:
-    """Status on the page: a message, the fraction of the work that is done or None, and whether it is an error."""
+    """Status line: message, completed fraction or None, and whether it is an error."""
 
     message: str = ""
     fraction: float | None = None
@@ -23,27 +23,25 @@ class Status:
 
 
 class Turns:
-    """A lock that waiting threads get in the order in which they came."""
+    """A first-come, first-served lock."""
 
     def __init__(self) -> None:
         self._queue: deque[int] = deque()
         self._changed = threading.Condition()
 
     def __enter__(self) -> None:
-        """Wait for the turn."""
         me = threading.get_ident()
         with self._changed:
             self._queue.append(me)
             self._changed.wait_for(lambda: self._queue[0] == me)
 
     def __exit__(self, *_: object) -> None:
-        """End the turn."""
         with self._changed:
             self._queue.popleft()
             self._changed.notify_all()
 
     def pass_on(self) -> None:
-        """Let those that wait have their turns, if this thread has it, and return with the next turn."""
+        """Let waiting threads have their turns, if this thread has it, and return with the next turn."""
         with self._changed:
             is_wanted = len(self._queue) > 1 and self._queue[0] == threading.get_ident()
         if is_wanted:
@@ -52,11 +50,11 @@ class Turns:
 
 
 TURNS = Turns()
-"""One job computes at a time; others go on at its next report, which is made after each block of links."""
+"""One job computes at a time; others continue at its next report, after each block of links."""
 
 
 class Job:
-    """A piece of work, which ends at its next report when it is cancelled."""
+    """A computation that ends at its next report when it is cancelled."""
 
     def __init__(self, tell: Callable[["Job", Status], None]) -> None:
         self.is_cancelled = threading.Event()
@@ -64,13 +62,12 @@ class Job:
         self._tell = tell
 
     def report(self, fraction: float, message: str) -> None:
-        """Tell the progress, and let other jobs compute."""
         if not self.is_cancelled.is_set():
             self._tell(self, Status(message, fraction))
         self.pass_on()
 
     def pass_on(self) -> None:
-        """Let other jobs compute; raise a `CancelledError` when this one is not wanted any more."""
+        """Let other jobs compute; raise a `CancelledError` when this one was cancelled."""
         if not self.is_cancelled.is_set():
             TURNS.pass_on()
         if self.is_cancelled.is_set():
@@ -78,7 +75,7 @@ class Job:
 
 
 class _Collector(logging.Handler):
-    """Collects each warning of one thread once."""
+    """Handler that collects each warning of one thread once."""
 
     def __init__(self, found: list[str]) -> None:
         super().__init__(logging.WARNING)
@@ -104,7 +101,7 @@ def collected_warnings(found: list[str] | None = None) -> Iterator[list[str]]:
 
 @contextmanager
 def logged_warnings() -> Iterator[None]:
-    """Log the `UserWarning` of readers, each time; no report may be made within, as the filters are the process's."""
+    """Log each `UserWarning` of readers; warning filters belong to the process, so no report may be made within."""
     try:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", UserWarning)

@@ -1,4 +1,4 @@
-"""The page of the app: the state of a session drawn by Bokeh, and clicks that are handed to the session."""
+"""The page of the app: draws the state of a session with Bokeh, and passes clicks to the session."""
 
 import functools
 import html
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import LENGTH, STRAIGHT, STROKES
+from sionna_partial.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Stroke
 from sionna_partial.app.files import FILES
 from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour
 from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
@@ -20,7 +20,7 @@ from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.resources import demo_homes
-from sionna_partial.settings import material_name
+from sionna_partial.settings import WALL_MATERIALS, material_name
 
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
 _AIM = 0.06
@@ -34,9 +34,10 @@ _FILE_NAMES = {
     "tif": "GeoTIFF",
     "yaml": "ROS map",
     "pdf": "Report (PDF)",
-    "project": "Project",
+    "project": "Save the project",
 }
 
+_AREA_HINT = "Drag around the area, or click on its corners and double-click on the last one."
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
 const copied = navigator.clipboard ? navigator.clipboard.writeText(area.value) : Promise.reject()
@@ -50,14 +51,7 @@ TEMPLATE = Path(__file__).with_name("page.html").read_text(encoding="utf-8")
 
 
 class Page:
-    """Page of one window.
-
-    Parameters
-    ----------
-    document : bokeh.document.Document
-    files_url : str
-        Under which its files are downloaded.
-    """
+    """Page of one window, whose files are downloaded below `files_url`."""
 
     def __init__(self, document: Any, files_url: str) -> None:
         from bokeh.models import CustomJS
@@ -123,6 +117,8 @@ class Page:
         self.example = self._on(Select(title="Example home", options=homes), self._open_example)
         self.map_text = Div(name="map_text", sizing_mode="stretch_width")
         self.stroke = self._on(Select(title="Dragging on the map", name="stroke", value=""), lambda _: self.show())
+        self.hint = Div(text=_AREA_HINT)
+        self.paint = Select(title="Material", name="paint", options=[*WALL_MATERIALS], value="concrete")
         self.brush = Spinner(title="Brush [m]", name="brush", low=0.05, high=20, step=0.05, value=0.5)
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
@@ -211,7 +207,7 @@ class Page:
             self._button(name)
             for name in (
                 "Open a map, floor plan or project\u2026",
-                "Learn from measurements (CSV)\u2026",
+                "Learn from measurements\u2026",
                 "Copy as Python",
             )
         )
@@ -235,7 +231,9 @@ class Page:
                 self.map_text,
                 _pair(self.length, self.dark),
                 self.stroke,
-                _pair(self.brush, self.undo),
+                self.hint,
+                _pair(self.paint, self.brush),
+                self.undo,
             ),
             "transmitters": _wide(
                 _pair(self.chosen, self.name),
@@ -296,12 +294,12 @@ class Page:
             self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
 
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
-        """Choose the transmitter that is clicked or dragged. To clear the selection here would end a drag."""
+        """Choose a clicked or dragged transmitter; clearing the selection here would end a drag."""
         if new and not self._is_showing:
             self._choose(self.picture.points.data["name"][new[-1]])
 
     def _on_stroke(self, _name: str, _old: Any, new: Any) -> None:
-        """Take a stroke: a length waits for its number, a correction is shown on the map."""
+        """Keep a drawn length until its number is typed, or draw a correction."""
         points_m = [*zip(map(float, new["x"]), map(float, new["y"]), strict=True)]
         if not points_m or self._is_showing:
             return
@@ -309,7 +307,9 @@ class Page:
             self._line_m = points_m
             return
         self.picture.stroke.data = {"x": [], "y": [], "r": []}
-        self._guarded(self.session.draw, self.stroke.value, points_m, float(self.brush.value or 0.0))
+        material = self.paint.value if self.stroke.value in PAINTS else ""
+        stroke = Stroke(self.stroke.value, tuple(points_m), float(self.brush.value or 0.0), material)
+        self._guarded(self.session.draw, stroke)
 
     def _open_example(self, name: str) -> None:
         if name:
@@ -337,7 +337,6 @@ class Page:
     # Updates
 
     def show(self) -> None:
-        """Draw the state of the session."""
         self._is_showing = True
         try:
             self._show_status()
@@ -352,7 +351,6 @@ class Page:
             self._is_showing = False
 
     def _once(self, name: str, key: tuple[Any, ...], draw: Callable[[], None]) -> None:
-        """Draw changes only."""
         if self._drawn.get(name) != key:
             draw()
             self._drawn[name] = key
@@ -364,7 +362,7 @@ class Page:
             text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'
         answer = self.session.answer
         if answer is not None and status.fraction is None and "wall_material" in answer.coverage.attrs:
-            text += f" Walls: {html.escape(str(answer.coverage.attrs['wall_material']))}."
+            text += f" Probability of wall materials: {html.escape(str(answer.coverage.attrs['wall_material']))}."
         colour = "#a1232f" if status.is_error else "#1a1a1a"
         self.message.text = f'<span style="color:{colour}">{text}</span>'
         self.cancel.visible = status.fraction is not None
@@ -400,7 +398,8 @@ class Page:
         self.stroke.options = options if is_measured else [(LENGTH, STROKES[LENGTH])]
         if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
             self.stroke.value = self.stroke.options[0][0]
-        self.brush.visible = self.stroke.value not in ("", *STRAIGHT)
+        for model, kinds in ((self.brush, BRUSHES), (self.paint, PAINTS), (self.hint, (AREA,))):
+            model.visible = self.stroke.value in kinds
         self._once("unit", (is_measured,), lambda: self.picture.show_unit("m" if is_measured else "pixels"))
 
     def _show_transmitters(self) -> None:
@@ -458,7 +457,7 @@ class Page:
         self.measured_text.text = f"{len(used)} measured points{unused}"
 
     def _aimed(self) -> dict[str, list[list[float]]]:
-        """Return lines from transmitters with a main direction along it [m]."""
+        """Return lines [m] along the main directions of antennas."""
         partial, lines = self.session.partial, []
         length_m = 0.0 if partial is None else _AIM * partial.resolution_m * max(partial.shape)
         for each in self.session.transmitters.values():
@@ -502,7 +501,6 @@ class Page:
 
 
 _USED, _UNUSED = "#ee6677", "#ffffff"
-"""Colours of measured points."""
 
 _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (
@@ -511,7 +509,6 @@ _LINKS = (
 
 
 def _pair(*models: Any) -> Any:
-    """Put models beside each other, over the whole width."""
     from bokeh.layouts import row
 
     for model in models:
@@ -520,7 +517,6 @@ def _pair(*models: Any) -> Any:
 
 
 def _wide(*models: Any) -> Any:
-    """Put models below each other, over the whole width."""
     from bokeh.layouts import column
 
     for model in models:
@@ -529,13 +525,12 @@ def _wide(*models: Any) -> Any:
 
 
 def _are_drawn(rows: dict[str, Any], drawn: dict[str, Any]) -> bool:
-    """Return whether the page has these transmitters, up to rounding: to send them again would disturb a drag."""
+    """Return whether the page has these transmitters, up to rounding: sending them again would disturb a drag."""
     same = all([*drawn[name]] == rows[name] for name in ("name", "colour"))
     return same and all(np.allclose(drawn[axis], rows[axis], rtol=0.0, atol=ROUNDING_M) for axis in "xy")
 
 
 def _legend(partial: PartialMap) -> str:
-    """Return the colours of walls whose material is known."""
     used = np.unique(0 if partial.wall_material is None else partial.wall_material)
     materials = [partial.wall_materials[number - 1] for number in used if number]
     return "".join(
@@ -545,7 +540,7 @@ def _legend(partial: PartialMap) -> str:
 
 
 def _summary(answer: Answer, threshold_dbm: float) -> str:
-    """State how much of the floor is covered, and in a home that is known, how good the prediction is."""
+    """Return the covered fractions, and the errors in a home that is known."""
     given: dict[str, Any] = {"probability": LIKELY, "eirp_dbm": answer.eirp_dbm}
     area = answer.coverage.radio.area(threshold_dbm, **given)["fraction"]
     rows = [*zip(answer.coverage["tx"].to_numpy(), *area.to_numpy()[:2], strict=True)]
@@ -560,4 +555,4 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
-    return text + " Hatched: not observed."
+    return text + (" Hatched: not observed." if not answer.coverage.attrs["map_complete"] else "")

@@ -1,4 +1,4 @@
-"""The plot of the page: map, layers with their colour bars, transmitters, measured points, next views."""
+"""Plot of the page: map, layers, transmitters, measured points and next views."""
 
 import math
 from typing import Any
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.app.answer import LEVELS, Answer
-from sionna_partial.app.drawing import LENGTH, STRAIGHT, Plan
+from sionna_partial.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
 from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
@@ -19,37 +19,43 @@ from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes,
 from sionna_partial.settings import WALL_MATERIALS, Material, material_name
 
 LIKELY = 0.9
-"""Probability with which an area counts as covered."""
+"""Probability at which an area counts as covered."""
 
 OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
-"""Layers whose line at the threshold is drawn."""
+"""Layers with a line at the threshold."""
 
 LAYERS = radio_layers(MOST_TRANSMITTERS)
-"""Layers by the name of their variable."""
 
 _UNSELECT = "points.selection_manager.clear()"
-"""Ends the selection by a click: otherwise the next drag would move the clicked transmitter as well."""
+"""Otherwise the next drag would move a clicked transmitter as well."""
 
 _STROKE = """
-if (mode.value == "") return
-const {x, y} = cb_obj, data = name == "tap" || name == "panstart" ? {x: [], y: []} : live.data
+const is_area = mode.value == encloses
+if (mode.value == "" || name == "doubletap" && !is_area) return
+const {x, y} = cb_obj, data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
 const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
 xs.push(x); ys.push(y)
-const drawn = {x: xs, y: ys, r: xs.map(() => mode.value == measures ? 0 : brush.value / 2)}
-const is_done = name == "tap" || name == "panend"
+const drawn = {x: xs, y: ys, r: xs.map(() => wide.includes(mode.value) ? brush.value / 2 : 0)}
+const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
-"""Draws a stroke, and gives it to the session at its end."""
+"""Draws a stroke in the browser, and sends it at its end."""
 
 _COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc"]
 _OTHER, _PEN = "#004488", "#0066ff"
-"""Colours of walls of `WALL_MATERIALS`, of other ones, and of strokes."""
+"""Colours of `WALL_MATERIALS`, of other walls, and of strokes."""
+
+_BELOW_PIXELS = 130
+"""Height of axis and colour bar of every layer."""
+
+_HANDLE_PIXELS = 44
+"""Diameter in which a finger grabs a transmitter."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
 _MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
 _STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
-"""Step of the scales of levels [dB], and number of steps below and above the threshold."""
+"""Steps of scales [dB], and their number below and above the threshold."""
 
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
@@ -61,7 +67,7 @@ _TOOLTIPS = (
     ("P(above threshold)", "@p_above{0.00}"),
 )
 _GROUND, _WALLS = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9"), ("#00000000", "#000000", "#00000000", "#ffffff60")
-"""Colours of free cells, walls, unknown cells and their hatch, below the coverage and above it."""
+"""Colours of free cells, walls, unknown cells and hatches, below and above the coverage."""
 
 _LABEL: dict[str, Any] = {
     "text_baseline": "middle",
@@ -73,8 +79,6 @@ _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
 
 
 class Picture:
-    """Plot of one window."""
-
     def __init__(self) -> None:
         from bokeh.models import ColumnDataSource, DataRange1d, FixedTicker, LinearColorMapper
         from bokeh.plotting import figure
@@ -102,6 +106,7 @@ class Picture:
             tools="pan,wheel_zoom,box_zoom,reset",
             active_drag=None,
             active_scroll=None,
+            min_border_bottom=_BELOW_PIXELS,
             background_fill_color="#d9dce0",
         )
         self.plot = plot
@@ -118,7 +123,7 @@ class Picture:
             name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below") for name, layer in LAYERS.items()
         }
         for name, (_, bar) in self.parts.items():
-            bar.title = bar.title or LAYERS[name].title  # one height of all bars: the map stays where it is
+            bar.title = bar.title or LAYERS[name].title  # bars of one height
             if name in LEVELS:
                 bar.ticker = FixedTicker()
         for colour, width in (("white", 4), ("black", 2)):
@@ -128,22 +133,25 @@ class Picture:
         self._add_marks()
 
     def _add_marks(self) -> None:
-        """Draw measured points, routes, views and transmitters on top, with the tools that read and move them."""
+        """Draw the top layers, with the tools that read and move them."""
         from bokeh.models import CustomJS, HoverTool, PointDrawTool
 
         plot = self.plot
         for source in (self.stroke, self._live):
             plot.circle("x", "y", radius="r", source=source, fill_color=_PEN, line_color=None, alpha=0.4)
             plot.line("x", "y", source=source, line_color=_PEN, line_width=3)
+            plot.scatter("x", "y", source=source, fill_color=_PEN, line_color=None)
+        self._area = plot.patch("x", "y", source=self._live, fill_color=_PEN, fill_alpha=0.3, line_color=None)
         plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self.poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self.aims, line_color="black", line_width=4)
         look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
-        points = plot.scatter("x", "y", source=self.points, marker="star", **look)
+        plot.scatter("x", "y", source=self.points, marker="star", **look)
         plot.text("x", "y", text="name", source=self.points, x_offset=13, **_LABEL)
-        tool = PointDrawTool(renderers=[points], empty_value="", description="Put and move transmitters")
+        handles = plot.scatter("x", "y", source=self.points, size=_HANDLE_PIXELS, alpha=0.0, nonselection_alpha=0.0)
+        tool = PointDrawTool(renderers=[handles], empty_value="", description="Put and move transmitters")
         hover = HoverTool(
             renderers=[parts[0] for parts in self.parts.values()],
             tooltips=[*_TOOLTIPS],
@@ -155,27 +163,29 @@ class Picture:
         plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
 
     def follow(self, mode: Any, brush: Any, threshold: Any) -> None:
-        """Draw strokes of a kind and a width that controls have, and the walls of a plan by a slider."""
+        """Draw strokes by the kind and width of two controls, and the walls of a plan by a slider."""
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
-        given |= {"straight": [*STRAIGHT], "measures": LENGTH}
-        for name in ("panstart", "pan", "panend", "tap"):
+        given |= {"straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
+        for name in ("panstart", "pan", "panend", "tap", "doubletap"):
             self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
-        code = "for (const tool of tools) tool.active = !mode.value"
-        mode.js_on_change("value", CustomJS(args={"tools": [*self._tools], "mode": mode}, code=code))
+        code = f"area.visible = mode.value == '{AREA}'; live.data = {{x: [], y: [], r: []}}"
+        code += "; for (const tool of tools) tool.active = !mode.value"
+        args = {"tools": [*self._tools], "mode": mode, "live": self._live, "area": self._area}
+        mode.js_on_change("value", CustomJS(args=args, code=code))
         shown = {"walls": self.wall_shades, "plan": self.plan, "slider": threshold}
         code = "walls.low = slider.value + 1; plan.visible = true"
         threshold.js_on_change("value", CustomJS(args=shown, code=code))
 
     def show_unit(self, unit: str) -> None:
-        """Name the unit of both axes."""
         for name, axis in (("x", self.plot.xaxis), ("y", self.plot.yaxis)):
             axis.axis_label = f"{name} [{unit}]"
 
     def show_map(self, partial: PartialMap | None, plan: Plan | None) -> None:
-        """Draw the cells of a map, or a plan that has no scale yet."""
-        self.stroke.data = {"x": [], "y": [], "r": []}
+        """Draw a map, or a plan that has no scale yet."""
+        for source in (self.stroke, self._live):
+            source.data = {"x": [], "y": [], "r": []}
         has_map = partial is not None
         (x0, y0, x1, y1), cells = (0.0, 0.0, *(plan.size_m if plan else (1.0, 1.0))), np.zeros((1, 1), np.uint8)
         colours = []
@@ -196,10 +206,7 @@ class Picture:
     def show_answer(
         self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool, outline: str = ""
     ) -> None:
-        """Draw the layers of a transmitter, or of the strongest for "", with scales that follow the threshold.
-
-        `outline` is one of `OUTLINES`.
-        """
+        """Draw the layers of a transmitter, or of the strongest for ""; `outline` is one of `OUTLINES`."""
         if answer is None:
             self.values.data = {column: [] for column in self.values.data}
             self.outline.data = {"xs": [], "ys": []}
@@ -225,7 +232,7 @@ class Picture:
         self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
 
     def _show_scales(self, thresholds: dict[str, float], names: list[str]) -> None:
-        """Let scales of levels change colour in steps of 5 dB, with a break at the threshold; servers have names."""
+        """Set scales in steps of 5 dB whose colours break at the threshold, and the names of servers."""
         for name, threshold in thresholds.items():
             _, bar = self.parts[name]
             low, high = threshold - _BELOW * _STEP_DB, threshold + _ABOVE * _STEP_DB
@@ -237,7 +244,7 @@ class Picture:
         bar.color_mapper.update(palette=server_codes(MOST_TRANSMITTERS)[: len(names)], high=len(names) - 0.5)
 
     def show_views(self, views: NextViews | None) -> None:
-        """Draw the next views of a robot, and the ways to them."""
+        """Draw next views of a robot, and the ways to them."""
         shown = views or ()
         self.routes.data = {"xs": [view.path_m[:, 0] for view in shown], "ys": [view.path_m[:, 1] for view in shown]}
         self.poses.data = {
@@ -249,10 +256,7 @@ class Picture:
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the states of a map in 600 to 1000 rows or columns, walls before free before unknown.
-
-    3 is a hatch, 3 + k a wall of material k.
-    """
+    """Return the cells of a map in 600 to 1000 rows or columns: states, 3 for a hatch, 3 + k for material k."""
     merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
     ny, nx = (math.ceil(n / merge) for n in partial.shape)
     padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
@@ -273,7 +277,6 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
 
 
 def material_colour(material: Material) -> str:
-    """Return the colour in which its walls are drawn."""
     return dict(zip(WALL_MATERIALS, _COLOURS, strict=True)).get(material_name(material), _OTHER)
 
 

@@ -1,27 +1,28 @@
 """Transmitters and radio settings of a window, and presets of common bands."""
 
+import math
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
+
+import numpy as np
 
 from sionna_partial.checks import Checked, Within, require, require_choice
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.maps.partial_map import PartialMap, nearest_free_m
 from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
 
-MOST_TRANSMITTERS = 10
-"""Number of transmitters of one window."""
+MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS = 10, 1000, 30_000
 
 FINEST_M = 0.15
 """Default spacing of receivers [m]."""
 
 MATERIALS = ("", *WALL_MATERIALS)
-"""Materials of walls that can be chosen; "" is unknown."""
+"""Choices of wall materials; "" is unknown."""
 
 
 class Preset(NamedTuple):
-    """Usual values of a band: centre of a channel, power of a transmitter with its antenna, and useful threshold."""
-
     frequency_hz: float
     bandwidth_hz: float
     eirp_dbm: float
@@ -43,7 +44,7 @@ PRESETS = {
 
 @dataclass(frozen=True)
 class Transmitter(Checked):
-    """Position of a transmitter [m], its power [dBm], and its antenna, whose gain is added."""
+    """Position [m], power [dBm] and antenna of a transmitter; the antenna's gain is added."""
 
     x_m: Annotated[float, Within(-1e6, 1e6)]
     y_m: Annotated[float, Within(-1e6, 1e6)]
@@ -53,12 +54,11 @@ class Transmitter(Checked):
 
     @property
     def position_m(self) -> tuple[float, float, float]:
-        """World x, y and z [m]."""
         return self.x_m, self.y_m, self.z_m
 
 
 def require_name(name: str) -> None:
-    """Raise a SettingsError for a text that cannot be the name of a transmitter."""
+    """Raise a SettingsError for an invalid name of a transmitter."""
     good = re.fullmatch(r"[A-Za-z][\w-]{0,30}", name, re.ASCII)
     require(bool(good), "name", name, "give a letter, then letters, digits, _ or -, up to 31 in all.")
 
@@ -82,12 +82,10 @@ class RadioSettings(Checked):
 
     @property
     def trace_settings(self) -> TraceSettings:
-        """The settings of the trace."""
         return TraceSettings(self.frequency_hz, refraction=self.through_walls)
 
     @property
     def scene_settings(self) -> SceneSettings:
-        """The settings of the scene, by default where the material is unknown."""
         return SceneSettings(material=WALL_MATERIALS[self.material]) if self.material else SceneSettings()
 
     @property
@@ -95,3 +93,29 @@ class RadioSettings(Checked):
         """Name of the preset with these values, "" for none."""
         own = Preset(*(getattr(self, name) for name in Preset._fields))
         return next((name for name, preset in PRESETS.items() if preset == own), "")
+
+
+def usual_height_m(partial: PartialMap) -> float:
+    low_m, high_m = partial.height_range_m
+    return DEFAULT_HEIGHT_M if low_m < DEFAULT_HEIGHT_M < high_m else round((low_m + high_m) / 2.0, 2)
+
+
+def fitted(settings: RadioSettings, partial: PartialMap) -> RadioSettings:
+    """Return settings with receivers inside the rooms of a map, about `_MOST_RECEIVERS` or fewer."""
+    (x0, y0, x1, y1), (low_m, high_m) = partial.bounds_m, partial.height_range_m
+    height_m = settings.rx_height_m if low_m < settings.rx_height_m < high_m else usual_height_m(partial)
+    steps = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / _MOST_RECEIVERS) / 0.05)
+    return replace(settings, rx_height_m=height_m, spacing_m=max(FINEST_M, round(0.05 * steps, 2)))
+
+
+def placed(partial: PartialMap, transmitter: Transmitter) -> Transmitter:
+    """Return a transmitter in the nearest free cell, or itself if it needs no move; its height must be right."""
+    at_m = np.array(transmitter.position_m)
+    if partial.radios_can_stand(at_m[None])[0]:
+        return transmitter
+    free_m = nearest_free_m(partial, at_m[:2], _NEAREST_CELLS)
+    allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
+    if not allowed.any():
+        partial.require_positions("the transmitter", at_m)
+    x_m, y_m = free_m[allowed.argmax()].round(3).tolist()
+    return replace(transmitter, x_m=x_m, y_m=y_m)

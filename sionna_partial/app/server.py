@@ -1,7 +1,8 @@
-"""The server of the app: one page for each window, under a secret path, and the files that windows send and fetch."""
+"""Server of the app: a page for each window under a secret path, and its uploads and downloads."""
 
 import asyncio
 import functools
+import logging
 import secrets
 import socket
 from collections.abc import Mapping, Sequence
@@ -14,15 +15,14 @@ from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 
 LOOPBACK = "127.0.0.1"
-"""Address that programs of this machine alone reach."""
 
 _FIRST_EXAMPLE = "apartment"
 
 _OTHER_BYTES = 100_000
-"""Size of the body of a request that is no upload to an open window: a larger one ends the connection [bytes]."""
+"""Largest body of a request other than an upload to an open window [bytes]."""
 
 _FORM_BYTES = 1_000_000
-"""Size of an upload besides its files [bytes]."""
+"""Allowance for the form around uploaded files [bytes]."""
 
 _DOWNLOAD_HEADERS = {
     "Content-Type": "application/octet-stream",
@@ -34,19 +34,19 @@ _NOTHING_TO_SEND = 404, "There is nothing to send, or the window was closed."
 
 
 class AppServer:
-    """Serves the app until `stop`; without a map, windows begin with an example.
+    """Server of the app; without a map, windows open an example.
 
     Parameters
     ----------
     partial : PartialMap, optional
-        With `title`, the name of its file.
     title : str
+        Name of the map's file.
     address : str
         Address of the network interface.
     port : int
         0 is any free one.
     warnings : sequence of str
-        Warnings of the reader of the map, which the page shows.
+        Warnings of the map's reader.
 
     Attributes
     ----------
@@ -71,6 +71,7 @@ class AppServer:
         from bokeh.application.handlers.function import FunctionHandler
         from bokeh.server.server import Server
 
+        logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a window was closed during its job
         self._sessions, self._token = dict[str, Session](), secrets.token_urlsafe(24)
         self._open_first = functools.partial(Session.open_example, name=_FIRST_EXAMPLE)
         if partial is not None:
@@ -98,7 +99,7 @@ class AppServer:
         self.url = f"http://{address}:{self._server.port}{path}"
 
     def run(self) -> None:
-        """Serve in this thread."""
+        """Serve in this thread until `stop`."""
         self._server.start()
         self._server.io_loop.start()
 
@@ -130,7 +131,7 @@ class AppServer:
 
 
 def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]) -> tuple[int, str] | None:
-    """Return the HTTP status and the reason for which an upload is refused by its headers."""
+    """Return HTTP status and reason of an upload that is refused by its headers."""
     size = headers.get("Content-Length", "")
     if session is None or kind not in ("map", "measurements"):
         return _NOTHING_TO_SEND
@@ -146,7 +147,6 @@ def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]
 
 
 def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) -> None:
-    """Let a window read uploaded files (name, content), and show why it cannot."""
     try:
         if kind == "map":
             session.upload_map(files)
@@ -157,9 +157,9 @@ def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) ->
 
 
 class _Files:
-    """Handler of the files that a window sends and fetches; `key` is known to that window alone.
+    """Handler of uploads and downloads; only the window knows its `key`.
 
-    `_files_handler` adds tornado's base class, which is imported when the app is.
+    `_files_handler` adds tornado's base class, so that tornado is imported with the app only.
     """
 
     request: Any
@@ -173,7 +173,7 @@ class _Files:
         self._receiver: Session | None = None
 
     def prepare(self) -> None:
-        """Refuse an upload by its header, before anything of its body is read."""
+        """Refuse an upload before its body is read."""
         if self.request.method != "POST":
             return
         key, kind = self.path_args
@@ -187,12 +187,10 @@ class _Files:
         self.request.connection.set_max_body_size(MOST_BYTES + _FORM_BYTES)
 
     def data_received(self, chunk: bytes) -> None:
-        """Keep a part of an upload that `prepare` has accepted."""
         if self._receiver is not None:
             self._chunks.append(chunk)
 
     def on_finish(self) -> None:
-        """Let the window send again."""
         if self._receiver is not None:
             self._receiver.is_receiving = False
 

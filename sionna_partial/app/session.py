@@ -1,4 +1,4 @@
-"""One window of the app without its page: map, transmitters, settings, jobs that can be cancelled, newest answer."""
+"""One window of the app without its page: map, transmitters, settings, cancellable jobs, newest answer."""
 
 import functools
 import itertools
@@ -17,14 +17,30 @@ import numpy as np
 import xarray as xr
 
 from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Stroke, uploaded_plan
-from sionna_partial.app.files import FILES, coverage_file, uploaded_map
+from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Stroke, drawn, uploaded_plan
+from sionna_partial.app.files import (
+    FILES,
+    Project,
+    coverage_file,
+    project_file,
+    script,
+    uploaded_map,
+    uploaded_project,
+)
 from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
-from sionna_partial.app.project import Project, project_file, uploaded_project
-from sionna_partial.app.radio import FINEST_M, MOST_TRANSMITTERS, PRESETS, RadioSettings, Transmitter, require_name
+from sionna_partial.app.radio import (
+    MOST_TRANSMITTERS,
+    PRESETS,
+    RadioSettings,
+    Transmitter,
+    fitted,
+    placed,
+    require_name,
+    usual_height_m,
+)
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, reason_of, require, require_choice
-from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import COARSER, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
@@ -43,18 +59,15 @@ from sionna_partial.measurements.measurements import (
 )
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.resources import demo_homes, scenes_folder
-from sionna_partial.tracing.antennas import Antenna
 
 ROUNDING_M = 0.006
-"""Distance up to which a position of the picture is the same as a rounded one [m]."""
+"""Positions of the picture that are nearer than this are equal [m]."""
 
 FIRST_STEPS, MORE_STEPS = 100, 50
-"""Steps of the simulated robot when an example is opened, and at each request."""
+"""Steps of the simulated robot at first, and at each request."""
 
 _MEASURE = 'Drag along a length that you know, such as a wall; then type it in "Known length [m]" and press Enter.'
-_SAVED_MAP = 'partial = sp.load_map("map.npz")  # in the file that "Project" downloads, with everything drawn on it'
-
-_MOST_RECEIVERS, _NEAREST_CELLS = 30_000, 1000
+_SAVED_MAP = 'partial = sp.load_map("map.npz")  # in the file of "Save the project", with everything drawn on it'
 
 _log = logging.getLogger(__name__)
 
@@ -62,14 +75,8 @@ _log = logging.getLogger(__name__)
 class Session:
     """State of one window. Its methods are called in one thread; long computations run in another.
 
-    A new job cancels the one before it and drops its results, so that no old answer follows a newer one.
-
-    Parameters
-    ----------
-    call : callable
-        Runs a function in the thread of the session; called in any thread.
-    show : callable
-        Called in that thread when something has changed.
+    A new job cancels the one before it and drops its results. `call` runs a function in the thread of the session;
+    `show` is called in that thread after changes.
     """
 
     def __init__(self, call: Callable[[Callable[[], None]], object], show: Callable[[], None]) -> None:
@@ -106,9 +113,9 @@ class Session:
             self._waiting.popleft()()
 
     def close(self) -> None:
-        """Cancel the job, and accept no other."""
+        """Cancel the job, and accept no other one."""
+        self._call, self._show = lambda function: None, lambda: None
         self.cancel()
-        self._call = lambda function: None
         self._worker.shutdown(wait=False, cancel_futures=True)
 
     @property
@@ -120,26 +127,24 @@ class Session:
         return list(dict.fromkeys(found))
 
     def cancel(self) -> None:
-        """End the job, if there is one."""
         if self._job is not None:
             self._job.is_cancelled.set()
             self._job = None
             self._conclude(Status("Cancelled."))
 
     def refuse(self, error: object) -> None:
-        """Show why something was not done."""
         self.status = Status(str(error), is_error=True)
         self._show()
 
     # Maps
 
     def open_map(self, partial: PartialMap, title: str, warnings: Sequence[str] = ()) -> None:
-        """Take a map, with no transmitter yet, and the warnings of its reader."""
+        """Take a map without transmitters, and the warnings of its reader."""
         self._take_map(partial, title, [f"partial = sp.load_map({title!r})"], warnings)
         self.predict()
 
     def open_example(self, name: str) -> None:
-        """Open a demo home as a robot has seen it after some steps, with its transmitter."""
+        """Open a demo home as a robot has seen it, with its transmitter."""
         require_choice("home", name, demo_homes())
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
@@ -156,7 +161,6 @@ class Session:
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
-        """Let the simulated robot explore further, and predict on its new map."""
         home, name, seed, total = self.home, self.title, self._seed, self.steps + steps
         if home is None:
             raise SettingsError(
@@ -178,7 +182,6 @@ class Session:
         self.begin(work)
 
     def upload_map(self, files: Sequence[tuple[str, bytes]]) -> None:
-        """Read a map, or a project, of files (name, content)."""
         title = next((PurePath(name).name for name, _ in files), "")
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
@@ -191,8 +194,8 @@ class Session:
             elif partial is not None:
                 yield functools.partial(self.open_map, partial, title, warnings)
             elif project is not None:
-                placed = {name: _placed(project.partial, each) for name, each in project.transmitters.items()}
-                yield functools.partial(self._open_project, replace(project, transmitters=placed), warnings)
+                found = {name: placed(project.partial, each) for name, each in project.transmitters.items()}
+                yield functools.partial(self._open_project, replace(project, transmitters=found), warnings)
 
         self.begin(work)
 
@@ -208,7 +211,7 @@ class Session:
         self._ask(_MEASURE)
 
     def measure(self, line_m: Sequence[tuple[float, float]], length_m: float) -> None:
-        """Take the length [m] of a line that was drawn on the picture of a plan; its map has that scale."""
+        """Set the scale of a plan by the length [m] of a line that was drawn on it."""
         require(self.plan is not None, "known length", length_m, "open a floor plan as a picture first.")
         assert self.plan is not None
         drawn_m = math.dist(line_m[0], line_m[-1])
@@ -216,7 +219,7 @@ class Session:
         self.change_plan(pixel_m=(self.plan.pixel_m or 1.0) * length_m / drawn_m)
 
     def change_plan(self, **values: Any) -> None:
-        """Read a plan with another scale, which ends what was on the map, or another threshold of walls."""
+        """Read a plan with another threshold, or another scale, which removes everything on the map."""
         plan = replace(self.plan, **values) if self.plan else None
         if plan is None or plan.pixel_m is None:
             self.plan = plan
@@ -242,19 +245,17 @@ class Session:
 
         self.begin(work)
 
-    def draw(self, kind: str, points_m: Sequence[tuple[float, float]], width_m: float) -> None:
-        """Correct the map by a stroke of a brush."""
-        require_choice("stroke", kind, [name for name in STROKES if name != LENGTH])
-        self._redraw((*self.strokes, Stroke(kind, tuple(points_m), width_m)))
+    def draw(self, stroke: Stroke) -> None:
+        require_choice("stroke", stroke.kind, [name for name in STROKES if name != LENGTH])
+        self._redraw((*self.strokes, stroke))
 
     def undo(self) -> None:
-        """Take the last stroke back."""
         self._redraw(self.strokes[:-1])
 
     def _redraw(self, strokes: tuple[Stroke, ...]) -> None:
         self._map()
         assert self._bare is not None
-        partial, self.strokes = _drawn(self._bare, strokes), strokes
+        partial, self.strokes = drawn(self._bare, strokes), strokes
         self.partial = partial
         self._take_transmitters(self.transmitters)
 
@@ -264,30 +265,25 @@ class Session:
         self.plan, self.strokes, self.home = None, (), None
 
     def _take_map(self, partial: PartialMap, title: str, python: list[str], warnings: Sequence[str] = ()) -> None:
-        """Take a map without transmitters."""
         self._forget_map()
         self.title, self._warnings["map"] = title, [*warnings]
         self._fit(partial, python)
 
     def _change_map(self, partial: PartialMap, python: list[str]) -> None:
-        """Take a map of the same building, in its coordinates, and predict."""
+        """Take another map of the same building, and predict."""
         self._warnings, self.answer = {"map": [], "act": [], "job": []}, None
         self._fit(partial, python)
         self._take_transmitters(self.transmitters)
 
     def _fit(self, partial: PartialMap, python: list[str]) -> None:
         self._bare, self._python_map = partial, python
-        self.partial = partial = _drawn(partial, self.strokes)
-        (x0, y0, x1, y1), (low_m, high_m) = partial.bounds_m, partial.height_range_m
-        if not low_m < self.settings.rx_height_m < high_m:
-            self.settings = replace(self.settings, rx_height_m=self._usual_height_m())
-        steps = math.ceil(math.sqrt((x1 - x0) * (y1 - y0) / _MOST_RECEIVERS) / 0.05)
-        self.settings = replace(self.settings, spacing_m=max(FINEST_M, round(0.05 * steps, 2)))
+        self.partial = drawn(partial, self.strokes)
+        self.settings = fitted(self.settings, self.partial)
 
     # Transmitters and settings
 
     def put(self, positions: Sequence[tuple[str, float, float]]) -> None:
-        """Take the transmitters (name, x, y) [m] of the picture; a new one has no name yet."""
+        """Take the transmitters (name, x, y) [m] of the picture; new ones have no name yet."""
         if len(positions) > MOST_TRANSMITTERS:
             raise SettingsError(f"there are {MOST_TRANSMITTERS} transmitters already: remove one first.")
         found: dict[str, Transmitter] = {}
@@ -304,16 +300,10 @@ class Session:
         if found != self.transmitters:  # a drag of the picture moves none
             self._take_transmitters(found)
 
-    def _usual_height_m(self) -> float:
-        """Return the height of a new transmitter [m]: the default, or the middle of rooms that do not contain it."""
-        low_m, high_m = self._map().height_range_m
-        return DEFAULT_HEIGHT_M if low_m < DEFAULT_HEIGHT_M < high_m else round((low_m + high_m) / 2.0, 2)
-
     def _new_transmitter(self) -> Transmitter:
-        return Transmitter(0.0, 0.0, self._usual_height_m(), self.settings.eirp_dbm)
+        return Transmitter(0.0, 0.0, usual_height_m(self._map()), self.settings.eirp_dbm)
 
     def add(self) -> None:
-        """Put a transmitter into the free cell that is nearest to the middle of all free cells."""
         partial = self._map()
         free = np.argwhere(partial.state == CellState.FREE)
         require(len(free) > 0, "free cells", 0, "give a map with some.")
@@ -321,26 +311,19 @@ class Session:
         self.put([*((name, each.x_m, each.y_m) for name, each in self.transmitters.items()), ("", x_m, y_m)])
 
     def change(self, name: str, new_name: str | None = None, **values: Any) -> None:
-        """Change a transmitter, and its name."""
         require_choice("transmitter", name, self.transmitters)
         new_name = name if new_name is None else new_name.strip()
         require_name(new_name)
         require(new_name == name or new_name not in self.transmitters, "name", new_name, "another one has it.")
         changed = replace(self.transmitters[name], **values)
         self.chosen = new_name if self.chosen == name else self.chosen
-        self._take_transmitters(
-            {
-                new_name if each == name else each: changed if each == name else old
-                for each, old in self.transmitters.items()
-            }
-        )
+        pairs = [(new_name, changed) if key == name else (key, old) for key, old in self.transmitters.items()]
+        self._take_transmitters(dict(pairs))
 
     def remove(self, name: str) -> None:
-        """Take a transmitter away."""
         self._take_transmitters({each: old for each, old in self.transmitters.items() if each != name})
 
     def use_preset(self, name: str) -> None:
-        """Take frequency, bandwidth, threshold and power of a preset, the power for all transmitters."""
         require_choice("preset", name, PRESETS)
         values = PRESETS[name]._asdict()
         self.transmitters = {each: replace(old, eirp_dbm=values["eirp_dbm"]) for each, old in self.transmitters.items()}
@@ -348,12 +331,11 @@ class Session:
 
     @property
     def preset(self) -> str:
-        """Name of the preset that settings and transmitters have, "" for none."""
+        """Name of the preset in use, "" for none."""
         same = all(each.eirp_dbm == self.settings.eirp_dbm for each in self.transmitters.values())
         return self.settings.preset if same else ""
 
     def set(self, **values: Any) -> None:
-        """Change settings; all but the threshold are of the prediction."""
         self.settings = replace(self.settings, **values)
         if values.keys() <= {"threshold_dbm"}:
             self._show()
@@ -361,16 +343,16 @@ class Session:
             self.predict()
 
     def _take_transmitters(self, transmitters: dict[str, Transmitter]) -> None:
-        """Predict for transmitters; one that is in a wall or outside the map moves to the nearest free cell."""
-        placed = {name: _placed(self._map(), each) for name, each in transmitters.items()}
+        """Predict for transmitters; one that cannot be where it is moves to the nearest free cell."""
+        found = {name: placed(self._map(), each) for name, each in transmitters.items()}
         self._warnings["act"] = [
             f"{name} cannot be at ({old.x_m:g}, {old.y_m:g}): ({new.x_m:g}, {new.y_m:g}) is the nearest free cell."
-            for (name, old), new in zip(transmitters.items(), placed.values(), strict=True)
+            for (name, old), new in zip(transmitters.items(), found.values(), strict=True)
             if new is not old
         ]
-        self.transmitters, self.views = placed, None
-        if self.chosen not in placed:
-            self.chosen = next(iter(placed), "")
+        self.transmitters, self.views = found, None
+        if self.chosen not in found:
+            self.chosen = next(iter(found), "")
         if self.measured is not None and not self._are_ours(self.measured).any():
             self.measured = None
             self._warnings["act"].append(
@@ -379,12 +361,12 @@ class Session:
         self.predict()
 
     def _are_ours(self, measured: Measurements) -> Bools:
-        """Return whether each of the measured links (N,) is of a transmitter of this window."""
+        """Return which measured links (N,) are of a transmitter of this window."""
         sources_m = [np.array([transmitter.position_m]) for transmitter in self.transmitters.values()]
         return np.asarray(nearest_transmitters(measured.tx, sources_m).any(axis=0))
 
     def measured_points(self) -> tuple[Floats, Bools]:
-        """Return the receivers (N, 3) of the measurements [m], and whether each is used (N,)."""
+        """Return the measured receivers (N, 3) [m], and which of them are used (N,)."""
         measured, tx_m = self.measured, np.array([each.position_m for each in self.transmitters.values()])
         if measured is None or self.partial is None:
             return np.empty((0, 3)), np.empty(0, dtype=bool)
@@ -392,7 +374,6 @@ class Session:
         return measured.rx, used & self._are_ours(measured)
 
     def forget_measurements(self, *warnings: str) -> None:
-        """Predict without measurements."""
         self.measured, self._warnings["act"] = None, [*warnings]
         self.predict()
 
@@ -419,7 +400,7 @@ class Session:
     def predict(self) -> None:
         """Predict the coverage: a coarse picture first, then the fine one."""
         partial, settings, measured = self._map(), self.settings, self.measured
-        home = self.home and _drawn(self.home, self.strokes)
+        home = self.home and drawn(self.home, self.strokes)
         if not self.transmitters:
             self._ask('Click on the map to put a transmitter, or press "Add".')
             return
@@ -459,7 +440,6 @@ class Session:
         self.begin(work)
 
     def place(self) -> None:
-        """Move the chosen transmitter, or put the first one, to where it covers most."""
         partial, settings, name = self._map(), self.settings, self.chosen
         old = self.transmitters.get(name, self._new_transmitter())
         threshold_db = float(np.clip(settings.threshold_dbm - old.eirp_dbm, GAIN_FLOOR_DB + 1.0, 0.0))
@@ -482,7 +462,6 @@ class Session:
         self.begin(work)
 
     def find_views(self) -> None:
-        """Find from where a robot would learn most about the coverage."""
         partial, settings, tx_m = self._map(), self.settings, [*self._tx_m().values()]
         weakest_dbm = min(each.eirp_dbm for each in self.transmitters.values())
         threshold_db = float(np.clip(settings.threshold_dbm - weakest_dbm, GAIN_FLOOR_DB, 0.0))
@@ -500,7 +479,7 @@ class Session:
         self.begin(work)
 
     def learn(self, content: bytes, name: str = "measured.csv") -> None:
-        """Take measured gains or powers, a CSV or a recording of Valeronoi; without transmitter, of the chosen one."""
+        """Take measurements; those without transmitter are of the chosen one."""
         partial, all_m, tx_m = self._map(), self._tx_m(), self._tx_m()[self.chosen]
         frequency_hz = self.settings.frequency_hz
 
@@ -533,13 +512,13 @@ class Session:
         wanted = settings.trace_settings, settings.scene_settings
         if model is None or (model.simulation.trace_settings, model.simulation.scene_settings) != wanted:
             model, warnings = self._models[of] = LinkModel(partial, None, *wanted), []
-        with collected_warnings(warnings):  # the predictor's is logged once for a model, whichever job comes first
+        with collected_warnings(warnings):  # logged once for each model
             model.update(partial)
             _ = model.predictor_of_map
         return model
 
     def begin(self, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Start a job and cancel the one before: it yields functions to be called in the thread of the session."""
+        """Start a job, which yields functions to be called in the session's thread, and cancel the one before."""
         if self._job is not None:
             self._job.is_cancelled.set()
         job = self._job = Job(self._tell)
@@ -549,7 +528,7 @@ class Session:
             self._worker.submit(self._run, job, work)
 
     def _run(self, job: Job, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Compute a job in turns with the jobs of other windows."""
+        """Compute a job in turns with other windows."""
         try:
             with TURNS, collected_warnings(job.warnings):
                 job.report(0.0, "starting")
@@ -559,7 +538,7 @@ class Session:
                 end = functools.partial(self._conclude, Status("Ready."))
         except CancelledError:
             return
-        except Exception as error:  # whatever it is, the page shows it and stays alive
+        except Exception as error:  # shown by the page, which stays alive
             if not isinstance(error, SionnaPartialError | OSError | MemoryError):
                 _log.exception("a job of the app failed")
             end = functools.partial(self._conclude, Status(reason_of(error), is_error=True))
@@ -586,7 +565,7 @@ class Session:
             end()
 
     def _conclude(self, status: Status) -> None:
-        """Show the end of a job; an answer that no longer fits the page is removed."""
+        """Show the end of a job, and remove an outdated answer."""
         self.status = status
         if self._is_outdated:
             self.answer, self._is_outdated = None, False
@@ -598,10 +577,10 @@ class Session:
     # Files
 
     def file(self, kind: str) -> bytes:
-        """Return the newest answer, or the project, as a file of one of `FILES`."""
+        """Return the newest answer, or the project, as one of `FILES`."""
         require_choice("kind", kind, FILES)
         if kind == "project":
-            return project_file(Project(self._map(), self.title, self.transmitters, self.settings, self.measured))
+            return project_file(self._project())
         answer = self.answer
         if answer is None or self._is_outdated or not answer.is_final:
             raise SettingsError(
@@ -612,45 +591,9 @@ class Session:
         return coverage_file(kind, answer.coverage, answer.network, answer.eirp_dbm, threshold_dbm, heading)
 
     def python(self) -> str:
-        """Return the lines that compute the same coverage."""
         if self.partial is None or not self.transmitters:
             return ""
-        settings = self.settings
-        given = [f"rx_height_m={settings.rx_height_m!r}", f"spacing_m={settings.spacing_m!r}"]
-        trace = [f"frequency_hz={settings.frequency_hz!r}"]
-        trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
-        given.append(f"trace_settings=sp.TraceSettings({', '.join(trace)})")
-        given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
-        given += ['measurements="measured.csv"'] if self.measured is not None else []
-        antennas = [each.antenna for each in self.transmitters.values()]
-        if any(each != Antenna() for each in antennas):
-            given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
-        powers = [each.eirp_dbm for each in self.transmitters.values()]
-        python_map = [_SAVED_MAP] if self.strokes else self._python_map
-        lines = ["import sionna_partial as sp", "", *python_map, f"tx = {self._tx_m()!r}"]
-        lines += ["coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"]
-        lines += [f"power = coverage.radio.power(eirp_dbm={powers!r})"]
-        lines += [
-            f"area = coverage.radio.area({settings.threshold_dbm!r}, eirp_dbm={powers!r})",
-            'coverage.radio.save("coverage.nc")',
-        ]
-        return "\n".join(lines) + "\n"
+        return script(self._project(), [_SAVED_MAP] if self.strokes else self._python_map)
 
-
-def _drawn(partial: PartialMap, strokes: Sequence[Stroke]) -> PartialMap:
-    for stroke in strokes:
-        partial = stroke.on(partial)
-    return partial
-
-
-def _placed(partial: PartialMap, transmitter: Transmitter) -> Transmitter:
-    """Return a transmitter where it can be, itself if that is where it is; its height must be right."""
-    at_m = np.array(transmitter.position_m)
-    if partial.radios_can_stand(at_m[None])[0]:
-        return transmitter
-    free_m = nearest_free_m(partial, at_m[:2], _NEAREST_CELLS)
-    allowed = partial.radios_can_stand(np.insert(free_m, 2, at_m[2], axis=1))
-    if not allowed.any():
-        partial.require_positions("the transmitter", at_m)
-    x_m, y_m = free_m[allowed.argmax()].round(3).tolist()
-    return replace(transmitter, x_m=x_m, y_m=y_m)
+    def _project(self) -> Project:
+        return Project(self._map(), self.title, self.transmitters, self.settings, self.measured)

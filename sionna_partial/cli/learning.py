@@ -66,6 +66,9 @@ def dataset(
     ] = False,
     frequency: opt.Frequency = CARRIER_FREQUENCY_HZ,
     material: opt.MaterialText = "",
+    cir_paths: Annotated[
+        int, typer.Option(help="Also store impulse responses, of so many strongest paths of each link. 0: none.")
+    ] = DatasetSettings.cir_paths,
     workers: Annotated[
         int | None, typer.Option(help="Homes at a time on this machine. Default: one for each core.")
     ] = None,
@@ -90,6 +93,7 @@ def dataset(
         short_link_fraction=short_links,
         scene=SceneSettings(material=opt.parse_material(material) if material else None),
         trace=TraceSettings(frequency_hz=frequency),
+        cir_paths=cir_paths,
     )
     count = homes if homes is not None else 0 if maps else DEFAULT_HOMES
     seeds = range(first_seed, first_seed + count)

@@ -1,4 +1,4 @@
-"""Homes -> data set: a folder of shards, built by dask workers, at home or on a cluster; kill it and run it again."""
+"""Homes -> data set: a folder of shards, built by dask workers on one machine or a cluster, in one or several runs."""
 
 import hashlib
 import json
@@ -37,24 +37,22 @@ from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
 from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0
-"""Time between two checks of the workers [s]: more may have come."""
+"""Time between checks for new workers [s]."""
 
 ANY_PORT = "127.0.0.1:0"
-"""Address of dask's own pages: its usual port may be taken."""
+"""Address of dask's dashboard, whose usual port may be taken."""
 
 MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
 """Largest scheduler file, and largest index of a data set [bytes]."""
 
 LEFTOVERS = (".tmp-", NEW_FOLDER)
-"""Beginnings of the names of folders that a killed run leaves."""
 
 CONNECT_S = 30.0
-"""Time to wait for a scheduler [s]."""
 
 
 @dataclass(frozen=True)
 class DatasetReport(Shown):
-    """Result of a run: names of the homes that it built and that were there before, and reasons of failures."""
+    """Homes that a run built or found, and reasons of failures by name."""
 
     folder: Path
     built: tuple[str, ...]
@@ -73,33 +71,33 @@ def build_dataset(
     home_time_limit_s: float = 900.0,
     progress: CountProgress | bool | None = None,
 ) -> DatasetReport:
-    """Build a data set: the links of many homes, on all cores or on a dask cluster.
+    """Build a data set of the links of many homes, on all cores or on a dask cluster.
 
     The folder gets `dataset.json` (settings, homes, versions), `shards/<home>.parquet` for each home, and
-    `failed/<home>.json` for each home that could not be made. Shards appear whole or not at all. A run that was ended,
-    in whatever way, is continued by the same call, which gives the bytes that an unbroken run would have given. Homes
-    may be added later. A map file that changes is not noticed: build from it in a new folder.
+    `failed/<home>.json` for each home that failed. Shards are written whole or not at all. The same call continues an
+    ended run, with the same bytes as an unbroken run. Homes may be added later. Changes of a map file are not noticed:
+    build from it in a new folder.
 
-    Every home is made in a process of its own, so that a home that raises, crashes or hangs is the only one to
-    fail. It is tried again where its process or worker died, which may be no fault of the home.
+    Every home has a process of its own: one that raises, crashes or hangs fails alone. It is tried again if its process
+    or worker died.
 
     Parameters
     ----------
     folder : path-like
-        Folder of the data set. With a `scheduler`, all workers must see it under the same path: it must be on a file
-        system that they share. A worker that does not see it ends the run with an error.
+        Folder of the data set. With a `scheduler`, all workers must share it under the same path; otherwise the run
+        ends with an error.
     homes : iterable of int, (int, str) or path-like
         Seeds of `make_home`, pairs of a seed and a kind, and complete maps or folders of them (`home_sources`).
     settings : DatasetSettings, optional
     scheduler : str, optional
-        Address of a dask scheduler (tcp://host:8786), or path of a scheduler file. By default this machine works.
+        Address of a dask scheduler (tcp://host:8786), or path of a scheduler file. Default: this machine.
     workers : int, optional
-        Number of homes that this machine makes at a time; by default one for each core it may use.
+        Number of homes that this machine makes at a time; default: its usable cores.
     home_time_limit_s : float
-        Time that a home may take [s].
+        Time limit of a home [s].
     progress : bool or callable, optional
-        False shows none; a callable is called as ``progress(homes_done, homes, message)``. By default a bar appears in
-        terminals and notebooks after 2 s.
+        False for none, or a callable ``progress(homes_done, homes, message)``. Default: a bar in terminals and
+        notebooks after 2 s.
 
     Returns
     -------
@@ -111,10 +109,10 @@ def build_dataset(
     SettingsError
         For an argument out of range, or if the folder holds a data set of other settings, homes or versions.
     MapError
-        If there is no home, or a path is not there.
+        If there is no home, or a path does not exist.
     OutputError
-        If the folder cannot be written, holds something else or is being written by another run, a worker cannot see
-        it, or a worker cannot make homes.
+        If the folder cannot be written, has other content or is being written by another run, or a worker cannot see it
+        or make homes.
     BackendError
         If the scheduler cannot be reached.
 
@@ -169,7 +167,6 @@ def build_dataset(
 def _results(
     client: Client, tasks: list[HomeTask], report: Callable[[str], None]
 ) -> Iterator[tuple[HomeTask, HomeResult]]:
-    """Make homes, as many at a time as there are workers: no home waits on a worker that another one may kill."""
     waiting, running = tasks[::-1], dict[Future, HomeTask]()
     while waiting or running:
         try:
@@ -191,7 +188,7 @@ def _results(
 def _prepare(
     folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
 ) -> list[HomeTask]:
-    """Write or check the folder's `dataset.json`, remove the remains of killed runs, and return the tasks."""
+    """Write or check `dataset.json`, remove the remains of killed runs, and return the tasks."""
     path, versions = folder / INDEX_FILE, installed_versions()
     homes = [source.record for source in sources]
     index = {"versions": versions, "settings": settings_record(settings), "homes": homes}
@@ -208,7 +205,7 @@ def _prepare(
 
 
 def _require_same(folder: Path, index: dict[str, Any]) -> None:
-    """Refuse a folder with something else than an earlier run of the same settings, versions and homes."""
+    """Refuse a folder with other content than an earlier run of the same settings, versions and homes."""
     path = folder / INDEX_FILE
     if not path.exists():
         names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
@@ -231,7 +228,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
 
 
 def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield the name, the old and the new value of each difference. Homes may have been added."""
+    """Yield the name, the old and the new value of each difference; new homes are none."""
     for part in ("settings", "versions"):
         before, after = (dict(_leaves(index[part], part)) for index in (earlier, now))
         for name in sorted(before.keys() | after.keys()):
@@ -249,7 +246,6 @@ def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple
 
 
 def _leaves(tree: object, name: str) -> Iterator[tuple[str, object]]:
-    """Names, such as settings.trace.max_depth, and values of nested settings."""
     if not isinstance(tree, dict):
         yield name, tree
         return
@@ -263,7 +259,6 @@ def _failure_path(folder: Path, name: str) -> Path:
 
 @contextmanager
 def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
-    """Start workers on this machine, or connect to a scheduler."""
     if scheduler is not None:
         with _remote_client(scheduler) as client:
             yield client
@@ -271,7 +266,7 @@ def _connected(scheduler: str | None, workers: int) -> Iterator[Client]:
     allow_homes()
     with (
         temporary_folder() as scratch,
-        dask.config.set({"temporary-directory": str(scratch)}),  # dask leaves its own behind where it is killed
+        dask.config.set({"temporary-directory": str(scratch)}),  # a killed dask leaves its own behind
         LocalCluster(
             n_workers=workers,
             threads_per_worker=1,
@@ -293,7 +288,7 @@ def _remote_client(scheduler: str) -> Client:
     if by_file and not Path(scheduler).is_file():
         raise BackendError(f"scheduler = {scheduler!r} is not there: give the file that dask scheduler writes.")
     try:
-        if by_file:  # a client that fails on a damaged file hangs when it is collected (docs/development.md)
+        if by_file:  # a client that fails on a damaged file hangs in garbage collection (docs/development.md)
             written = json.loads(read_bytes(Path(scheduler), "scheduler", BackendError, MAX_SCHEDULER_BYTES))
             parse_host_port(parse_address(written["address"])[1])
         return Client(**where, timeout=CONNECT_S, set_as_default=False)

@@ -1,10 +1,9 @@
 """Homes of a data set: a robot explores a home, and links are traced on each of its maps and on the home.
 
-Each home is made in a process of its own: one that crashes or hangs costs itself alone. A process serves one home
-after the other, so that libraries load and compile once. It ends when the worker does, or when it has had nothing to do
-for a while. Pools of concurrent.futures and pebble, and dask's Nanny, spawn processes: that imports `__main__` again,
-so that a user's script without a guard would begin again in every process. They also have neither a time limit for a
-home nor the last lines of a process that died.
+Each home is made in a process of its own, which serves one home after the other, so that libraries load and compile
+once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, would
+start a user's script without a `__main__` guard again in each process, and lack a time limit per home and the last
+lines of a dead process.
 """
 
 import contextlib
@@ -33,7 +32,7 @@ import numpy as np
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import is_whole, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.shards import INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
+from sionna_partial.datasets.shards import CIR, INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.files import SCENE_FILES, temporary_folder
@@ -56,41 +55,36 @@ from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home
 
 Home = int | tuple[int, HomeKind | None] | str | os.PathLike[str]
-"""Seed of `make_home`, seed and kind, or path of a complete map or of a folder of them."""
+"""Seed of `make_home`, (seed, kind), or path of a complete map or of a folder of maps."""
 
 MAP_SUFFIXES = (".yaml", ".yml", ".npz")
-"""Files in a folder that are taken for maps."""
 
 COMMON_STEMS = ("map", "scene")
-"""Names of map files that do not name the home: it has the name of the folder."""
+"""Names of map files for which the home has the name of the folder."""
 
 NEAREST_M = 0.1
-"""Shortest distance of transmitter and receiver [m]."""
 
 FROM_BORDER_CELLS = 0.25
-"""Distance of transmitters and receivers from the borders of their cells [cells]."""
 
 _LIDAR_FRACTION = 2 / 3
 
 MAX_DRAWS = 1000
-"""Number of times that positions which cannot be used are drawn again."""
 
 _log = logging.getLogger(__name__)
 
 ATTEMPTS = 3
-"""Number of processes that may die over a home. One may have been killed for no fault of the home."""
+"""Number of processes that may die over a home: one may have been killed from outside."""
 
 IDLE_S = 60.0
-"""Time without a home after which a process ends [s]."""
+"""Idle time after which a process ends [s]."""
 
 GRACE_S = 60.0
-"""Time that a process has beyond a home's limit to end by itself, and to start [s]."""
+"""Time beyond a home's limit for a process to start and end by itself [s]."""
 
 TIMEOUT_LINE = "Timeout ("
-"""Start of the line that faulthandler writes before it ends a process that takes too long."""
+"""First words that faulthandler writes at a time-out."""
 
 LAST_LINES = 20
-"""Number of the last lines of a dead process that are reported."""
 
 PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba", "scipy", "shapely", "pyarrow")
 """Packages whose versions may change the bytes of a data set."""
@@ -104,7 +98,7 @@ _stopped = threading.Event()
 
 @dataclass(frozen=True)
 class HomeSource:
-    """A home to build from: its name, seed of `make_home` or absolute path of a complete map, and kind."""
+    """A home to build from: name, seed of `make_home` or absolute path of a complete map, and kind."""
 
     name: str
     origin: int | str
@@ -117,12 +111,12 @@ class HomeSource:
         return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
 
     def load(self) -> PartialMap:
-        """Make or read the home, with the errors of `make_home` and `load_map`."""
+        """Make or read the home."""
         return make_home(self.origin, self.kind) if isinstance(self.origin, int) else load_map(self.origin)
 
 
 def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
-    """Name the homes to build from, in their order; homes of a folder in the order of their names.
+    """Return the homes to build from, in order; homes of a folder are sorted by name.
 
     A map has the name of its file, or of its folder if the file is called map or scene.
     """
@@ -177,32 +171,27 @@ def _maps_at(path: Path) -> Iterator[HomeSource]:
 
 
 def _scene_file(folder: Path) -> Path | None:
-    """Return the map in a folder of one home."""
     return next((folder / name for name in SCENE_FILES if (folder / name).is_file()), None)
 
 
 @dataclass(frozen=True)
 class _Positions:
-    """T transmitters (3,) of a home, and for each its N receivers (N, 3), and whether they were drawn anywhere (N,)."""
-
     tx_m: list[Floats]
     rx_m: list[Floats]
     anywhere: list[Bools]
 
 
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
-    """Trace the links of a complete home on the map of a robot at every stage, and on the complete home.
+    """Trace the links of a complete home on the robot's map at every stage, and on the complete home.
 
-    Transmitters are drawn from the free cells of the home. Each has receivers of its own: the first half from the free
-    cells, the second half (`anywhere`) from all cells of the map area that are not walls; of each half,
-    `short_link_fraction` within `SHORT_LINK_M` of the transmitter. The map area is the bounding box of the known cells
-    and `margin_m` around it, whatever the size of the grid: a small home in a large empty grid would have receivers
-    outside and no others. None is where a robot with errors has mapped a wall, as no link can be predicted there. No
-    receiver is nearer than `NEAREST_M` to its transmitter.
+    Half of a transmitter's receivers are in free cells of the home, half (`anywhere`) in any cell of the map area
+    (bounding box of the known cells with `margin_m`) that is no wall; of each half, `short_link_fraction` within
+    `SHORT_LINK_M`. No receiver is in a cell that a robot with errors mapped as a wall, or within `NEAREST_M` of its
+    transmitter.
 
-    The truth of a receiver that is not in a free cell of the home is outage, by definition (paper, "Indoor-Outdoor
-    Estimation"); the truth of other receivers is their trace on the complete home. Positions and robot depend on
-    `name` and the settings, and not on other homes. The table is ordered by stage, in each by transmitter.
+    The truth is outage for a receiver outside the free cells of the home (paper, "Indoor-Outdoor Estimation"), else the
+    trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered by
+    stage, then by transmitter.
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)
@@ -210,7 +199,7 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
     positions = _draw_positions(home, maps, name, settings, rng)
-    inside, link_state, gain_db = _truth(home, positions, settings)
+    inside, link_state, gain_db, cir = _truth(home, positions, settings)
     return LinkTable.concatenate(
         LinkTable(
             home=np.full(len(phi), name),
@@ -224,13 +213,14 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
             anywhere=np.concatenate(positions.anywhere),
             observed_fraction=np.full(len(phi), partial.observed_fraction),
             complete_maps={name: home},
+            cir=cir,
         )
         for stage, partial, phi in zip(settings.stages, maps, _features(maps, positions, settings), strict=True)
     )
 
 
 def closed_home(home: PartialMap, name: str) -> PartialMap:
-    """Return a complete home, with a ring of walls around its grid if it lacks nothing else."""
+    """Return a complete home, with walls around its grid if only these are missing."""
     if home.is_complete:
         return home
     ny, nx = home.shape
@@ -247,7 +237,7 @@ def closed_home(home: PartialMap, name: str) -> PartialMap:
 
 
 def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:
-    """Return the sensor of the robot in a home: the sensor of the settings, or one drawn for the name of the home."""
+    """Return the sensor of the settings, or one drawn by the name of the home."""
     if isinstance(settings.sensor, SensorSettings):
         return settings.sensor
     rng = np.random.default_rng([1, *_home_seed(name, settings)])
@@ -265,7 +255,7 @@ def _home_seed(name: str, settings: DatasetSettings) -> list[int]:
 
 
 def map_area(home: PartialMap, margin_m: float) -> PartialMap:
-    """Cut a map, or extend it with unknown cells, to the bounding box of its known cells and a margin around it."""
+    """Cut or extend a map to the bounding box of its known cells and a margin."""
     known = np.argwhere(home.state != CellState.UNKNOWN)
     margin = math.ceil(margin_m / home.resolution_m - 1e-9)
     (row0, column0), (row1, column1) = known.min(axis=0), known.max(axis=0) + 1
@@ -276,7 +266,6 @@ def map_area(home: PartialMap, margin_m: float) -> PartialMap:
 def _draw_positions(
     home: PartialMap, maps: list[PartialMap], name: str, settings: DatasetSettings, rng: np.random.Generator
 ) -> _Positions:
-    """Draw the transmitters, and for each receivers in free cells, and in all cells that no map has as walls."""
     open_cells = np.logical_and.reduce([each.state != CellState.WALL for each in (home, *maps)])
     free = open_cells & (home.state == CellState.FREE)
     links, count = settings.links_per_home, settings.transmitters_per_home
@@ -299,7 +288,6 @@ def _receivers(
     settings: DatasetSettings,
     rng: np.random.Generator,
 ) -> Floats:
-    """Draw receivers (count, 3) that are not at the transmitter [m]."""
     short, height_m = round(settings.short_link_fraction * count), settings.rx_height_m
     x, y = (home.origin_m[axis] + (np.arange(home.shape[1 - axis]) + 0.5) * home.resolution_m for axis in (0, 1))
     near_cells = np.hypot(x[None] - tx_m[0], y[:, None] - tx_m[1]) <= SHORT_LINK_M
@@ -322,8 +310,10 @@ def points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: 
     return np.column_stack([home.origin_m + points * home.resolution_m, np.full(count, height_m)])
 
 
-def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -> tuple[Bools, States, Floats]:
-    """Return whether receivers (N,) are inside, their link state and their path gain [dB], of all transmitters."""
+def _truth(
+    home: PartialMap, positions: _Positions, settings: DatasetSettings
+) -> tuple[Bools, States, Floats, dict[str, Floats]]:
+    """Return whether receivers (N,) are inside, their link state, path gain [dB] and impulse response `CIR`."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
     links = _traced(home, positions.tx_m, indoors, settings)
@@ -332,7 +322,23 @@ def _truth(home: PartialMap, positions: _Positions, settings: DatasetSettings) -
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
     link_state[where] = np.concatenate([each.link_state for each in links])
     gain_db[where] = np.concatenate([each.gain_db for each in links])
-    return where, link_state, gain_db
+    empty = np.zeros((len(where), settings.cir_paths), np.float32)
+    cir = dict(zip(CIR, (empty, empty.copy(), np.full_like(empty, np.nan)), strict=True)) if settings.cir_paths else {}
+    parts = [_strongest(each, settings.cir_paths) for each in links if cir]
+    for name, found in zip(cir, zip(*parts, strict=True), strict=False):
+        cir[name][where] = np.concatenate(found)
+    return where, link_state, gain_db, cir
+
+
+def _strongest(links: TracedLinks, count: int) -> tuple[Floats, Floats, Floats]:
+    """Return the arrays (N, count) of `CIR` of the strongest paths, the strongest first."""
+    response = links.cir(normalize_delays=False)
+    gain, delay_s = response["a"].to_numpy()[:, 0, 0], response["delay_s"].to_numpy()
+    order = np.argsort(-np.abs(gain), axis=1, kind="stable")[:, :count]
+    more = [(0, 0), (0, count - order.shape[1])]
+    gain, delay_s = (np.take_along_axis(each, order, axis=1) for each in (gain, delay_s))
+    gain, delay_s = np.pad(gain, more), np.pad(delay_s, more, constant_values=np.nan)
+    return gain.real, gain.imag, delay_s
 
 
 def _traced(
@@ -344,7 +350,7 @@ def _traced(
 
 
 def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSettings) -> list[LinkFeatures]:
-    """Features on each map, of all transmitters. A robot that has seen all stays: its maps are traced once."""
+    """Return the features on each map, for all transmitters; equal maps are traced once."""
     features: list[LinkFeatures] = []
     for index, partial in enumerate(maps):
         if index and partial == maps[index - 1]:
@@ -357,7 +363,7 @@ def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSe
 
 @dataclass(frozen=True)
 class HomeTask:
-    """A home to be made, and the folder of its data set, whose `dataset.json` has the SHA-256 `index_sha256`."""
+    """A home to be made, the folder of its data set, and the SHA-256 of the folder's `dataset.json`."""
 
     folder: str
     index_sha256: str
@@ -374,7 +380,7 @@ class HomeTask:
 
     @property
     def is_done(self) -> bool:
-        """Return whether the home's shard is there, whole, and of these settings."""
+        """Return whether the home's shard is whole and of these settings."""
         try:
             notes = shard_metadata(shard_path(self.folder, self.source.name))
         except PredictorError:
@@ -389,7 +395,7 @@ class HomeTask:
 
 @dataclass(frozen=True)
 class HomeResult:
-    """Result of a home: "unusable" is a worker on which no home can be made; the error's first line is its summary."""
+    """Result of a home; "unusable" is a worker that can make no home. The first line of `error` is its summary."""
 
     outcome: Literal["done", "failed", "unusable"]
     error: str = ""
@@ -401,12 +407,12 @@ def settings_record(settings: DatasetSettings) -> dict[str, object]:
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the versions of `PACKAGES` that are installed."""
+    """Return the installed versions of `PACKAGES`."""
     return {package: version(package) for package in PACKAGES}
 
 
 def run_home(task: HomeTask) -> HomeResult:
-    """Make a home in a process of its own; the home's errors are returned, not raised."""
+    """Make a home in a process of its own; return its errors."""
     fault = _fault_of_worker(task)
     if fault:
         return HomeResult("unusable", fault)
@@ -432,12 +438,12 @@ def run_home(task: HomeTask) -> HomeResult:
 
 
 def allow_homes() -> None:
-    """Let homes be made in this process's threads, after `stop_homes`."""
+    """Allow homes again after `stop_homes`."""
     _stopped.clear()
 
 
 def stop_homes() -> None:
-    """Kill the processes of all threads; homes that are being made are given up."""
+    """Kill the processes of all threads, with unfinished homes."""
     _stopped.set()
     for process in list(_alive):
         process.kill()
@@ -462,8 +468,6 @@ def serve(descriptor: int) -> None:
 
 
 class _HomeProcess:
-    """A process that makes homes, seen from the worker."""
-
     def __init__(self) -> None:
         self._link, far_end = Pipe()
         self._log = tempfile.TemporaryFile()  # noqa: SIM115
@@ -486,14 +490,14 @@ class _HomeProcess:
 
     @property
     def is_alive(self) -> bool:
-        """Return whether it runs; the resources of a dead one are released."""
+        """Return whether it runs; release the resources of a dead one."""
         if self._process.poll() is None:
             return True
         self.close()
         return False
 
     def make(self, task: HomeTask) -> HomeResult | list[str]:
-        """Make a home; return the lines that the process wrote last if it died or took too long."""
+        """Make a home; return the last lines of the process if it died or took too long."""
         self._log.seek(0)
         self._log.truncate()
         in_time = True
@@ -514,7 +518,6 @@ class _HomeProcess:
         _alive.discard(self)
 
     def close(self) -> None:
-        """End the process and release its resources, temporary files included."""
         self.kill()
         self._link.close()
         self._log.close()
@@ -538,7 +541,7 @@ def _take_idle() -> _HomeProcess | None:
 
 
 def _fault_of_worker(task: HomeTask) -> str:
-    """Return why no home can be made here; nothing if it can."""
+    """Return the reason why no home can be made here, or an empty string."""
     where = f"the worker on {socket.gethostname()}"
     index = Path(task.folder) / INDEX_FILE
     remedy = "give a folder on a file system that all workers share."
@@ -567,7 +570,7 @@ def _made(task: HomeTask) -> HomeResult:
 
 
 def _fault_of_libraries() -> str:
-    """Let Dr.Jit start, with one thread; return why it cannot."""
+    """Start Dr.Jit with one thread; return the reason of a failure, or an empty string."""
     try:
         load_llvm()
     except BackendError as error:
@@ -579,6 +582,6 @@ def _fault_of_libraries() -> str:
 
 
 def _end_with_worker() -> None:
-    """Wait for the worker's end of a pipe to close, which it does when the worker dies."""
+    """End when the worker's end of a pipe closes, as it does when the worker dies."""
     os.read(sys.stdin.fileno(), 1)
     end_process(1)

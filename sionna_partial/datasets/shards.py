@@ -1,4 +1,4 @@
-"""Links of many homes, and their folders: a Parquet shard for each home, read as one LinkTable."""
+"""Links of many homes, and their folders: one Parquet shard per home, read as one LinkTable."""
 
 import base64
 import hashlib
@@ -9,7 +9,7 @@ import os
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from os import PathLike
 from pathlib import Path
@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, States
-from sionna_partial.checks import shown
+from sionna_partial.checks import is_whole, shown
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
@@ -31,16 +31,15 @@ from sionna_partial.prediction.map_networks import FEATURES, columns_of, feature
 from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
-"""Files and folders of a data set: settings and homes, a shard for each home, a note for each home that failed."""
+"""Files and folders of a data set: settings and homes, shards, notes on homes that failed."""
 
 FORMAT = "sionna-partial links 4"
-"""Name and version of the shards' format, in their metadata."""
+"""Name and version of the format, in the metadata of shards."""
 
 _MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
-"""Links of a home, cells of its maps and bytes of its shard, which may not be more."""
 
 _MAX_NAME_BYTES = 200
-"""Length of the names of homes from which files have a shorter one [bytes]; file systems allow 255."""
+"""Length above which names of homes are shortened for files, where systems allow 255 [bytes]."""
 
 _PREFIX = "sionna_partial."
 
@@ -50,10 +49,14 @@ _TYPES = {
     **dict.fromkeys(("link_state", "partial_link_state"), pa.uint8()),
     **dict.fromkeys(("inside", "anywhere"), pa.bool_()),
 }
-"""Types of the columns that do not hold real numbers."""
 
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
-"""Names of the columns other than the features."""
+
+CIR = ("path_gain_re", "path_gain_im", "path_delay_s")
+"""Columns of the impulse response between isotropic antennas on the complete map, the strongest path first.
+
+Complex baseband gain [1], 0 where there is no path, and absolute delay [s], NaN where there is none.
+"""
 
 _NAMES = (
     *COLUMNS[:2],
@@ -62,19 +65,24 @@ _NAMES = (
     "map_index",
     *COLUMNS[2:],
 )
-_FIELDS = [pa.field(name, _TYPES.get(name, pa.float64()), nullable=False) for name in _NAMES]
+
+
+def _fields(cir_paths: int) -> list[pa.Field]:
+    lists = dict.fromkeys(CIR, pa.list_(pa.float32(), cir_paths)) if cir_paths else {}
+    types = {name: _TYPES.get(name, pa.float64()) for name in _NAMES} | lists
+    return [pa.field(name, kind, nullable=False) for name, kind in types.items()]
 
 
 @dataclass(frozen=True, eq=False)
 class LinkTable(Shown):
-    """N links; a transmitter and a receiver at one stage of exploration of one home are a link.
+    """N links; a link is a transmitter and a receiver at one stage of exploration of a home.
 
     Parameters
     ----------
     home : (N,) str array
         Name of the home, such as "make_home(10003)".
     stage : (N,) float64 array
-        Steps that the robot has explored; below 1, the fraction of the home's free area that it was to observe.
+        Steps of exploration; below 1, the wanted observed fraction of the home's free area.
     features : LinkFeatures
         Features of the trace on the partial map, with their context.
     maps : tuple of M PartialMap
@@ -82,14 +90,16 @@ class LinkTable(Shown):
     map_index : (N,) int64 array
         Index of each link's map.
     link_state, gain_db : (N,) arrays
-        LinkState and omnidirectional path gain [dB] on the complete map; a receiver that is not inside is in outage
+        LinkState and omnidirectional path gain [dB] on the complete map; outage for a receiver that is not inside
         (paper, "Indoor-Outdoor Estimation").
     inside, anywhere : (N,) bool arrays
-        True for a receiver in a free cell of the complete map, and for one that was drawn from the whole map area.
+        True for a receiver in a free cell of the complete map, and for a receiver drawn from the whole map area.
     observed_fraction : (N,) float64 array
-        Fraction of the home's free area that the robot has seen.
+        Observed fraction of the home's free area.
     complete_maps : mapping of str to PartialMap
         The complete homes by name.
+    cir : mapping of str to (N, cir_paths) float32 array
+        `CIR`, if the data set has impulse responses.
     """
 
     home: NDArray[np.str_]
@@ -103,6 +113,7 @@ class LinkTable(Shown):
     anywhere: Bools
     observed_fraction: Floats
     complete_maps: Mapping[str, PartialMap]
+    cir: Mapping[str, Floats] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.features.context is None:
@@ -111,29 +122,29 @@ class LinkTable(Shown):
         link_numbers("gain_db", self.gain_db, (len(self),))
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.home)
 
     @property
     def context(self) -> LinkContext:
-        """Features of the links that derive from the maps."""
+        """Context of the links' features."""
         assert self.features.context is not None
         return self.features.context
 
     @cached_property
     def phi(self) -> LinkFeatures:
-        """The features with the windows that map networks read, which are drawn at the first access."""
+        """Features with windows, which are drawn at the first access."""
         return self.features.with_windows(self.maps, self.map_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
-        """Return the links that an index array, a mask (N,) or a slice selects."""
-        features = self.__dict__.get("phi", self.features).take(index)  # with the windows, if they were drawn
+        """Select links by an index array, a mask (N,) or a slice."""
+        features = self.__dict__.get("phi", self.features).take(index)  # with windows, if drawn
         columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
-        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, **columns)
+        cir = {name: values[index] for name, values in self.cir.items()}
+        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, cir=cir, **columns)
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
-        """Return the links of all `parts`, one part after the other."""
+        """Join links, one part after the other, with impulse responses if all have as many paths."""
         tables = list(parts)
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
@@ -144,13 +155,14 @@ class LinkTable(Shown):
         number = {key: index for index, key in enumerate(maps)}
         numbers = [np.array([number[id(each)] for each in table.maps], dtype=np.int64) for table in tables]
         index = np.concatenate([each[table.map_index] for each, table in zip(numbers, tables, strict=True)])
-        return cls(
-            features=features, maps=tuple(maps.values()), map_index=index, complete_maps=complete_maps, **columns
-        )
+        is_same = len({tuple(values.shape[1:] for values in table.cir.values()) for table in tables}) == 1
+        cir = {name: np.concatenate([table.cir[name] for table in tables]) for name in tables[0].cir if is_same}
+        shared = {"maps": tuple(maps.values()), "map_index": index, "complete_maps": complete_maps, "cir": cir}
+        return cls(features=features, **shared, **columns)
 
 
 Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
-"""Links, or one or more folders that `sionna-partial dataset` wrote."""
+"""Links, or one or more folders of data sets."""
 
 
 def stage_name(stage: float) -> str:
@@ -170,21 +182,23 @@ def _columns(table: LinkTable) -> dict[str, Any]:
 
 
 def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mapping[str, object]) -> None:
-    """Write links as a Parquet file, whole or not at all. Equal links and metadata give equal bytes.
+    """Write links as a Parquet file, whole or not at all; equal links and metadata give equal bytes.
 
-    Columns are named as in `LinkTable`, with the unit behind the name; positions have a column for each axis
-    (`tx_x_m`), and the link state and the gain of the partial trace are `partial_link_state` and `partial_gain_db`. The
-    frequency and the maps are in the file's metadata, as is `metadata`, as JSON under `sionna_partial.` and its name;
-    `map_index` is the index of the map on which a link was traced.
+    Columns are named as in `LinkTable`, with units; positions have a column per axis (`tx_x_m`), and the partial trace
+    has `partial_link_state` and `partial_gain_db`. Frequency, maps and `metadata` are JSON in the file's metadata, with
+    the prefix `sionna_partial.`; `map_index` is the index of a link's map.
     """
     maps = {
         "partial": [_packed(each) for each in table.maps],
         "complete": {name: _packed(home) for name, home in table.complete_maps.items()},
     }
     notes = {"format": FORMAT, "frequency_hz": table.features.frequency_hz, "maps": maps, **metadata}
+    cir_paths = next((values.shape[1] for values in table.cir.values()), 0)
+    notes |= {"cir_paths": cir_paths} if cir_paths else {}
     texts = {_PREFIX + name: json.dumps(notes[name], sort_keys=True) for name in sorted(notes)}
-    schema, columns = pa.schema(_FIELDS, metadata=texts), _columns(table)
-    values = [pa.array(columns[field.name], type=field.type) for field in _FIELDS]
+    schema, columns = pa.schema(_fields(cir_paths), metadata=texts), _columns(table)
+    lists = {name: pa.FixedSizeListArray.from_arrays(values.ravel(), cir_paths) for name, values in table.cir.items()}
+    values = [lists.get(each.name, pa.array(columns.get(each.name, []), type=each.type)) for each in schema]
     memory = io.BytesIO()
     pq.write_table(pa.Table.from_arrays(values, schema=schema), memory, compression="zstd", write_page_checksum=True)
     with atomic_write(path) as stream:
@@ -201,15 +215,17 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
         table = file.read()
     except (OSError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
-    columns = {name: table[name].to_numpy() for name in table.column_names}
     try:
-        return _links_of(columns, notes)
+        columns = {name: table[name].to_numpy() for name in _NAMES}
+        lists = {name: table[name].combine_chunks().flatten().to_numpy() for name in table.column_names if name in CIR}
+        cir = {name: values.reshape(table.num_rows, -1) for name, values in lists.items()}
+        return _links_of(columns, notes, cir)
     except (KeyError, TypeError, ValueError, IndexError, zlib.error, MapError, PredictorError) as error:
         raise _damaged(path, error) from error
 
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Read the metadata of a shard, without its links."""
+    """Read the metadata of a shard."""
     with open_regular(path, "path", PredictorError, _MAX_BYTES):
         pass
     try:
@@ -218,8 +234,10 @@ def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
         notes = {key.removeprefix(_PREFIX): json.loads(text) for key, text in texts.items() if key.startswith(_PREFIX)}
     except (OSError, ValueError, RecursionError, pa.ArrowException) as error:
         raise _damaged(path, error) from error
+    cir_paths = notes.get("cir_paths", 0)
+    wanted = _fields(cir_paths) if is_whole(cir_paths) and cir_paths < _MAX_CELLS else []
     if notes.get("format") != FORMAT or [(each.name, each.type) for each in schema] != [
-        (each.name, each.type) for each in _FIELDS
+        (each.name, each.type) for each in wanted
     ]:
         raise PredictorError(
             f"path = '{path}' is no shard of this version ({FORMAT}): give a folder that `sionna-partial dataset` "
@@ -229,26 +247,24 @@ def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
 
 
 def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = None) -> LinkTable:
-    """Read the links of a data set, home by home in the order of its list of homes.
-
-    Homes that failed, or have not been built yet, are left out.
+    """Read the links of the built homes of a data set, in the order of its list of homes.
 
     Parameters
     ----------
     folder : path-like
-        A folder that `build_dataset` wrote.
+        Folder from `build_dataset`.
     homes : iterable of str, optional
-        Names of the homes to read, in this order; by default all that there are.
+        Names of the homes to read, in this order; by default all.
 
     Returns
     -------
     LinkTable
-        With `home`, `stage`, features `phi`, true `link_state` and `gain_db`, `inside` and `anywhere`, each (N,).
+        With `home`, `stage`, features `phi`, true `link_state` and `gain_db`, `inside` and `anywhere`.
 
     Raises
     ------
     PredictorError
-        If the folder holds no data set, a home is not in it, or a shard is damaged.
+        If the folder has no data set, a home is missing, or a shard is damaged.
 
     Examples
     --------
@@ -271,7 +287,7 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
 
 
 def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read what `dataset.json` of a data set has: settings, homes and versions."""
+    """Read `dataset.json`: settings, homes and versions."""
     remedy = "give a folder that `sionna-partial dataset` wrote."
     path = input_path(folder, "folder", PredictorError, remedy) / INDEX_FILE
     if not os.path.exists(path):
@@ -289,19 +305,19 @@ def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
-    """Return the path of a home's shard in a data set."""
+    """Return the path of a home's shard."""
     return Path(folder) / SHARDS_FOLDER / f"{file_stem(name)}.parquet"
 
 
 def file_stem(name: str) -> str:
-    """Return the name of a home; one that is too long for the name of a file is cut, with its hash at the end."""
+    """Return the name of a home; a long name is cut, with its hash at the end."""
     content = name.encode(errors="surrogateescape")
     if len(content) <= _MAX_NAME_BYTES:
         return name
     return f"{content[:150].decode(errors='ignore')}-{hashlib.sha256(content).hexdigest()[:16]}"
 
 
-def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
+def _links_of(columns: dict[str, Any], notes: Any, cir: Mapping[str, Floats]) -> LinkTable:
     positions = {
         f"{end}_m": np.column_stack([columns.pop(f"{end}_{axis}_m") for axis in "xyz"]) for end in ("tx", "rx")
     }
@@ -314,11 +330,11 @@ def _links_of(columns: dict[str, Any], notes: Any) -> LinkTable:
     home = columns["home"].astype(np.str_)
     complete_maps = {name: _unpacked(each) for name, each in notes["maps"]["complete"].items()}
     phi = LinkFeatures(**found, context=context, frequency_hz=notes["frequency_hz"])
-    return LinkTable(home=home, features=phi, maps=maps, map_index=map_index, complete_maps=complete_maps, **table)
+    shared = {"maps": maps, "map_index": map_index, "complete_maps": complete_maps, "cir": cir}
+    return LinkTable(home=home, features=phi, **shared, **table)
 
 
 def _packed(partial: PartialMap) -> dict[str, object]:
-    """Return a floor plan as JSON has it, its cells deflated."""
     material: dict[str, object] = {} if partial.material is None else {"material": asdict(partial.material)}
     for name, (cells, counted, values) in partial.layers().items():
         material |= {name: _deflated(cells), counted: values}
@@ -368,7 +384,7 @@ def _few(names: list[str]) -> str:
 
 @dataclass(frozen=True)
 class LinkTraces:
-    """Settings of the traces: carrier frequency [Hz], and whether with diffraction on plans, and through walls."""
+    """Settings of the traces: carrier frequency [Hz], diffraction on plans, paths through walls."""
 
     frequency_hz: float
     diffraction: bool
@@ -376,22 +392,21 @@ class LinkTraces:
 
     @classmethod
     def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
-        """Return the settings of the traces that a predictor was trained on."""
+        """Return the traces that a predictor was trained on."""
         return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
 
     def __str__(self) -> str:
-        """Return them in words."""
         where = f"at {self.frequency_hz / 1e9:g} GHz{' through walls' if self.through_walls else ''}"
         return f"{where} {'with' if self.diffraction else 'without'} diffraction"
 
     def is_like(self, other: "LinkTraces") -> bool:
-        """Return whether frequency (within 1e-6), diffraction and paths through walls are the same."""
+        """Return whether frequency (within 1e-6), diffraction and paths through walls are equal."""
         same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
         return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
 
 
 def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
-    """Return the links of data sets, and how they were traced: None for a table, which does not contain that.
+    """Return the links of data sets and their traces, which are None for a table.
 
     A home may be in several folders, explored anew in each.
     """
@@ -440,7 +455,7 @@ def settings_for(
     passes: int = PredictorSettings.passes,
     seed: int = PredictorSettings.seed,
 ) -> PredictorSettings:
-    """Return settings of a training on such links; None takes the defaults."""
+    """Return settings for a training on such links; None takes the defaults."""
     known = traces or LinkTraces.of_settings(PredictorSettings())
     return PredictorSettings(
         networks, known.frequency_hz, known.diffraction, passes, seed=seed, through_walls=known.through_walls
@@ -450,7 +465,7 @@ def settings_for(
 def require_like(
     found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
 ) -> None:
-    """Raise a PredictorError if the links of a data set were traced otherwise than `whose` links; None passes."""
+    """Raise a PredictorError for links traced otherwise than `whose` links; None passes."""
     if found is not None and not found.is_like(wanted):
         raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 

@@ -1,4 +1,4 @@
-"""Robot simulator: a complete home -> the maps of a robot after so many steps."""
+"""Robot simulator: a complete home -> the maps of a robot after given numbers of steps."""
 
 from __future__ import annotations
 
@@ -23,14 +23,11 @@ from sionna_partial.settings import Policy, SensorSettings
 from sionna_partial.worlds.robot import Choice, Robot
 
 MAX_STEPS = 100_000
-"""Largest number of actions: many times the number for a large building."""
 
 VAIN_STEPS = 1000
-"""Number of actions without progress after which a robot stops trying to observe a fraction of the free area: errors of
-its map may block every route."""
+"""Number of actions without progress after which a robot stops; errors of its map may block every route."""
 
 PROGRESS = 0.005
-"""Fraction of the free area that counts as progress."""
 
 _FREE, _UNKNOWN = int(CellState.FREE), int(CellState.UNKNOWN)
 _MARGIN_M = 2.0
@@ -49,14 +46,13 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     sensor : SensorSettings
         Sensor of the robot.
     steps : (M,) tuple of int
-        Numbers of actions [1], increasing; where fractions were asked for, those after which each was observed.
+        Numbers of actions [1], increasing.
     states : (M, ny, nx) uint8 array of CellState
-        The robot's map after so many steps, on the grid of `home`.
+        The robot's map after each of `steps`, on the grid of `home`.
     poses : (N, 3) array
-        Pose of the robot after 0, 1, ... actions, up to the last of `steps`: world x, y [m], and heading from x
-        towards y [degree].
+        Pose of the robot after 0, 1, ... actions: world x, y [m], and heading from x towards y [degree].
     believed_poses : (N, 3) array
-        Pose in the robot's own estimate. It differs from `poses` only with drift.
+        Pose in the robot's estimate; equal to `poses` without drift.
 
     Examples
     --------
@@ -75,10 +71,7 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
 
     @property
     def maps(self) -> list[PartialMap]:
-        """Map of the robot after each of `steps`.
-
-        `interior_cells` is the number of free cells of the home. A mesh is cut to the known cells, each time anew.
-        """
+        """Maps of the robot after each of `steps`, with `interior_cells`; a mesh is cut to the known cells."""
         free = int((self.home.state == _FREE).sum())
         return [cut_to_known(replace(self.home, state=state, interior_cells=free)) for state in self.states]
 
@@ -89,12 +82,12 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
         return np.minimum(1.0, seen / (self.home.state == _FREE).sum())
 
     def at(self, steps: Sequence[int]) -> Exploration:
-        """Return the exploration with only some of its `steps`.
+        """Return the exploration with some of its `steps`.
 
         Raises
         ------
         SettingsError
-            If one of them is not there.
+            For a step that was not kept.
         """
         remedy = f"choose from the steps that were kept: {', '.join(map(str, self.steps))}."
         require(len(steps) > 0 and set(steps) <= set(self.steps), "steps", steps, remedy)
@@ -115,43 +108,40 @@ def explore(
 ) -> list[PartialMap]:
     """Send a robot through a home and return its map at several moments.
 
-    The robot starts at a random free position and heading. Each step it moves towards a frontier between seen and
-    unseen cells, or turns, and then looks: rays run through the cells to the first wall. Range, position and wall
-    detection are exact, so whatever is seen is true, unless `sensor` has errors. When there is nothing left to see,
-    the robot stays.
+    The robot starts at a random free position and heading. Each step it drives towards a frontier between seen and
+    unseen cells, or turns, and then looks: rays run through the cells to the first wall. Observations are exact unless
+    `sensor` has errors. The robot stays when nothing is left to see.
 
     Parameters
     ----------
     home : PartialMap
-        The complete home. Its unknown cells stop the robot and its view, and stay unknown.
+        The complete home. Unknown cells stop the robot and its view.
     steps : sequence of int or float
-        Numbers of actions [1], increasing, at most `MAX_STEPS`, after which the map is returned. After 0 nothing has
-        been seen. Or fractions of the free area in [0, 1), increasing: each map is the first that has so much of it,
-        or the robot's map when it has nothing left to see, or after `VAIN_STEPS` actions without progress.
+        Increasing numbers of actions [1], at most 100,000, after which the map is returned; empty after 0. Or
+        increasing fractions of the free area in [0, 1): the first map with that fraction, or the last map if nothing is
+        left to see or after 1000 actions without progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
-        Sensor of the robot and its errors; None is the default, without errors.
+        Sensor of the robot and its errors; by default without errors.
     policy : {"random", "coverage"}
-        Choice of frontiers: at random, or where the uncertainty of the coverage falls most for few actions, as in
-        `next_views`. The latter predicts at every choice: about a minute for 300 steps.
+        Choice of frontiers: at random, or by the expected decrease of the uncertainty of the coverage, as in
+        `next_views` (about a minute for 300 steps).
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
         Transmitters [m] for the policy "coverage"; by default any position.
 
     Returns
     -------
     list of PartialMap
-        One for each of `steps`, on the grid of `home`, with `interior_cells` set to its number of free cells. Cells
-        that are known in one map are known in the next; without errors they are equal. A mesh is cut to
-        the known cells.
+        One for each of `steps`, on the grid of `home`, with its number of free cells as `interior_cells`. Known cells
+        stay known; without errors they keep their states. A mesh is cut to the known cells.
 
     Raises
     ------
     MapError
-        If the home has no free cell, or is no PartialMap.
+        If the home is not a PartialMap, or has no free cell.
     SettingsError
-        If `steps` are neither increasing whole numbers of 0 to `MAX_STEPS` nor increasing fractions in [0, 1), or
-        `seed` is not a whole number of 0 or more, or `sensor` or `policy` are of another kind.
+        For steps, seed, sensor or policy that are not allowed.
     PositionError
         For a transmitter outside the home or in a wall.
 
@@ -196,9 +186,8 @@ def explore_trajectory(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> found = sp.explore_trajectory(sp.make_home(3), steps=(20, 60))
-    >>> found.maps[-1].observed_fraction > found.maps[0].observed_fraction
-    True
+    >>> sp.explore_trajectory(sp.make_home(3), steps=(20, 60)).poses.shape
+    (61, 3)
     """
     remedy = (
         f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "

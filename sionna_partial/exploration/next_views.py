@@ -54,19 +54,18 @@ from sionna_partial.worlds.robot import (
 )
 
 GOALS = ("coverage", "state", "area")
-"""Goals of a view; the first is the default."""
 
 MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
-"""Largest numbers of poses that are returned, and of transmitters that are predicted."""
+"""Largest numbers of returned poses and of predicted transmitters."""
 
 SPACING_M, MOST_RECEIVERS = 0.5, 1500
-"""Distance between predicted receivers [m], and about their largest number; on large maps they are farther apart."""
+"""Distance between predicted receivers [m], larger on large maps, and about their largest number."""
 
 POSSIBLE_TRANSMITTERS = 3
-"""Number of positions that stand for all possible ones of a transmitter."""
+"""Number of positions that represent all possible ones of a transmitter."""
 
 LOOK_M = 1.25
-"""Driving that takes as long as choosing a view and turning towards it [m]."""
+"""Driving distance that takes as long as choosing a view and turning towards it [m]."""
 
 _HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 
@@ -74,7 +73,7 @@ _HEADINGS_DEG = np.arange(0.0, 360.0, 15.0)
 @read_only
 @dataclass(frozen=True, eq=False)
 class NextView(Shown):
-    """A pose from which a robot sees something that is not known.
+    """A pose from which a robot sees unknown cells.
 
     Parameters
     ----------
@@ -85,23 +84,21 @@ class NextView(Shown):
     path_length_m : float
         Length of the shortest safe path from the start [m].
     gain : float
-        Expected gain in information: uncertainty that the view removes, summed over receivers, one per square metre
-        [bit], the mean over transmitters; for the goal "area" the unknown area in view [m^2].
+        Expected information gain, summed over receivers, one per square metre [bit], mean over transmitters; for the
+        goal "area" the unknown area in view [m^2].
     gain_per_m : float
-        `gain` per metre driven, where looking counts as `LOOK_M` more. Views are ranked by it.
+        `gain` per metre driven, with 1.25 m added to the path. Views are ranked by it.
     path_m : (K, 2) float64 array
         The path, from the start to the pose [m].
     frontier_m : (F, 2) float64 array
-        Centres of the free cells beside unknown ones to which the robot drives [m].
+        Centres of the free cells of the frontier [m].
 
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
-    >>> partial = sp.map_from_array(cells, resolution_m=0.5)
-    >>> best = sp.next_views(partial, goal="area")[0]
-    >>> best.position_m.shape, best.gain > 0.0
-    ((2,), True)
+    >>> partial = sp.map_from_array([[1] * 5, *[[1, 0, 0, 0, 2]] * 3, [1] * 5], resolution_m=0.5)
+    >>> sp.next_views(partial, goal="area")[0].gain > 0.0
+    True
     """
 
     position_m: Floats
@@ -121,26 +118,17 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     Parameters
     ----------
     views : tuple of NextView
-        Empty where nothing unknown can be reached.
+        Empty if nothing unknown can be reached.
     partial : PartialMap
     start_m : (2,) float64 array
         Start of the paths [m].
     tx_m : (T, 3) float64 array
-        Transmitters that were predicted [m]; none for the goal "area".
+        Predicted transmitters [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        Entropy of each link on (tx, y, x) [bit], times the probability that the receiver is indoors. For a transmitter
-        at an unknown position it is multiplied by the relative probability of each of `tx_m`.
+        Entropy of each link on (tx, y, x) [bit], times the probability that the receiver is indoors and, for an unknown
+        transmitter, the relative probability of its position.
     goal : {"coverage", "state", "area"}
     sensor : SensorSettings
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
-    >>> partial = sp.map_from_array(cells, resolution_m=0.5)
-    >>> views = sp.next_views(partial, goal="area")
-    >>> [round(view.path_length_m, 1) for view in views]
-    [0.5]
     """
 
     views: tuple[NextView, ...]
@@ -152,7 +140,6 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     sensor: SensorSettings
 
     def __len__(self) -> int:
-        """Return the number of poses."""
         return len(self.views)
 
     @overload
@@ -160,7 +147,6 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     @overload
     def __getitem__(self, index: slice) -> Sequence[NextView]: ...
     def __getitem__(self, index: int | slice) -> NextView | Sequence[NextView]:
-        """Return a pose, 0 being the best."""
         return self.views[index]
 
     def poses(self) -> list[dict[str, dict[str, float]]]:
@@ -168,14 +154,13 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
         return [_pose(view) for view in self]
 
     def to_yaml(self) -> str:
-        """Return the poses as YAML: `header` and `poses` of a geometry_msgs/PoseArray, and the expected gains.
+        """Return YAML with `header` and `poses` of a geometry_msgs/PoseArray, and the expected gains.
 
         Examples
         --------
         >>> import sionna_partial as sp
-        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]
-        >>> views = sp.next_views(sp.map_from_array(cells, resolution_m=0.5), goal="area")
-        >>> print(views.to_yaml().splitlines()[0])
+        >>> partial = sp.map_from_array([[1] * 5, *[[1, 0, 0, 0, 2]] * 3, [1] * 5], resolution_m=0.5)
+        >>> print(sp.next_views(partial, goal="area").to_yaml().splitlines()[0])
         header: {frame_id: map}
         """
         expected = ("heading_deg", "path_length_m", "gain", "gain_per_m")
@@ -215,29 +200,28 @@ def next_views(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> NextViews:
-    """Rank poses from which a robot would lower the uncertainty of a coverage map most per metre driven.
+    """Rank poses by the expected decrease of the uncertainty of a coverage map per metre driven.
 
-    A pose is in the middle of a frontier between free and unknown cells, and looks where most is unknown. A view that
-    shows a part of the unobserved part of a link's direct line is expected to lower the uncertainty of that link, as
-    `predict_map` predicts it, by that fraction. Unknown cells count as free until they are seen. Unknown pockets into
-    which no robot fits, as in furniture, are no goal.
+    Poses are in the middle of frontiers and face the largest unknown area. A view of a fraction of the unobserved part
+    of a link's direct line is expected to lower the uncertainty of that link by that fraction. Unknown cells count as
+    free. Unknown pockets that no robot fits into are ignored.
 
     Parameters
     ----------
     scene : PartialMap or path
-        The map, or whatever `load_map` reads.
+        The map, or a file for `load_map`.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        One or several transmitters [m]. By default the transmitters of the measurements, or one located by them;
-        without measurements any position, the mean over some free cells.
+        Transmitters [m]. By default the transmitters of the measurements, or one located by them; without measurements
+        the mean over positions in free cells.
     measurements : Measurements, mapping, data frame or path, optional
-        Gains that were measured of the transmitters, as for `predict_map`.
+        Measured gains, as for `predict_map`.
     goal : {"coverage", "state", "area"}
-        Quantity that is to become known: whether the path gain exceeds the threshold, the link state, or the map alone,
-        for which nothing is predicted.
+        Quantity to learn: whether the path gain exceeds the threshold, the link state, or the map alone, without
+        prediction.
     count : int
         Largest number of poses.
     start : (2,) array-like, optional
-        Position of the robot [m]; by default the middle of the largest connected part of the free cells.
+        Position of the robot [m]; by default the middle of the largest free part.
     threshold_db : float
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional
@@ -248,14 +232,14 @@ def next_views(
     Returns
     -------
     NextViews
-        A sequence of at most `count` poses, the best first.
+        At most `count` poses, the best first.
 
     Raises
     ------
     MapError
         If the map cannot be read, or has no free cell.
     PositionError
-        For a start that is in no free cell, or a transmitter outside the map or in a wall.
+        For a start outside free cells, or a transmitter outside the map or in a wall.
     SettingsError
         For another goal, or a count or threshold out of range.
     MeasurementError
@@ -288,14 +272,13 @@ def next_views(
         frontiers = _frontiers(partial, cell)
         gains = _gains(partial, frontiers, tx_m, uncertainty, sensor, part_of(report, 0.7, 1.0))
         report(1.0, "done")
-    views = [_view(partial, *each) for each in zip(frontiers, *gains, strict=True)]
+    views = [_view(partial, *row) for row in zip(frontiers, *gains, strict=True)]
     views.sort(key=lambda view: -view.gain_per_m)
     start_m = cell_centres_m(partial, np.array(cell)) if start is None else np.asarray(start, dtype=np.float64)
     return NextViews(tuple(views[:count]), partial, start_m, tx_m, uncertainty, goal, sensor)
 
 
 def _frontiers(partial: PartialMap, cell: tuple[int, int]) -> list[Frontier]:
-    """Return wide frontiers that a robot at a cell reaches; pockets are no goal."""
     none = np.zeros(partial.shape, dtype=bool)
     radius, pockets = ROBOT_RADII_M[0] / partial.resolution_m, unknown_pockets(partial.state, partial.resolution_m)
     state = np.where(pockets, CellState.WALL, partial.state).astype(np.uint8)
@@ -304,7 +287,7 @@ def _frontiers(partial: PartialMap, cell: tuple[int, int]) -> list[Frontier]:
 
 
 def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:
-    """Return how a robot, whose map begins at another cell, chooses frontiers for the coverage of transmitters."""
+    """Return a choice of frontiers for the coverage of transmitters; `corner` is the first cell of the robot's map."""
     if tx is not None:
         _transmitters(home, tx, None)
 
@@ -315,7 +298,7 @@ def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | N
         partial = replace(area, state=robot.seen.copy(), interior_cells=None)
         tx_m = _transmitters(partial, tx, None)
         gains, _ = _gains(partial, frontiers, tx_m, _uncertainty(LinkModel(partial), tx_m, None, None), sensor)
-        return int(np.argmax(np.array(gains) / [robot.steps_to(each) + LOOK_M / FORWARD_M for each in frontiers]))
+        return int(np.argmax(np.array(gains) / [robot.steps_to(goal) + LOOK_M / FORWARD_M for goal in frontiers]))
 
     return choose
 
@@ -328,11 +311,7 @@ def _gains(
     sensor: SensorSettings,
     report: Progress = no_progress,
 ) -> tuple[list[float], list[float]]:
-    """Return the gain at each frontier, and the heading with the largest unknown area in view [degree].
-
-    A view that shows a part of the unobserved part of a link's direct line is taken to lower its uncertainty by that
-    fraction.
-    """
+    """Return the gain at each frontier, and the heading with the largest unknown area in view [degree]."""
     x, y = np.meshgrid(uncertainty.x, uncertainty.y)
     rx = in_cells(partial, np.stack([x.ravel(), y.ravel()], axis=1))
     each_m2 = uncertainty.attrs["spacing_m"] ** 2 / max(1, len(tx_m))
@@ -365,7 +344,6 @@ def _view(partial: PartialMap, frontier: Frontier, gain: float, heading_deg: flo
 
 
 def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]:
-    """Return the free cell at the start; by default in the middle of the largest part of the free cells."""
     free = partial.state == CellState.FREE
     if not free.any():
         raise MapError("the map has 0 free cells: a robot needs somewhere to stand; give a map with free cells.")
@@ -385,7 +363,6 @@ def _start_cell(partial: PartialMap, start: ArrayLike | None) -> tuple[int, int]
 
 
 def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measurements | None) -> Floats:
-    """Return the transmitters (T, 3) to predict [m]."""
     if tx is None and measured is not None:
         measured.require_transmitters()
         tx = np.unique(measured.tx, axis=0)
@@ -396,7 +373,6 @@ def _transmitters(partial: PartialMap, tx: ArrayLike | None, measured: Measureme
 
 
 def _possible_m(partial: PartialMap) -> Floats:
-    """Return positions that stand for all free cells (T, 3) [m]."""
     cells_m = with_height(cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE)))
     cells_m = cells_m[clear_of_walls(partial, cells_m)]
     if not len(cells_m):
@@ -413,7 +389,6 @@ def _uncertainty(
     threshold_db: float | None,
     report: Progress = no_progress,
 ) -> xr.DataArray:
-    """Predict the uncertainty of links of given transmitters on (tx, y, x) [bit]."""
     spacing_m = _spacing_m(model.partial)
     if not len(tx_m):
         none = xr.DataArray(np.zeros((0, 1, 1)), {"y": [0.0], "x": [0.0]}, ("tx", "y", "x"))
@@ -427,10 +402,7 @@ def _uncertainty(
 def _located(
     model: LinkModel, measured: Measurements, threshold_db: float | None, report: Progress
 ) -> tuple[Floats, xr.DataArray]:
-    """Return some positions (T, 3) [m] where the transmitter may be, and the contribution of each to the uncertainty.
-
-    That is the uncertainty of the coverage averaged over all positions, weighted by the posterior of each.
-    """
+    """Return possible positions (T, 3) [m] of the transmitter, and the contribution of each to the uncertainty."""
     spacing_m = _spacing_m(model.partial)
     coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=report)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
@@ -441,7 +413,7 @@ def _located(
 
 
 def _entropy(coverage: xr.Dataset, threshold_db: float | None) -> xr.DataArray:
-    """Return the entropy of whether the gain is above a threshold, or of the link state, times P(indoor) [bit]."""
+    """Return the entropy of the coverage above a threshold, or of the link state, times P(indoor) [bit]."""
     if threshold_db is None:
         p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
     else:
@@ -461,7 +433,6 @@ def _described(uncertainty: xr.DataArray, spacing_m: float) -> xr.DataArray:
 
 
 def _pose(view: NextView) -> dict[str, dict[str, float]]:
-    """Return a geometry_msgs/Pose."""
     x, y = view.position_m.round(3)
     half = math.radians(view.heading_deg) / 2.0
     return {

@@ -24,28 +24,24 @@ from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, t
 from sionna_partial.resources import optional_packages
 
 MAX_BAG_BYTES = 10**12
-"""Largest file of a recording [bytes]; only the messages that are asked for are read."""
+"""Largest file of a recording [bytes]; only requested messages are read."""
 
 MAX_MESSAGE_BYTES = MAX_CELLS + 100_000
-"""Largest message that is decoded [bytes]."""
 
 MAX_CHUNK_BYTES = 2 * 10**9
-"""Size of a chunk of an MCAP that is unpacked [bytes]."""
 
 _MCAP_MAGIC, _MCAP_SCHEMA, _MCAP_CHUNK = b"\x89MCAP0\r\n", 3, 6
 
 MAX_TILT_RAD = 0.01
-"""Largest roll and pitch of a map's origin that pass for level [rad]."""
 
 OCCUPIED_PERCENT, FREE_PERCENT = 65, 25
-"""Occupancy from which a cell is wall, and up to which it is free (the defaults of nav2's map_saver) [percent]."""
+"""Occupancy from which a cell is wall, and up to which it is free (defaults of nav2's map_saver) [percent]."""
 
 GRID = "OccupancyGrid"
-"""Type of messages with a map."""
 
 
 class Message(NamedTuple):
-    """A message of a recording: seconds since its start, the header's stamp (None without one), content and topic."""
+    """A message: seconds since the start of the recording, the header's stamp (or None), content and topic."""
 
     time_s: float
     stamp_s: float | None
@@ -61,16 +57,14 @@ class Recording:
 
     @property
     def kinds(self) -> dict[str, str]:
-        """Message type of every topic, without its package."""
         return {link.topic: link.msgtype.rpartition("/")[2] for link in self._reader.connections}
 
     @property
     def duration_s(self) -> float:
-        """Time from the first to the last message [s]."""
         return self._reader.duration / 1e9 if self._reader.message_count else 0.0
 
     def topic_of(self, given: str | None, kinds: tuple[str, ...], usual: str = "") -> str:
-        """Return a topic of one of several message types: the given one, the usual one, or the only one."""
+        """Return a topic of one of several message types: the given, the usual, or the only one."""
         topics = [topic for topic, kind in self.kinds.items() if not kinds or kind in kinds]
         if given is None and (usual in topics or len(topics) == 1):
             return usual if usual in topics else topics[0]
@@ -82,7 +76,6 @@ class Recording:
         raise self.error(f"path = '{self.path}' {what}: name one of its topics: {found}.")
 
     def messages(self, *topics: str, until_s: float = math.inf) -> Iterator[Message]:
-        """Decode the messages of some topics, in the order in which they were recorded."""
         for each in self.raw(*topics, until_s=until_s):
             yield self.decoded(*each)
 
@@ -95,7 +88,6 @@ class Recording:
             yield (time_ns - start) / 1e9, raw, link.msgtype, link.topic
 
     def decoded(self, time_s: float, raw: bytes, kind: str, topic: str) -> Message:
-        """Decode a message."""
         if len(raw) > MAX_MESSAGE_BYTES:
             size = f"a {kind} of {len(raw):,} bytes, more than {MAX_MESSAGE_BYTES:,}"
             raise self.error(f"path = '{self.path}' holds {size}: record a coarser map.")
@@ -106,7 +98,7 @@ class Recording:
 
 @contextmanager
 def _plain_storage(files: Iterable[Path]) -> Iterator[None]:
-    """Raise a ValueError for storage whose reader would not end: views in SQLite, huge chunks and arrays in MCAP."""
+    """Raise a ValueError for storage that its reader cannot handle: SQLite views, huge MCAP chunks and arrays."""
     for file in files:
         if file.suffix == ".db3":
             with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as database:
@@ -139,7 +131,7 @@ def _require_plain_mcap(stream: IO[bytes]) -> None:
 
 @contextmanager
 def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
-    """Open a rosbag; whatever its reader raises while it is open becomes an `error`."""
+    """Open a rosbag; all exceptions of its reader become an `error`."""
     with optional_packages(error):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -169,17 +161,17 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
     topic : str or None
         A topic of `nav_msgs/OccupancyGrid`; by default `/map`, or the only one.
     time_s : float or None
-        Seconds since the start of the recording: the last map up to then. None is the last map of all.
+        Seconds since the start of the recording: the last map up to then, by default the last of all.
 
     Returns
     -------
     PartialMap
-        As `map_from_occupancy` makes it of the message.
+        See `map_from_occupancy`.
 
     Raises
     ------
     MapError
-        If it is no rosbag or damaged, or has no such topic, or no map up to then.
+        If the file is not a rosbag, is damaged, or has no such topic or map.
 
     Examples
     --------
@@ -218,23 +210,18 @@ def map_from_occupancy(
     occupied_percent: float | None = None,
     free_percent: float | None = None,
 ) -> PartialMap:
-    """Make a map of a ROS `nav_msgs/OccupancyGrid`: of the message itself, or of its array.
+    """Make a map from a ROS `nav_msgs/OccupancyGrid`: the message itself, or its array.
 
     Parameters
     ----------
     data : OccupancyGrid or (height, width) integers
-        A message (rclpy, rospy, rosbags; anything with its `info` and `data`), or an array: -1 (or 255, its unsigned
-        form) unknown, else the occupancy in percent, 0 to 100. Row 0 holds the smallest y, as ROS has it.
-    resolution_m : float or None
-        Edge of a cell [m]; None for a message, which has its own.
-    origin_m : (float, float) or None
-        World x and y of the lower-left corner [m], (0, 0) by default; None for a message. The yaw of a message's
-        origin is honoured: quarter turns are exact, and for any other yaw cells have half the size.
-    wall_height_m : float
-        Height of walls and ceiling [m].
+        A message (rclpy, rospy, rosbags; any object with its `info` and `data`), or an array: occupancy in percent,
+        0 to 100, and -1 (or 255) for unknown. Row 0 holds the smallest y, as in ROS.
+    resolution_m, origin_m, wall_height_m
+        As of `map_from_array`. A message has its own resolution and origin, whose yaw is applied as in `load_map`.
     occupied_percent, free_percent : float or None
-        From this value a cell is wall; up to this value it is free. By default 65 and 25, as of nav2's map_saver, or,
-        for a map of continuous values such as of Cartographer, one threshold that fits it, with a `MapWarning`.
+        From the first value a cell is wall; up to the second it is free. By default 65 and 25, as in nav2's map_saver,
+        or, for continuous values as of Cartographer, one fitted threshold, with a `MapWarning`.
 
     Returns
     -------
@@ -272,7 +259,7 @@ def map_of_percent(
     occupied_percent: float | None = None,
     free_percent: float | None = None,
 ) -> PartialMap:
-    """Make a map of occupancies in percent, x and y of its lower-left corner [m], and its yaw [rad]."""
+    """Make a map from occupancies in percent, x and y of the lower-left corner [m], and the yaw [rad]."""
     values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
@@ -298,7 +285,7 @@ def map_of_percent(
 
 
 def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, float, float]]:
-    """Cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
+    """Return cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
     try:
         info, origin = message.info, message.info.origin
         size, resolution_m = (int(info.height), int(info.width)), number_of(info.resolution)

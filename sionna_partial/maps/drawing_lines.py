@@ -1,4 +1,4 @@
-"""Lines of a DXF: the layers with walls, named in European languages or by the AIA/NCS standard, and their unit."""
+"""Lines of a DXF on layers with walls, named in European languages or by the AIA/NCS standard, and their unit."""
 
 import io
 import math
@@ -19,16 +19,14 @@ from sionna_partial.maps.import_report import MapWarning, rooms_of
 from sionna_partial.maps.mesh.cells import crossed_cells
 
 MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 2_000_000, 16
-"""Most pieces of lines, most blocks and entities in them, and most blocks within blocks."""
+"""Most pieces of lines, most blocks with their entities, and deepest nesting of blocks."""
 
 FLAT_FRACTION = 0.001
-"""Distance of a polygon from its curve, in extents of the curve."""
+"""Distance of a polygon from its curve, relative to the extent of the curve."""
 
 LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "MLINE"}
-"""Types of entities that are read."""
 
 XREF = "external reference"
-"""Type of elements that refer to a block in another file."""
 
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
@@ -50,16 +48,15 @@ NO_WALL_NAMES = {
         "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
     }.items()
 }
-"""Words in the names of layers that describe walls, close doors, or have walls that will be demolished."""
+"""Words in the names of layers that describe walls, close doors, or contain walls to be demolished."""
 
 AIA_WALLS = {"WALL", "GLAZ", "COLS", "PRTN"}
 """Major groups of the AIA/NCS standard with walls, windows and columns."""
 
 AIA_STATUS = {"D": "to be demolished", "F": "future work", "M": "to be moved", "T": "temporary"}
-"""Last fields of AIA/NCS names of walls that are not part of the finished building."""
+"""Status fields of AIA/NCS names of walls that are not part of the finished building."""
 
 AIA_DEMOLITION = {"AD", "ID", "SD"}
-"""Disciplines of demolition: of architecture, interiors and structure."""
 
 PARTIAL_HEIGHT = re.compile(r"(?<![a-z])prht(?![a-z])|partial.?height|halbhoch|brüstung", re.IGNORECASE)
 """Words in the names of layers with walls that end below the ceiling."""
@@ -77,30 +74,28 @@ UNITS_M = {
     "inches": 0.0254,
     "feet": 0.3048,
 }
-"""Units in which plans are drawn [m]."""
 
 RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
-"""Misfit that units have in addition which are rare, unless the header has them."""
+"""Additional misfit of rare units, unless the header has them."""
 
 POSSIBLE_M = (1.0, 2000.0)
-"""Longer side of any building [m]."""
+"""Plausible longer sides of a building [m]."""
 
 MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
-"""Differences of misfits from which the unit of the header is not taken; from which it is taken with a warning, or not
-taken if it is inches or feet and the drawing metric; and from which one unit is better than all others."""
+"""Differences of misfits from which the header's unit is rejected; from which it gives a warning, or is rejected if it
+is inches or feet in a metric drawing; and from which one unit is better than all others."""
 
 RASTER_CELLS = 1000
 """Number of cells along the longer side of the plan in which openings are found."""
 
 MOST_LINES = 1500
-"""Number of the longest lines between which distances are taken."""
+"""Number of the longest lines between which distances are computed."""
 
 
 def skip_reason(name: str) -> str:
-    """Return the reason for which a layer is not read as walls, "" for one with walls.
+    """Return the reason for which a layer is not read as walls, "" for walls.
 
-    Names of the AIA/NCS standard are discipline, major group, minor groups and status: its major group decides whether
-    it has walls. The name of an external reference in front is left out.
+    The major group of an AIA/NCS name decides. Names of external references in front are ignored.
     """
     name = unicodedata.normalize("NFC", _REFERENCE.split(name)[-1])
     parts = _AIA.fullmatch(name)
@@ -116,7 +111,7 @@ def skip_reason(name: str) -> str:
 
 
 def opened(content: bytes) -> Any:
-    """Parse a DXF, which has to end as one. The slow reader for damaged files is the second choice."""
+    """Parse a complete DXF, with ezdxf's slow recovery as second choice."""
     from ezdxf import recover
     from ezdxf.document import Drawing
     from ezdxf.filemanagement import dxf_stream_info
@@ -136,10 +131,10 @@ def opened(content: bytes) -> Any:
 
 
 class DrawnLines:
-    """Lines of a drawing by layer. Blocks are read once, however often they are inserted.
+    """Lines of a drawing by layer. Each block is read once.
 
-    `counts` is the number of entities on each layer (in lower case) by type, also of blocks: entities on layer 0
-    of a block take the layer of their INSERT. `names` are the layers as they are written.
+    `counts` is the number of entities by layer (in lower case) and type, including blocks, whose entities on layer 0
+    take the layer of the INSERT. `names` are the layers as written.
     """
 
     def __init__(self, path: Path, drawing: Any) -> None:
@@ -153,7 +148,6 @@ class DrawnLines:
             raise self._too_large()
 
     def line_counts(self) -> Counter[str]:
-        """Return the number of entities with lines on each layer."""
         found = Counter[str]()
         for (layer, kind), count in self.counts.items():
             found[layer] += count * (kind in LINE_TYPES)
@@ -165,7 +159,7 @@ class DrawnLines:
         found = self._lines(self._drawing.modelspace(), layers, MAX_NESTING)
         kept = {layer: found[layer] for layer in sorted(found) if layer in layers}
         pieces = [segments[..., :2].reshape(-1, 2, 2) for segments in kept.values()]
-        names = np.repeat(np.array([*kept] or [""]), [len(each) for each in pieces] or [0])
+        names = np.repeat(np.array([*kept] or [""]), [len(part) for part in pieces] or [0])
         return np.concatenate([np.zeros((0, 2, 2)), *pieces]), names
 
     def _count(self, entities: Iterable[Any], nesting: int) -> Counter[tuple[str, str]]:
@@ -191,7 +185,6 @@ class DrawnLines:
         return found
 
     def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
-        """Return pieces (N, 2, 3) of lines by layer; layer 0 takes the layer of an INSERT later."""
         parts: dict[str, list[Segments]] = {}
         pieces = 0
         for entity in entities:
@@ -234,7 +227,7 @@ class DrawnLines:
 
 
 def _grid(insert: Any) -> Floats:
-    """Return the shifts (N, 1, 1, 3) of the places of a block that an INSERT places on a grid."""
+    """Return the shifts (N, 1, 1, 3) of an INSERT that repeats a block on a grid."""
     from ezdxf.math import Vec3
 
     ocs, turned = insert.ocs(), math.radians(insert.dxf.rotation)
@@ -253,7 +246,6 @@ def _layer_of(entity: Any) -> str:
 
 
 def _pieces(entity: Any) -> Iterator[Segments]:
-    """Yield the pieces (N, 2, 3) of the lines of an entity."""
     kind = entity.dxftype()
     if kind == "LINE":
         yield np.array([[entity.dxf.start.xyz, entity.dxf.end.xyz]])
@@ -266,7 +258,6 @@ def _pieces(entity: Any) -> Iterator[Segments]:
 
 
 def _curves(entity: Any) -> Iterator[Floats]:
-    """Yield the corners (N, 3) of the polygons that an entity consists of."""
     from ezdxf.path import from_hatch, make_path
 
     for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
@@ -279,7 +270,7 @@ def _curves(entity: Any) -> Iterator[Floats]:
 
 
 class _Scale(NamedTuple):
-    """A length of which buildings have a usual value [m]: a factor from it is a misfit of 1, and of `limit` at most."""
+    """Usual value of a length [m]; a factor from it is a misfit of 1, limited to `limit`."""
 
     usual_m: float
     factor: float
@@ -297,11 +288,10 @@ SCALES = {
 
 
 def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Floats) -> tuple[float, str]:
-    """Return the length of a unit of a drawing [m] and where it comes from.
+    """Return the length of a unit of a drawing [m] and its source, or raise a MapError if none fits best.
 
-    `code` is `$INSUNITS`, and `is_metric` is `$MEASUREMENT`. `segments` (N, 2, 2) are the lines of the walls, `texts`
-    (T,) the heights of texts. The unit of the header is taken unless one other unit fits the lengths in the drawing
-    far better. Raises a MapError if there is no unit that fits better than all others.
+    `code` is `$INSUNITS`, `is_metric` is `$MEASUREMENT`, `segments` (N, 2, 2) are the lines of the walls, `texts` (T,)
+    the heights of texts. The header's unit is used unless one other unit fits the lengths in the drawing much better.
     """
     lengths, header_m = lengths_of(segments, texts), _header_unit(code)
     misfits = {name: misfit(lengths, unit_m) + RARE.get(name, 0.0) for name, unit_m in UNITS_M.items()}
@@ -331,7 +321,7 @@ def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Flo
 
 
 def misfit(lengths: dict[str, float], unit_m: float) -> float:
-    """Return how far lengths in a drawing are from the usual ones with a unit [m], as a sum of squares."""
+    """Return the sum of squared deviations of lengths from the usual ones, with a unit [m]."""
     found = 0.0
     for name, length in lengths.items():
         usual_m, factor, limit = SCALES[name]
@@ -340,7 +330,6 @@ def misfit(lengths: dict[str, float], unit_m: float) -> float:
 
 
 def lengths_of(segments: Floats, texts: Floats) -> dict[str, float]:
-    """Return the lengths by which a unit is checked, in units of the drawing; those that it has."""
     low = segments.min(axis=(0, 1))
     extent = float(np.ptp(segments.reshape(-1, 2), axis=0).max())
     found = {"an extent": extent}
@@ -396,7 +385,7 @@ def _longest(segments: Floats) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def wall_thickness(segments: Floats) -> float:
-    """Return the usual distance of a line from the next parallel one beside it, 0 for walls of single lines."""
+    """Return the usual distance between neighbouring parallel lines, 0 for walls of single lines."""
     angle, offset, first, last = _longest(segments)
     length = last - first
     beside = np.minimum.outer(last, last) - np.maximum.outer(first, first) > 0.5 * np.minimum.outer(length, length)
@@ -408,7 +397,7 @@ def wall_thickness(segments: Floats) -> float:
 
 
 def _usual_gap(segments: Floats, extent: float, least: float) -> float:
-    """Return the most frequent gap between lines that continue each other, 0 if there is none."""
+    """Return the most frequent gap between collinear lines, 0 if there is none."""
     angle, offset, first, last = _longest(segments)
     line = np.stack([np.rint(angle / 0.01), np.rint(offset / (2e-4 * extent))], axis=1)
     _, group = np.unique(line, axis=0, return_inverse=True)

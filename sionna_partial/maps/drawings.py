@@ -1,7 +1,4 @@
-"""Floor plans -> PartialMap: DXF drawings and pictures.
-
-Walls are the lines of the wall layers of a drawing, or the dark lines of a picture; what they enclose is free.
-"""
+"""Floor plans -> PartialMap: DXF drawings, with walls on layers, and pictures, with walls in dark lines."""
 
 import math
 import os
@@ -43,20 +40,19 @@ from sionna_partial.maps.ros_map import bare_image, opened_image
 from sionna_partial.settings import Material
 
 MAX_DRAWING_BYTES = 100_000_000
-"""Largest drawing that is read [bytes]."""
 
 FOREIGN = "AEC_", "ACAD_PROXY"
-"""Beginnings of the types of objects that are not in the DXF as lines."""
+"""Prefixes of types of objects that the DXF does not contain as lines."""
 
 OPENING_M, SOLID_M = 2.0, 0.5
-"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both of its faces [m]."""
+"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
 
 MAX_ADDED, MAX_GROWTH = 8, 2.5
-"""Most layers that are tried where walls enclose hardly any area; largest extent with one of them, in their extents."""
+"""Most layers that are tried if walls enclose hardly any area, and their largest relative extent."""
 
 THIN_M, FILLED_FRACTION = 0.06, 0.3
-"""Width up to which lines are furniture, doors and dimensions [m], where at least that fraction of the dark pixels is
-wider: on such plans walls are filled."""
+"""Width of thin lines (furniture, doors, dimensions) [m], and least fraction of dark pixels in wider lines on plans
+with filled walls."""
 
 MARK_M = 0.5
 """Extent along x and y up to which separate marks are text or symbols [m]."""
@@ -72,31 +68,28 @@ def map_from_drawing(
     resolution_m: float = DEFAULT_RESOLUTION_M,
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
 ) -> PartialMap:
-    """Make a map of a DXF floor plan.
+    """Make a map from a DXF floor plan.
 
-    Lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space are walls, also those
-    in blocks. So are areas within that are nowhere wider than 0.5 m: walls that are drawn by both faces are solid.
-    Other areas within are free, doors included; openings of up to 2 m in the outer walls are closed for that, not
-    on the map. All other cells are unknown.
+    Walls are lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space, also in
+    blocks, and enclosed areas at most 0.5 m wide: walls drawn by both faces are solid. Other enclosed areas, doors
+    included, are free; openings of up to 2 m in outer walls count as closed for that. All other cells are unknown.
 
     Parameters
     ----------
     path : path-like
         The drawing (DXF, text or binary).
     wall_layers : sequence of str or None
-        Layers with the walls, `*` and `?` as in file names. By default visible layers whose names look like walls,
-        columns or windows, in languages of Europe and in the AIA/NCS standard, without those to be demolished. If there
-        are none, all visible layers are walls. If they enclose hardly any area, the layer that closes most rooms is
-        added. Both raise a `MapWarning`.
+        Layers with the walls, with wildcards `*` and `?`. By default visible layers with names of walls, columns or
+        windows, in European languages or the AIA/NCS standard, except demolished ones. Without such layers, all visible
+        ones; if they enclose hardly any area, also the layer that closes most rooms: both raise a `MapWarning`.
     layer_materials : mapping of str to Material or str, or None
-        Materials of the walls on layers, `*` and `?` as in file names, or their names as of `Material.named`. Where
-        there are lines of several, the last holds. All other walls are of the default.
+        Materials of the walls on layers, with wildcards. The last layer wins.
     layer_heights_m : mapping of str to float, or None
-        Heights of the walls on layers [m], `*` and `?` as in file names. By default walls reach the ceiling, with a
-        `MapWarning` for layers whose names mean a partial height.
+        Heights of the walls on layers [m], with wildcards. By default walls reach the ceiling, with a `MapWarning` for
+        layers whose names mean a partial height.
     unit_m : float or None
-        Length of a unit of the drawing [m], 0.001 for millimetres. By default the unit of its `$INSUNITS`. Another
-        unit, with a `MapWarning`, if extent, doors, walls and texts of the drawing fit only that one.
+        Length of a unit of the drawing [m], 0.001 for millimetres. By default the unit of its `$INSUNITS`, or another
+        one, with a `MapWarning`, if extent, doors, walls and texts fit only that.
     resolution_m : float
         Edge of a cell [m].
     wall_height_m : float
@@ -110,8 +103,8 @@ def map_from_drawing(
     Raises
     ------
     MapError
-        If there is no such file, it is damaged or too large, its unit is not clear, it has no such layers, or its walls
-        enclose nothing.
+        If the file is missing, damaged or too large, its unit is unclear, or its layers have no walls that enclose an
+        area.
 
     Examples
     --------
@@ -162,7 +155,7 @@ def map_from_drawing(
 
 
 class _Plan(NamedTuple):
-    """A drawing: its layers (in lower case) and whether they are visible, and its lines."""
+    """Layers of a drawing (in lower case) with their visibility, and its lines."""
 
     path: Path
     drawing: Any
@@ -177,7 +170,6 @@ class _Plan(NamedTuple):
         return cls(path, drawing, visible, lines)
 
     def unit(self, segments: Segments) -> tuple[float, str]:
-        """Return the length of a unit [m] and where it comes from; see `unit_of`."""
         header, texts = self.drawing.header, self.drawing.modelspace().query("TEXT MTEXT")
         names = {"TEXT": "height", "MTEXT": "char_height"}
         heights = np.array([float(text.dxf.get(names[text.dxftype()], 0.0)) for text in texts])
@@ -185,14 +177,12 @@ class _Plan(NamedTuple):
         return unit_of(self.path, code, is_metric, segments, heights)
 
     def listed(self) -> str:
-        """Return the names of the layers with their numbers of lines."""
         counts = self.lines.line_counts()
         names = sorted(self.visible, key=lambda layer: (-counts[layer], layer))
         texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
         return f"{len(names)} layers: {', '.join(texts)}"
 
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
-        """Return the reason for which each layer is no wall, "" for those with walls."""
         if names is not None:
             found = {
                 layer: "" if any(fnmatch(layer, name.lower()) for name in names) else "not in wall_layers"
@@ -218,7 +208,6 @@ class _Plan(NamedTuple):
         return segments, on_layer
 
     def note(self, notes: ImportNotes, reasons: dict[str, str]) -> None:
-        """Note which elements are used, and which are skipped; warn of those that may be walls and cannot be read."""
         lost = dict[str, int]()
         for (name, kind), count in self.lines.counts.items():
             layer = self.lines.names.get(name, name)
@@ -238,7 +227,6 @@ class _Plan(NamedTuple):
 
 
 def _cells(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> tuple[States, PartialMap]:
-    """Return the cell states (ny, nx) of lines [m], and an empty map of these cells."""
     extent = np.ptp(segments.reshape(-1, 2), axis=0)
     if not POSSIBLE_M[0] <= extent.max() <= POSSIBLE_M[1]:
         raise MapError(
@@ -256,7 +244,7 @@ def _enclosed(state: States) -> float:
 def _closing_layer(
     plan: _Plan, reasons: dict[str, str], segments: Segments, unit_m: float, resolution_m: float
 ) -> str | None:
-    """Return the other layer that closes the rooms, and warn of it; of several, the one that encloses least area."""
+    """Return the layer that closes the rooms with the smallest area, and warn of it."""
     counts, found = plan.lines.line_counts(), dict[str, float]()
     others = [layer for layer, reason in reasons.items() if reason == NO_WALL and counts[layer]]
     extent = np.ptp(segments.reshape(-1, 2), axis=0).max()
@@ -278,7 +266,6 @@ def _closing_layer(
 
 
 def _warn_of_close_lines(path: Path, segments: Segments, unit_m: float, resolution_m: float) -> None:
-    """Warn of walls whose faces are closer to each other than a cell."""
     thickness_m = wall_thickness(segments) * unit_m
     if 0 < thickness_m < resolution_m:
         what = f"path = '{path}' has lines {thickness_m:.2g} m apart, closer than resolution_m = {resolution_m:g}"
@@ -287,7 +274,6 @@ def _warn_of_close_lines(path: Path, segments: Segments, unit_m: float, resoluti
 
 
 def _by_layer(name: str, plan: _Plan, layers: set[str], given: Any, checked: Any) -> dict[Any, set[str]]:
-    """Return the layers with walls for each value of an option that has values by the names of layers."""
     given = {} if given is None else given
     if not isinstance(given, Mapping):
         raise MapError(f"{name} = {shown(given)} is not allowed: give values by the names of layers.")
@@ -303,7 +289,6 @@ def _by_layer(name: str, plan: _Plan, layers: set[str], given: Any, checked: Any
 
 
 def material_given(name: str, value: object) -> Material:
-    """Return the material that `layer_materials` has for a name."""
     material = Material.named(value) if isinstance(value, str) else value
     if not isinstance(material, Material):
         raise MapError(f"layer_materials[{shown(name)}] = {shown(value)} is no material: give one, or its name.")
@@ -330,7 +315,6 @@ def with_materials(
 def _with_heights(
     path: Path, partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], heights_m: dict[float, set[str]]
 ) -> PartialMap:
-    """Let walls on some layers end at a height [m], and warn of walls of partial height without one."""
     named = set().union(*heights_m.values())
     low = sorted(layer for layer in set(on_layer.tolist()) - named if PARTIAL_HEIGHT.search(layer))
     if low:
@@ -358,13 +342,13 @@ def _owners(
 
 def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
     plain = not isinstance(wall_layers, str) and isinstance(wall_layers, Sequence)
-    if wall_layers is not None and not (plain and wall_layers and all(isinstance(each, str) for each in wall_layers)):
+    if wall_layers is not None and not (plain and wall_layers and all(isinstance(name, str) for name in wall_layers)):
         raise MapError(f"wall_layers = {shown(wall_layers)} is not allowed: give names of layers, such as ['WALLS'].")
     return wall_layers
 
 
 def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
-    """Return the cell states (ny, nx): walls with the cells of `solid`, the area within, and unknown cells."""
+    """Return the cell states (ny, nx): walls including `solid`, enclosed area, and unknown cells."""
     cell_m = empty.resolution_m
     cells = crossed_cells((segments - empty.origin_m) / cell_m, empty.shape, BORDER_M / cell_m)
     margin = math.ceil(OPENING_M / cell_m)
@@ -384,10 +368,10 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
 
 
 def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
-    """Read a floor plan from a picture with dark walls on a bright ground, or bright walls on a dark one.
+    """Read a floor plan from a picture with dark walls on a bright ground, or the inverse.
 
     `resolution_m` is the edge of a pixel [m], `threshold` the largest shade of walls in `wall_shades`, by default
-    Otsu's. World x and y begin at the lower-left corner of the picture.
+    Otsu's. The origin is the lower-left corner of the picture.
     """
     if resolution_m is None:
         raise bare_image(path)
@@ -420,7 +404,7 @@ def read_picture(path: Path, *, resolution_m: float | None = None, threshold: in
 
 
 def wall_shades(path: Path) -> tuple[States, int, bool]:
-    """Return shades of grey (rows, columns), inverted where walls are bright, Otsu's threshold, and if inverted."""
+    """Return shades of grey (rows, columns), inverted if walls are bright, Otsu's threshold, and the inversion."""
     shade = _shades(path)
     count = np.bincount(shade.ravel(), minlength=256)
     if np.count_nonzero(count) < 2:
@@ -432,7 +416,6 @@ def wall_shades(path: Path) -> tuple[States, int, bool]:
 
 
 def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes) -> Bools:
-    """Return which pixels are walls, the top row first, and note what was taken for them."""
     shade, otsu, is_inverted = wall_shades(path)
     most, source = (otsu, "Otsu's threshold") if threshold is None else (threshold, "as given")
     wall = shade <= most
@@ -448,7 +431,7 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
     longest = MARK_M / pixel_m
     small = [max(part.stop - part.start for part in extent) <= longest for extent in ndimage.find_objects(pieces)]
     notes.skip("separate marks", sum(small), f"text or symbols up to {MARK_M:g} m")
-    wall = np.array([False, *(not each for each in small)])[pieces]
+    wall = np.array([False, *(not is_small for is_small in small)])[pieces]
     notes.use("connected walls", len(small) - sum(small))
     if not wall.any():
         what = f"path = '{path}' has no connected walls longer than {MARK_M:g} m with resolution_m = {pixel_m:g}"
@@ -457,7 +440,6 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
 
 
 def _shades(path: Path) -> States:
-    """Return the shades of grey (rows, columns); transparent pixels are white."""
     image = ImageOps.exif_transpose(opened_image(path, f"path = '{path}'", ("PNG", "JPEG", "BMP")))
     if image.mode.startswith(("I", "F")):
         values = np.asarray(image, dtype=np.float64)
@@ -468,7 +450,7 @@ def _shades(path: Path) -> States:
 
 
 def otsu_threshold(count: Indices) -> int:
-    """Return the largest shade of the darker class by the frequencies of shades (Otsu, IEEE Trans. SMC-9, 1979)."""
+    """Return the largest shade of the darker class (Otsu, IEEE Trans. SMC-9, 1979)."""
     shade = np.arange(len(count))
     dark, total = np.cumsum(count)[:-1], count.sum()
     mean_dark = np.cumsum(count * shade)[:-1] / np.maximum(dark, 1)

@@ -27,16 +27,14 @@ from sionna_partial.resources import optional_packages
 from sionna_partial.settings import Material
 
 MAX_IFC_BYTES = 500_000_000
-"""Largest model that is read [bytes]."""
 
 CUT_M = 1.2001
-"""Height above the storey at which walls are cut [m], as in plans: above sills and tables, and on no round number."""
+"""Height above the storey at which walls are cut [m]: above sills and tables, and not a round number."""
 
 LEAST_STOREY_M = 2.0
-"""Height from which on the next storey is the ceiling of one [m]: levels nearer by are of stairs or foundations."""
+"""Height from which the next storey is the ceiling [m]; closer levels belong to stairs or foundations."""
 
 MAX_THICKNESS_M = 10.0
-"""Largest thickness of a material [m]."""
 
 DOOR = "IfcDoor"
 
@@ -49,7 +47,7 @@ TYPES = {
     "IfcColumn": "concrete",
     "IfcWall": None,
 }
-"""Types that are walls, with all of their subtypes, and the name of their material; None is the default one."""
+"""Types that are walls, with their subtypes, and the name of their material; None is the default."""
 
 NAMES = {
     "coated glass": r"coated glass|low.?e\b",
@@ -61,14 +59,14 @@ NAMES = {
     "wood": r"wood|timber|lumber|holz|\bbois",
     "metal": r"metal|steel|stahl|alumini|iron",
 }
-"""Parts of the names of materials, by our names for them; the first that fits counts."""
+"""Patterns of material names by our names; the first match counts."""
 
 
 PANES = ("IfcWindow", "IfcCurtainWall")
-"""Types whose panes count, not their frames."""
+"""Types whose panes count instead of their frames."""
 
 SOLID = ("concrete", "reinforced concrete", "brick", "wood")
-"""Names of materials whose walls are as thick as their bodies, where no layer has a thickness."""
+"""Materials whose walls are as thick as their bodies if no layer has a thickness."""
 
 
 class _Cut(NamedTuple):
@@ -80,7 +78,7 @@ class _Cut(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Material of an element, None for the default, its lines, and the area that they enclose [m]."""
+    """Material of an element (None: default), its lines, and the area that they enclose [m]."""
 
     material: Material | None
     segments: Segments
@@ -97,8 +95,7 @@ def map_from_ifc(
     """Make a map of a storey of an IFC model; see `load_map`.
 
     Walls, columns, windows and the parts of curtain walls are cut 1.2 m above the storey; an element without a body has
-    the bodies of its parts. The enclosed area is free, as on a drawing. Doors are open, unless `layer_materials` has a
-    material for "IfcDoor".
+    the bodies of its parts. Doors are open unless `layer_materials` has a material for "IfcDoor".
     """
     with optional_packages(MapError):
         import ifcopenshell
@@ -120,36 +117,37 @@ def map_from_ifc(
 
 
 def _map_of(path: Path, pieces: list[_Piece], resolution_m: float, height_m: float) -> PartialMap:
-    """Return the map of elements that were cut."""
-    segments = np.concatenate([each.segments for each in pieces])
+    segments = np.concatenate([piece.segments for piece in pieces])
     empty = fitted_grid(np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]), resolution_m)
-    state = states_of_lines(segments, empty, _covered([each.area for each in pieces], empty))
+    state = states_of_lines(segments, empty, _covered([piece.area for piece in pieces], empty))
     if not (state == CellState.FREE).any():
         raise MapError(f"path = '{path}' has walls that enclose nothing on this storey: give another storey.")
     partial = PartialMap(state, empty.resolution_m, empty.origin_m, height_m)
-    materials = list(dict.fromkeys(each.material for each in pieces))
-    owner = np.repeat([str(materials.index(each.material)) for each in pieces], [len(each.segments) for each in pieces])
-    named = {each: {str(number)} for number, each in enumerate(materials) if each is not None}
+    materials = list(dict.fromkeys(piece.material for piece in pieces))
+    numbers = [str(materials.index(piece.material)) for piece in pieces]
+    owner = np.repeat(numbers, [len(piece.segments) for piece in pieces])
+    named = {material: {str(number)} for number, material in enumerate(materials) if material is not None}
     return with_materials(partial, segments, owner, named) if named else partial
 
 
 def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tuple[float, float]:
-    """Return world z of the given storey, or of the only one with walls, and the height of its ceiling above [m]."""
+    """Return world z of the given storey, or the only one with walls, and the height of its ceiling above [m]."""
     from ifcopenshell.util.element import get_container
     from ifcopenshell.util.placement import get_local_placement
 
     unit_m = notes.unit_m
     every = model.by_type("IfcBuildingStorey")
-    level_m = {each: float(get_local_placement(each.ObjectPlacement)[2, 3]) * unit_m for each in every}
+    level_m = {storey: float(get_local_placement(storey.ObjectPlacement)[2, 3]) * unit_m for storey in every}
     walls = model.by_type("IfcWall")
     if not walls or not every:
         raise MapError(f"path = '{path}' has {len(walls)} walls on {len(every)} storeys: export a building with both.")
     used = {get_container(wall, ifc_class="IfcBuildingStorey") for wall in walls}
-    chosen = [each for each in every if each in used or not used & {*every}]
+    chosen = [storey for storey in every if storey in used or not used & {*every}]
     if name is not None:
-        chosen = [each for each in every if (each.Name or "").casefold() == str(name).casefold()]
+        chosen = [storey for storey in every if (storey.Name or "").casefold() == str(name).casefold()]
     if len(chosen) != 1:
-        named = ", ".join(f"'{each.Name}' at {level_m[each]:.2f} m" for each in sorted(every, key=level_m.__getitem__))
+        by_level = sorted(every, key=level_m.__getitem__)
+        named = ", ".join(f"'{storey.Name}' at {level_m[storey]:.2f} m" for storey in by_level)
         what = f"storey = {shown(name)} is one of {len(chosen)} of path = '{path}'"
         raise MapError(f"{what}: give the name of one as storey; it has {named[:1000]}.")
     floor_m = level_m[chosen[0]]
@@ -159,7 +157,6 @@ def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tup
 
 
 def _given(path: Path, model: Any, given: Mapping[str, Material | str]) -> dict[str, Material]:
-    """Return the materials that are given for patterns of types."""
     found = dict[str, Material]()
     for name, value in given.items():
         present = [kind for kind in TYPES if model.by_type(kind) and fnmatch(kind.lower(), str(name).lower())]
@@ -171,7 +168,6 @@ def _given(path: Path, model: Any, given: Mapping[str, Material | str]) -> dict[
 
 
 def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: ImportNotes) -> list[_Piece]:
-    """Cut the walls at a height [m]; windows and doors come after the walls that they are in."""
     kinds = [kind for kind in TYPES if kind != DOOR or kind in given]
     owner_of = _bodies(model, kinds)
     cuts = _cuts(model, height_m, [model.by_id(body) for body in owner_of], notes)
@@ -200,7 +196,7 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
 
 
 def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
-    """Return the number of the kind, and the wall, of all elements that may have a body: walls, and parts of walls."""
+    """Return the type number and the wall of each element that may have a body: walls and parts of walls."""
     owner_of = {element.id(): (number, element) for number, kind in enumerate(kinds) for element in model.by_type(kind)}
     waiting = [(element, *owner) for owner in owner_of.values() for element in owner[1:]]
     while waiting:
@@ -214,12 +210,11 @@ def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
 
 
 def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) -> dict[int, _Cut]:
-    """Cut the bodies of elements at a height [m]."""
     import ifcopenshell.geom
 
     settings = ifcopenshell.geom.settings()
     settings.set("use-world-coords", True)
-    products = [each for each in products if each.Representation]
+    products = [product for product in products if product.Representation]
     cuts, triangles = dict[int, _Cut](), 0
     shapes: Any = ifcopenshell.geom.iterator(settings, model, core_count(), include=products) if products else ()
     for shape in shapes:
@@ -235,7 +230,6 @@ def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) 
 
 
 def _cut(corners_m: Floats, height_m: float) -> Segments:
-    """Cut triangles (F, 3, 3) [m] by a horizontal plane: segments (N, 2, 2) [m] whose ends meet to the last digit."""
     above = corners_m[..., 2] > height_m
     crossed = np.flatnonzero(above.any(axis=1) & ~above.all(axis=1))
     corners_m, above = corners_m[crossed], above[crossed]
@@ -251,7 +245,6 @@ def _cut(corners_m: Floats, height_m: float) -> Segments:
 
 
 def _covered(areas: list[shapely.Geometry], empty: PartialMap) -> Bools:
-    """Cells (ny, nx) whose centres are within one of the areas [m]."""
     cells, (ny, nx) = np.zeros(empty.shape, dtype=bool), empty.shape
     for area in areas:
         if area.is_empty:
@@ -298,13 +291,12 @@ def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) 
 
 
 def _width_m(area: shapely.Geometry) -> float:
-    """Return the width of strips of one width and any lengths from their area and perimeter [m]."""
+    """Return the width of strips of any lengths from their area and perimeter [m]."""
     count, perimeter_m = max(1, len(shapely.get_parts(area))), area.length
     return float(perimeter_m - math.sqrt(max(0.0, perimeter_m**2 - 16 * count * area.area))) / (4 * count)
 
 
 def _layers(found: Any) -> list[tuple[float, str]]:
-    """Return thickness in units of the model (0 where there is none) and name of each material of a set."""
     if found.is_a("IfcMaterial"):
         return [(0.0, found.Name or "")]
     of_kind = {
@@ -323,5 +315,4 @@ def _layers(found: Any) -> list[tuple[float, str]]:
 
 
 def _known(text: str) -> str | None:
-    """Return our name of a material that a text names."""
     return next((name for name, pattern in NAMES.items() if re.search(pattern, text, re.IGNORECASE)), None)

@@ -1,4 +1,4 @@
-"""ImportReport: elements of a file that a reader used and skipped, and the size of the map that it made."""
+"""ImportReport: elements of a file that a reader used and skipped, and the size of the resulting map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ MAX_ROOM_CELLS = 1_000_000
 """Number of cells above which a plan is coarsened before rooms are counted."""
 
 OPENING_RATIO = 0.65
-"""Largest width of an opening, as a fraction of the widest circle in the smaller of the rooms that it joins."""
+"""Largest width of an opening, relative to the widest circle in the smaller of the rooms that it joins."""
 
 SMALLEST_RADIUS_CELLS = 4.0
 """Radius of the widest circle in the smallest room [cells]."""
@@ -30,16 +30,15 @@ SIZES_M, DOORS_M = (3.0, 300.0), (0.5, 3.0)
 """Plausible longer sides of a building, and plausible widths of doors [m]."""
 
 ENCLOSED_FRACTION = 0.1
-"""Fraction of the extent of a building that is free at least."""
+"""Smallest free fraction of the extent of a building."""
 
 SHOWN_ROWS = 30
-"""Number of elements that the text of a report lists as used, and as skipped."""
 
 _Map = TypeVar("_Map", bound=Any)
 
 
 class Rooms(NamedTuple):
-    """Number of rooms, and the widths [m] of the widest openings that join them, one for each room that is joined."""
+    """Number of rooms, and the widths of the widest openings that join them [m], one for each joined room."""
 
     number: int
     openings_m: Floats
@@ -48,8 +47,7 @@ class Rooms(NamedTuple):
 def rooms_of(free: Bools, resolution_m: float) -> Rooms:
     """Find rooms and openings among the free cells (ny, nx) of a plan.
 
-    Cells are visited in the order of their distance from walls. An opening is where two areas meet that are both wider
-    than it.
+    Cells are visited by falling distance from walls. An opening is where two wider areas meet.
     """
     factor = math.ceil(math.sqrt(free.size / MAX_ROOM_CELLS))
     if factor > 1:
@@ -63,8 +61,7 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
 
 
 @njit(cache=True)
-def _join(clearance, order, nx, ratio, smallest):  # type: ignore[no-untyped-def]
-    """Join cells in falling order of clearance; return the clearances of openings, and the number of areas."""
+def _join(clearance, order, nx, ratio, smallest):
     parent = np.full(len(clearance), -1)
     openings, count, areas = np.zeros(len(order)), 0, 0
     for cell in order:
@@ -89,7 +86,7 @@ def _join(clearance, order, nx, ratio, smallest):  # type: ignore[no-untyped-def
 
 
 class MapWarning(UserWarning):
-    """A map file that was not read to the letter, or whose map is not plausible.
+    """A map file that was read with corrections, or whose map is not plausible.
 
     `report` is the `ImportReport` of the map, or None.
     """
@@ -99,7 +96,7 @@ class MapWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of a file with one name or type, their number, and the reason for which they were skipped."""
+    """Elements of a file with one name or type, their number, and the reason for skipping them."""
 
     name: str
     count: int
@@ -120,9 +117,7 @@ class ImportSource:
 
 @dataclass(frozen=True)
 class ImportReport(ImportSource, Shown):
-    """Report of a map that was read from a file.
-
-    Size, rooms and doors are computed from the cells of the map, so that they check the result of the import.
+    """Report of a map that was read from a file; size, rooms and doors are computed from the cells of the map.
 
     Parameters
     ----------
@@ -133,7 +128,7 @@ class ImportReport(ImportSource, Shown):
     unit_source : str
         Source of the unit: a header, an option, the file format, or a guess.
     used, skipped : tuple of Elements
-        Elements of the file by name or type, with their number, and the reason for which they were skipped.
+        Elements of the file.
     notes : tuple of str
         Further decisions of the reader.
     extent_m : (float, float)
@@ -143,7 +138,7 @@ class ImportReport(ImportSource, Shown):
     free_area_m2 : float
         Area of the free cells [m^2].
     door_widths_m : tuple of float
-        Widths of the openings between rooms, to a cell [m]. Each room that is joined to others counts once.
+        Widths of the openings between rooms, to a cell [m], one for each joined room.
     """
 
     extent_m: tuple[float, float] = (0.0, 0.0)
@@ -174,7 +169,7 @@ class ImportReport(ImportSource, Shown):
         return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
 
     def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
-        """Yield the implausible results, each with its remedy; checks without a remedy are left out."""
+        """Yield implausible results with their remedies; checks without a remedy are skipped."""
         (x, y), widths = self.extent_m, self.door_widths_m
         if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
             yield f"spans {x:.4g} x {y:.4g} m, with {self._unit}: {size}"
@@ -190,14 +185,7 @@ class ImportReport(ImportSource, Shown):
 
 @dataclass
 class ImportNotes:
-    """Notes of a reader while it reads a file: elements used, elements skipped with the reason, and the unit.
-
-    Examples
-    --------
-    >>> notes = ImportNotes("model.ifc", 0.001, "IfcSIUnit of the model")
-    >>> notes.use("IfcWall", 12)
-    >>> notes.skip("IfcFurniture", 3, "no wall")
-    """
+    """Notes of a reader: elements used, elements skipped with the reason, and the unit."""
 
     file: str | os.PathLike[str]
     unit_m: float = 1.0
@@ -206,18 +194,15 @@ class ImportNotes:
     _counts: dict[tuple[str, str], int] = field(default_factory=dict)
 
     def use(self, name: str, count: int = 1) -> None:
-        """Count elements that were used."""
         self.skip(name, count, "")
 
     def skip(self, name: str, count: int, reason: str) -> None:
-        """Count elements that were skipped."""
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
-        """Return a PartialMap with its report, and warn of a result that is not plausible.
+        """Return a PartialMap with its report, and warn of implausible results.
 
-        `size`, `doors` and `area` are the remedies, which name the options, for maps of an implausible extent, with
-        implausible doors, and that enclose hardly any area. A check without a remedy is left out.
+        `size`, `doors` and `area` are remedies; a check without a remedy is skipped.
         """
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
@@ -232,19 +217,14 @@ class ImportNotes:
 
 
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
-    """Return the report of a map with the cells (ny, nx)."""
-    free, known = state == CellState.FREE, state != CellState.UNKNOWN
+    free = state == CellState.FREE
     rooms = rooms_of(free, resolution_m)
-    spans = [_span(known.any(axis=axis)) * resolution_m for axis in (0, 1)]
+    (y, x) = next(iter(ndimage.find_objects((state != CellState.UNKNOWN).astype(np.uint8))), (slice(0, 0),) * 2)
+    extent_m = (x.stop - x.start) * resolution_m, (y.stop - y.start) * resolution_m
     area_m2, doors_m = float(free.sum()) * resolution_m**2, tuple(rooms.openings_m.tolist())
     return ImportReport(
-        **vars(source), extent_m=(spans[0], spans[1]), rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
+        **vars(source), extent_m=extent_m, rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
     )
-
-
-def _span(known: Any) -> int:
-    cells = np.flatnonzero(known)
-    return int(cells[-1] - cells[0]) + 1 if len(cells) else 0
 
 
 def _listed(rows: tuple[Elements, ...]) -> list[str]:

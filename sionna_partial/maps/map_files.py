@@ -60,19 +60,16 @@ ACCEPTED = (
     f"a building model ({', '.join(IFC_SUFFIXES)}), the map of a vacuum robot ({', '.join(VACUUM_SUFFIXES)}), "
     f"a floor plan as a picture ({', '.join(PICTURE_SUFFIXES)}), or a rosbag ({', '.join(BAG_SUFFIXES)}, or a folder)"
 )
-"""Kinds of files that load_map reads."""
 
 _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
-"""Size of the largest array of a mesh [bytes]."""
 
 COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
-"""Formats of coverage files."""
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
 """Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
 
 HABITAT_COVERED = (6, 9)
-"""Drawings that may cover what is not navigable: target and target bounding box (habitat-lab, maps.py)."""
+"""Drawings that may cover cells that are not navigable: target and its bounding box (habitat-lab, maps.py)."""
 
 
 def load_map(
@@ -92,66 +89,64 @@ def load_map(
 ) -> PartialMap:
     """Read a map from a file or a folder.
 
-    A mesh is laid on cells: observed cells in which it has a surface in the height band are walls, other observed
-    cells are free. The map carries the mesh itself, cut at the border of its known cells seen from above.
+    In a mesh, observed cells with a surface in the height band are walls, other observed cells are free. The map
+    carries the mesh, cut at the border of its known cells.
 
     Parameters
     ----------
     path : path-like
-        A ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image); an `.npz` of `save_map`; an
-        exported scene: its folder or its `scene.xml`; the folder that `sionna-partial calibrate` wrote; a mesh in
-        metres (PLY, GLB, GLTF, OBJ, STL); or a Mitsuba scene of meshes, with the radio materials of Sionna RT: its
-        `.xml`, or a folder with one; a point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS; see `map_from_points`); a
-        floor plan (DXF; see `map_from_drawing`); a building model (IFC, with the extra `ifc`), whose
-        walls, columns, windows and curtain walls are cut 1.2 m above a storey, and whose doors are open; the map of a
-        vacuum robot as Valetudo writes it (JSON), or the recording of Valeronoi (.vwm) with it, whose rooms become
-        `PartialMap.room`; a picture of a floor plan (PNG, JPEG, BMP), with `resolution_m`; or a rosbag (.bag, .mcap,
-        .db3, or a folder; see `map_from_bag`).
+        - ROS map_server YAML (modes trinary, scale and raw; PGM, PNG or BMP image)
+        - `.npz` of `save_map`
+        - exported scene (folder or `scene.xml`), or folder of `sionna-partial calibrate`
+        - mesh in metres (PLY, GLB, GLTF, OBJ, STL)
+        - Mitsuba scene of meshes with radio materials of Sionna RT (`.xml`, or a folder with one)
+        - point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS): see `map_from_points`
+        - DXF floor plan: see `map_from_drawing`
+        - picture of a floor plan (PNG, JPEG, BMP), with `resolution_m`
+        - building model (IFC, extra `ifc`): walls, columns, windows and curtain walls are cut 1.2 m above a storey;
+          doors are open
+        - map of a vacuum robot (Valetudo JSON, Valeronoi .vwm), whose segments become `PartialMap.room`
+        - rosbag (.bag, .mcap, .db3, or a folder): see `map_from_bag`
     strict : bool
-        Read a ROS map to the letter. By default the shade 205, by which map savers mean unknown, and fully
-        transparent pixels of a trinary map stay unknown, with a `MapWarning`, where the letter makes them free or
-        wall. Other files are unambiguous.
+        Read a ROS map exactly as map_server does. By default the shade 205, which means unknown in saved maps, and
+        transparent pixels of a trinary map stay unknown, with a `MapWarning`.
     wall_height_m : float or None
-        Wall height [m] in place of the file's. For a mesh, the height above its lowest point up to which radios may
-        be (by default its highest point), as on roofs.
+        Wall height [m] instead of the file's. For a mesh, the height above its lowest point up to which radios may be.
     height_band_m : (float, float) or None
-        World z between which a surface of a mesh, or a point of a cloud, is a wall [m]. By default `DEFAULT_BAND_M`
-        above the lowest point, of a cloud above its lowest floor.
+        World z between which surfaces of a mesh, or points of a cloud, are walls [m]. By default 1.0 to 1.8 m
+        above the lowest point of a mesh, or the lowest floor of a cloud.
     observed : (M, 2) array-like, PartialMap or None
-        Observed part of a mesh: the corners of a polygon, world x and y [m]; or a map, whose known cells it is.
-        By default all cells above or below which the mesh has a surface.
+        Observed part of a mesh: corners of a polygon in world x and y [m], or a map with known cells. By default all
+        cells above or below which the mesh has a surface.
     resolution_m : float or None
-        Edge of the cells of the map of a mesh, cloud, drawing or building model [m], 0.05 by default. They lie on
-        multiples of it. For a picture, the metres per pixel: a known length [m] over its number of pixels.
+        Edge of the cells of a mesh, cloud, drawing or building model [m], 0.05 by default. For a picture, the metres
+        per pixel.
     up : {"z", "y"} or None
-        Axis of a mesh or cloud that points up. By default y of glTF (.glb, .gltf), as its specification says, and z of
-        other files, with a `MapWarning` if that looks wrong.
+        Axis of a mesh or cloud that points up. By default y for glTF, as its specification says, and z for other
+        files, with a `MapWarning` if that looks wrong.
     layer_materials : mapping of str to Material or str, or None
-        Materials of the walls on layers of a drawing, or their names as of `Material.named` (see `map_from_drawing`).
-        For a building model, by types such as "IfcWall", in place of the materials that it names. Doors that are given
-        one ("IfcDoor") are closed.
+        Materials of the walls on layers of a drawing (see `map_from_drawing`), or by types of a building model, such
+        as "IfcWall". "IfcDoor" closes the doors.
     wall_layers : sequence of str or None
-        Layers of a drawing with the walls, `*` and `?` as in file names (see `map_from_drawing`).
+        Layers of a drawing with the walls (see `map_from_drawing`).
     unit_m : float or None
-        Length of a unit of a drawing, mesh or cloud [m], 0.001 for millimetres, 0.3048 for feet. By default the unit
-        in the header of a drawing, and 1 for meshes and clouds.
+        Length of a unit of a drawing, mesh or cloud [m]: 0.001 for millimetres. By default the unit in the header of
+        a drawing, and 1 for meshes and clouds.
     storey : str or None
-        Name of a storey of a building model; it may be left out where one alone has walls.
+        Name of a storey of a building model. Optional if only one has walls.
     obstacle_height_m : float or None
-        Height of free-standing obstacles on a floor plan [m], such as furniture on the map of a robot (see
-        `PartialMap.with_obstacle_height`). By default walls reach the ceiling, but for obstacles that the file has.
+        Height of free-standing obstacles on a floor plan [m] (see `PartialMap.with_obstacle_height`).
 
     Returns
     -------
     PartialMap
-        In world axes: the origin's yaw is honoured. Quarter turns are exact; for any other yaw the map is turned onto
-        cells of half the size. Its `import_report` lists what was used and skipped of the file.
+        In world axes. The yaw of the origin is applied: quarter turns are exact, any other yaw halves the size of the
+        cells. `import_report` lists what was used and skipped.
 
     Raises
     ------
     MapError
-        If there is no such file, or it is damaged, of another kind or out of range; or if an argument for meshes is
-        given and it is none.
+        For a file that is missing, damaged, of another kind or out of range, or an argument for another kind of file.
 
     Examples
     --------
@@ -191,19 +186,17 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     Parameters
     ----------
     partial : PartialMap
-        The map.
     path : path-like
-        `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem; not for a map with a mesh) or `.npz`.
+        `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem; not for meshes) or `.npz`.
     extra : mapping or None
-        Further keys for the YAML; `.npz` has none.
+        Additional keys for the YAML.
 
     Raises
     ------
     MapError
-        If `partial` is no PartialMap.
+        If `partial` is not a PartialMap.
     OutputError
-        For another suffix, for a map with a mesh as YAML, for `extra` with `.npz`, or if writing fails; nothing half
-        written is left behind.
+        For another suffix, a mesh or `extra` in a format without them, or if writing fails. No partial file remains.
 
     Examples
     --------
@@ -249,12 +242,12 @@ def map_from_array(
     origin_m: tuple[float, float] = (0.0, 0.0),
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
 ) -> PartialMap:
-    """Make a map of an array of CellState integers.
+    """Make a map from an array of CellState integers.
 
     Parameters
     ----------
     array : (ny, nx) integers
-        FREE 0, WALL 1, UNKNOWN 2. Row 0 holds the smallest y (turn an image with `numpy.flipud`); columns run along x.
+        FREE 0, WALL 1, UNKNOWN 2. Row 0 holds the smallest y (turn images with `numpy.flipud`).
     resolution_m : float
         Edge of a cell [m].
     origin_m : (float, float)
@@ -269,7 +262,7 @@ def map_from_array(
     Raises
     ------
     MapError
-        For anything else than a two-dimensional array of these integers, or a number out of range.
+        For another shape, other values, or a number out of range.
 
     Examples
     --------
@@ -288,25 +281,24 @@ def map_from_habitat(
     origin_m: tuple[float, float] = (0.0, 0.0),
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
 ) -> PartialMap:
-    """Make a map of Habitat's top-down map and its fog-of-war mask.
+    """Make a map from Habitat's top-down map and its fog-of-war mask.
 
-    Habitat's 0 means "not navigable", which is not free, and the mask reveals no such cell. A revealed navigable cell
-    is free; a revealed border cell is wall, and so is a not navigable cell that shares an edge with a revealed
-    navigable one, because the view ended there. What agent, path and start have been drawn over is navigable;
-    what a target has been drawn over is unknown, as is everything else.
+    Revealed navigable cells are free. Revealed border cells, and cells that are not navigable (0) but share an edge
+    with a free one, are walls: the mask reveals no such cell. Cells under agent, path and start are navigable. Cells
+    under a target, and all others, are unknown.
 
     Parameters
     ----------
     top_down : (rows, columns) integers
         `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. Rows run along Habitat's
-        +z, columns along +x. In world axes x is Habitat's x and y is -z, so that row 0 holds the LARGEST y.
+        +z, columns along +x. World x is Habitat's x and y is -z, so that row 0 holds the LARGEST y.
     fog_of_war : (rows, columns) integers or booleans
-        `info["top_down_map"]["fog_of_war_mask"]`: not 0 where the agent has seen.
+        `info["top_down_map"]["fog_of_war_mask"]`: nonzero where the agent has seen.
     resolution_m : float
         Metres per pixel.
     origin_m : (float, float)
-        World x and y of the lower-left corner: `(lower[0], -(lower[2] + rows * resolution_m))` for the lower bound
-        of Habitat's `pathfinder.get_bounds()` [m].
+        World x and y of the lower-left corner [m]: `(lower[0], -(lower[2] + rows * resolution_m))` for the lower bound
+        of Habitat's `pathfinder.get_bounds()`.
     wall_height_m : float
         Height of walls and ceiling [m].
 
@@ -317,7 +309,7 @@ def map_from_habitat(
     Raises
     ------
     MapError
-        For arrays of other or unequal shapes, or a number out of range.
+        For other or unequal shapes, or a number out of range.
 
     Examples
     --------
@@ -346,31 +338,25 @@ def map_from_slam(
     wall_height_m: float = DEFAULT_WALL_HEIGHT_M,
     threshold: float = 0.5,
 ) -> PartialMap:
-    """Make a map of the obstacle and explored channels of Active Neural SLAM.
+    """Make a map from the obstacle and explored channels of Active Neural SLAM: explored obstacles are walls.
 
     Parameters
     ----------
     obstacle, explored : (ny, nx) numbers in [0, 1]
-        Probability that a cell holds an obstacle, and that it has been explored (`map[0]` and `map[1]`). Row 0 holds
-        the smallest y, as Active Neural SLAM has it (row from y, column from x).
-    resolution_m : float
-        Edge of a cell [m].
-    origin_m : (float, float)
-        World x and y of the lower-left corner of cell [0, 0] [m].
-    wall_height_m : float
-        Height of walls and ceiling [m].
+        Probability of an obstacle, and of having been explored (`map[0]` and `map[1]`). Row 0 holds the smallest y.
+    resolution_m, origin_m, wall_height_m
+        As of `map_from_array`.
     threshold : float
-        From this value a channel holds.
+        Smallest probability that counts.
 
     Returns
     -------
     PartialMap
-        Explored obstacles are wall, the rest of what is explored is free, all else is unknown.
 
     Raises
     ------
     MapError
-        For arrays of other or unequal shapes or with other values, or a number out of range.
+        For other or unequal shapes, other values, or a number out of range.
 
     Examples
     --------
@@ -399,36 +385,29 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
 
 
 def _later(reader: str) -> Callable[..., PartialMap]:
-    """Return a reader of this room, such as "ifc:map_from_ifc", whose module is imported when a file is read."""
+    """Return a reader, such as "ifc:map_from_ifc", whose module is imported when a file is read."""
     return lambda source, **options: resolve_name(f"sionna_partial.maps.{reader}")(source, **options)
 
 
 _read_cloud = _later("mesh.points:map_from_points")
 
+_UNIT_SOURCES = {".xml": "Mitsuba scene", **dict.fromkeys((".glb", ".gltf"), "specification of glTF")}
+
 
 def _read_mesh(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-    from sionna_partial.maps.mesh.files import read_mesh
+    from sionna_partial.maps.mesh.files import read_mesh, read_mitsuba_scene
 
-    reading = MeshReading(**options)
-    is_gltf = source.suffix.lower() in (".glb", ".gltf")
-    notes = reading.notes(source, "specification of glTF") if is_gltf else reading.notes(source)
-    return reading.attached(notes, mesh_map(read_mesh(source, reading.up, notes), reading))
+    reading, suffix = MeshReading(**options), source.suffix.lower()
+    notes = reading.notes(source, _UNIT_SOURCES.get(suffix, "taken for metres"))
+    mesh = read_mitsuba_scene(source, notes) if suffix == ".xml" else read_mesh(source, reading.up, notes)
+    return reading.attached(notes, mesh_map(mesh, reading))
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
     from sionna_partial.maps.mesh.points import is_cloud
 
     return (_read_cloud if is_cloud(source) else _read_mesh)(source, **options)
-
-
-def _read_mitsuba(source: Path, **options: Any) -> PartialMap:
-    from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-    from sionna_partial.maps.mesh.files import read_mitsuba_scene
-
-    reading = MeshReading(**options)
-    notes = reading.notes(source, "Mitsuba scene")
-    return reading.attached(notes, mesh_map(read_mitsuba_scene(source, notes), reading))
 
 
 def _read_npz(source: Path) -> PartialMap:
@@ -445,7 +424,7 @@ def _read_npz(source: Path) -> PartialMap:
             origin_m, height_m = tuple(content["origin_m"].tolist()), content["wall_height_m"].item()
             interior = int(content["interior_cells"]) if "interior_cells" in content else None
             material = Material(**json.loads(str(content["material"]))) if "material" in content else None
-            layers = layers_of(content, np.asarray, lambda each: each.tolist() if each.ndim else json.loads(str(each)))
+            layers = layers_of(content, np.asarray, lambda data: data.tolist() if data.ndim else json.loads(str(data)))
             mesh = None
             if "mesh_triangles" in content:
                 vertices_m, triangles = content["mesh_vertices_m"], content["mesh_triangles"]
@@ -457,7 +436,7 @@ def _read_npz(source: Path) -> PartialMap:
 
 
 class _Reader(NamedTuple):
-    """What a file is, how it is read, and with which arguments of `load_map`."""
+    """Name, reading function and `load_map` arguments of a kind of file."""
 
     what: str
     read: Callable[..., PartialMap]
@@ -471,11 +450,11 @@ _OPTIONS_OF = {
     "unit_m": "drawings and scans",
     "resolution_m": "scans, drawings, building models and pictures",
 }
-"""Files that options are for, other than scans."""
+"""Kinds of files that options are for, other than scans."""
 
 _OF_SCANS = ("height_band_m", "observed", "resolution_m", "up", "unit_m")
 _BAG = _Reader("a rosbag", _later("bags:map_from_bag"))
-_MITSUBA = _Reader("a Mitsuba scene", _read_mitsuba, _OF_SCANS)
+_MITSUBA = _Reader("a Mitsuba scene", _read_mesh, _OF_SCANS)
 _CALIBRATED = _Reader("the map of a calibration", _read_npz)
 _EXPORTED = _Reader(
     "an exported map (remove its map.yaml to read the meshes of its scene alone)", bind(read_ros_map, confined=True)
@@ -503,11 +482,10 @@ _READERS = {
     **dict.fromkeys(PICTURE_SUFFIXES, _Reader("a picture", _later("drawings:read_picture"), ("resolution_m",))),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
-"""Readers by suffix. Their modules, and the libraries that these need, are imported when a file is read."""
+"""Readers by suffix. Their modules are imported when a file is read."""
 
 
 def _reader_of(source: Path) -> tuple[Path, _Reader]:
-    """Return the file that a path leads to, and its reader."""
     suffix = source.suffix.lower()
     if suffix not in BAG_SUFFIXES and (source / "metadata.yaml").is_file():
         return source, _BAG
@@ -524,7 +502,7 @@ def _reader_of(source: Path) -> tuple[Path, _Reader]:
 
 
 def _reader_of_scene(source: Path) -> tuple[Path, _Reader]:
-    """Return the file of an exported scene, of the only Mitsuba scene there, or of the map of a calibration."""
+    """Return the file of an exported scene, of the only Mitsuba scene, or of the map of a calibration."""
     folder = source if source.is_dir() else source.parent
     scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
     if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):

@@ -25,34 +25,31 @@ from sionna_partial.maps.wall_cells import wall_cells
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
-"""Largest number of cells of a map: more is a unit error or a map that should be cut."""
 
 MAX_INTERIOR_CELLS = 2**53
-"""Largest number of free cells of a complete home: more is damage, and no file could hold it."""
 
 MAX_WALL_MATERIALS = 255
-"""Most materials of the walls of a map, heights of obstacles, and rooms, which a byte per cell counts."""
+"""Most materials, obstacle heights or rooms of a map: one byte per cell counts them."""
 
 FREE_STANDING_M = 2.5
-"""Extent along x and y up to which walls that stand free are furniture [m]."""
+"""Extent along x and y up to which free-standing walls are furniture [m]."""
 
 ODD_CELLS = 1000
-"""Number of cells from which a map has free and wall cells."""
+"""Number of cells from which a map should have free and wall cells."""
 
 OUTLINE_M = 0.3
-"""Largest distance of an outline of a wall from the cells of this wall [m]."""
+"""Largest distance of an outline from the cells of its wall [m]."""
 
 ROOM_M, BODY_M = 0.6, 0.3
-"""Radius of the largest disc in an unknown region from which it may be a room, and of what gets into one [m]."""
+"""Radius of the largest disc in an unknown region that may be a room, and of a disc that can enter it [m]."""
 
 POCKET_M = 0.4
 """Edge of a square that an unknown region must hold for a robot to look into it [m]."""
 
 FAR_EXTENTS = 2.0
-"""Distance from the middle of a map, in its extents, from which a position is in another unit or of another map."""
+"""Distance from the middle of a map, in its extents, from which a position has another unit or map."""
 
 _BORDER_CELLS = 1e-6
-"""Distance within which a point is on the border of a cell [cells]."""
 
 
 _FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
@@ -64,12 +61,12 @@ _RANK = np.argsort(_FREEST)
 class PartialMap(Pictured, plot="plots.style:plot_map"):
     """A floor plan of free, wall and unknown cells on a regular grid.
 
-    World axes: x right, y up, z up, in metres. Everything outside the grid is unknown.
+    World axes: x right, y up, z up, in metres. Everything outside the grid is unknown. Arrays are read-only.
 
     Parameters
     ----------
     state : (ny, nx) uint8 array of CellState
-        Row 0 holds the smallest y. Kept read-only.
+        Row 0 holds the smallest y.
     resolution_m : float
         Edge of a cell [m], between 1 mm and 10 m.
     origin_m : (float, float)
@@ -77,33 +74,32 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     wall_height_m : float
         Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
-        Number of free cells of the complete home, where a simulation gives it.
+        Number of free cells of the complete home, if known.
     mesh : SceneMesh or None
-        Observed part of the building, instead of walls extruded from the cells. Its z is the z of the world.
+        Observed part of the building, instead of walls extruded from the cells.
     material : Material or None
-        Material of its walls, floor and ceiling, or of the parts of its mesh that name none; None is the
-        material of SceneSettings.
+        Material of walls, floor and ceiling, or of unnamed parts of the mesh; None is the material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
-        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Kept read-only, and 0 where there
-        is no wall. A mesh has its own. See `with_wall_material`.
+        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Not for meshes.
+        See `with_wall_material`.
     wall_materials : tuple of Material
-        At most 255 materials that `wall_material` counts.
+        At most 255.
     obstacle : (ny, nx) uint8 array or None
         Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls.
-        Kept read-only, and 0 where there is no wall. Not for a map with a mesh. See `with_obstacle_height`.
+        Not for meshes. See `with_obstacle_height`.
     obstacle_heights_m : tuple of float
-        At most 255 heights that `obstacle` counts [m].
+        At most 255 [m].
     room : (ny, nx) uint8 array or None
-        Room of each free cell: k for `room_names[k - 1]`, 0 for none. Kept read-only, and 0 where the cell is not free.
+        Room of each free cell: k for `room_names[k - 1]`, 0 for none.
     room_names : tuple of str
-        At most 255 names that `room` counts, such as those of the segments of a vacuum robot's map.
+        At most 255 names, such as the segments of a vacuum robot's map.
     import_source : ImportSource or None
-        Facts about the file that the map was read from, for `import_report`. Maps that differ in it alone are equal.
+        Facts about the source file, for `import_report`. Equality ignores it.
 
     Raises
     ------
     MapError
-        For an array of another shape or with other values, or a number out of range.
+        For another shape, other values, or a number out of range.
 
     Examples
     --------
@@ -151,7 +147,6 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
             object.__setattr__(self, name, self._layer(name, counted, of))
 
     def _layer(self, name: str, counted: str, of: CellState) -> NDArray[np.uint8] | None:
-        """Return the numbers of the cells of a state as a new read-only array, None where all are 0."""
         values = getattr(self, name)
         if values is None:
             return None
@@ -173,16 +168,16 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return equal_fields(self, other)
 
     def layers(self) -> dict[str, tuple[States, str, list[Any]]]:
-        """Return the cells of each layer, the field with the values that they count, and these as plain data."""
+        """Return the cells of each layer, the field with its values, and the values as plain data."""
         found = {}
         for name, (counted, _, _) in _LAYERS.items():
             if (cells := getattr(self, name)) is not None:
-                values = [asdict(each) if isinstance(each, Material) else each for each in getattr(self, counted)]
+                values = [asdict(value) if isinstance(value, Material) else value for value in getattr(self, counted)]
                 found[name] = cells, counted, values
         return found
 
     def window(self, row: int, column: int, shape: tuple[int, int], beyond: CellState) -> "PartialMap":
-        """Return the map of `shape` cells from a row and a column on; those outside the grid are all `beyond`."""
+        """Return the map of `shape` cells from a row and a column on; cells outside the grid are all `beyond`."""
         ny, nx = self.shape
         rows, columns = np.arange(row, row + shape[0]), np.arange(column, column + shape[1])
         inside = np.ix_((rows >= 0) & (rows < ny), (columns >= 0) & (columns < nx))
@@ -204,16 +199,16 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Parameters
         ----------
         material : Material or str
-            The material, or its name as of `Material.named`.
+            The material, or its name for `Material.named`.
         where : (ny, nx) bool array, (M, 2) array-like, or shapely geometry
-            Cells, or the corners of a polygon or a geometry in world x and y [m]: cells whose centres it holds.
+            Cells, or a polygon or geometry in world x and y [m] that contains the centres of cells.
 
         Raises
         ------
         MapError
             For an area of another kind, a mesh, or more than 255 materials.
         SettingsError
-            For a material that is not known.
+            For an unknown material.
 
         Examples
         --------
@@ -224,29 +219,25 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         ['concrete']
         """
         material = Material.named(material) if isinstance(material, str) else material
-        materials = self.wall_materials if material in self.wall_materials else (*self.wall_materials, material)
-        cells = np.zeros(self.shape, np.uint8) if self.wall_material is None else self.wall_material.copy()
-        materials = _checked_materials(_values("wall_materials", materials))
-        cells[self.cells_within(where)] = materials.index(material) + 1
-        return replace(self, wall_material=cells, wall_materials=materials)
+        return self._with_layer("wall_material", material, self.cells_within(where))
 
     def with_obstacle_height(self, height_m: float, where: object = None) -> "PartialMap":
-        """Return the map with the walls of an area ending at a height: a low lidar also sees furniture.
+        """Return the map with the walls of an area ending at a height, such as furniture that a low lidar sees.
 
-        Paths go over such obstacles, and radios may stand above them.
+        Paths pass over such obstacles, and radios may be above them.
 
         Parameters
         ----------
         height_m : float
             Height of their tops [m]; from `wall_height_m` on they are walls.
         where : (ny, nx) bool array, (M, 2) array-like, shapely geometry or None
-            The area as in `with_wall_material`. None is all that stands free: wall cells that touch each other, within
-            2.5 m along x and y, with nothing but free cells around them. Pillars are among them.
+            The area as in `with_wall_material`. None selects free-standing walls: pieces within 2.5 m along x and y
+            with only free cells around them, pillars included.
 
         Raises
         ------
         MapError
-            For a height that is no positive number, an area of another kind, a mesh, or more than 255 heights.
+            For a height that is not positive, an area of another kind, a mesh, or more than 255 heights.
 
         Examples
         --------
@@ -258,14 +249,20 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         [False, True, False]
         """
         height_m = _number("height_m", height_m, 0.01, 100.0)
-        cells = np.zeros(self.shape, np.uint8) if self.obstacle is None else self.obstacle.copy()
         area = free_standing(self.state, self.resolution_m) if where is None else self.cells_within(where)
-        heights_m = tuple(dict.fromkeys((*self.obstacle_heights_m, height_m)))
-        cells[area] = heights_m.index(height_m) + 1 if height_m < self.wall_height_m else 0
-        return replace(self, obstacle=cells, obstacle_heights_m=heights_m)
+        return self._with_layer("obstacle", height_m, area, is_default=height_m >= self.wall_height_m)
+
+    def _with_layer(self, name: str, value: Any, area: Bools, *, is_default: bool = False) -> "PartialMap":
+        counted, _, checked = _LAYERS[name]
+        values, old = getattr(self, counted), getattr(self, name)
+        values = checked(_values(counted, values if value in values else (*values, value)))
+        cells = np.zeros(self.shape, np.uint8) if old is None else old.copy()
+        cells[area] = 0 if is_default else values.index(value) + 1
+        changes: dict[str, Any] = {name: cells, counted: values}
+        return replace(self, **changes)
 
     def cells_within(self, where: object) -> Bools:
-        """Return the cells (ny, nx) of an area, as `where` of `with_wall_material`, or raise a MapError."""
+        """Return the cells (ny, nx) of an area, as `where` of `with_wall_material`."""
         if not isinstance(where, shapely.Geometry):
             area = real_array("where", where, MapError, "give cells (ny, nx) as booleans, or a polygon.", "biuf")
             if area.dtype == np.bool_ and area.shape == self.shape:
@@ -300,34 +297,30 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def height_range_m(self) -> tuple[float, float]:
-        """World z of floor and ceiling [m]; of a mesh, its ends. Radios are between them."""
+        """World z of floor and ceiling, or of the ends of a mesh [m]; radios must be between them."""
         range_m = self.environment.height_range_m
         assert range_m is not None  # a mesh has it once it is built
         return range_m
 
     @cached_property
     def import_report(self) -> ImportReport | None:
-        """Report of the file that the map was read from: unit, extent, rooms, doors, elements used and skipped.
-
-        None for a map that was not read from a file.
-        """
+        """Report of the source file: unit, extent, rooms, doors, elements used and skipped. None without a file."""
         return None if self.import_source is None else report_of(self.import_source, self.state, self.resolution_m)
 
     @cached_property
     def is_complete(self) -> bool:
-        """Return whether no free cell touches an unknown one by an edge, so that nothing unknown can be reached.
+        """True if no free cell touches an unknown one by an edge; False without free cells.
 
-        The space beyond the grid is unknown: free cells at its border make a map incomplete, as in one that was cut
-        out of a larger one. A map without free cells is not complete.
+        The space beyond the grid is unknown: free cells at its border make a map incomplete.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
 
     @cached_property
     def is_nearly_complete(self) -> bool:
-        """Return whether no unknown room can be entered; only pockets in furniture or thick walls are unknown.
+        """True if no unknown room can be entered; only pockets in furniture or thick walls are unknown.
 
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
-        gets into it from free cells without touching a wall. Meshes are never nearly complete.
+        can enter it from free cells. Meshes are never nearly complete.
         """
         if self.is_complete or not self.environment.is_extruded:
             return self.is_complete
@@ -348,14 +341,14 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def _near_named_walls(self) -> Bools:
-        """Whether the nearest wall of each cell is within `OUTLINE_M` and has a material that the map names."""
+        """Cells (ny, nx) whose nearest wall is within `OUTLINE_M` and has a named material."""
         if self.wall_material is None:
             return np.zeros(self.shape, dtype=bool)
         away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
         return (self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)
 
     def at_named_walls(self, points_m: NDArray[np.floating]) -> Bools:
-        """Return whether points (..., 3) [m] on outlines of walls, or NaN, are on walls whose material is named."""
+        """Return whether points (..., 3) [m] on outlines, or NaN, are on walls with a named material."""
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
         column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)
         return self._near_named_walls[row, column]
@@ -369,8 +362,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def observed_fraction(self) -> float:
         """Fraction of the interior that has been seen, in [0, 1].
 
-        Free cells over `interior_cells` where that is known; else 1 for a complete map, and the fraction of known
-        cells in the grid for any other.
+        Free cells over `interior_cells` if known; else 1 for a complete map, and the fraction of known cells otherwise.
         """
         if self.interior_cells is not None:
             return min(1.0, float((self.state == CellState.FREE).sum()) / max(1, self.interior_cells))
@@ -386,10 +378,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return row, column
 
     def state_at(self, points_m: NDArray[np.floating]) -> States:
-        """CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
+        """Return the CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
 
-        A point on the border of several cells is in the freest of them: FREE before UNKNOWN before WALL. Sensors and
-        planners put radios on the corners of cells, beside a wall, and these are not inside it.
+        A point on a border belongs to the freest cell: FREE before UNKNOWN before WALL, since planners put radios on
+        corners of cells beside walls.
         """
         cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m
         padded = np.pad(self.state, 1, constant_values=CellState.UNKNOWN)
@@ -403,9 +395,9 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
-        """Heights up to which walls reach [m], and a map with the walls of that height alone; first the walls of rooms.
+        """Heights up to which walls reach [m], and a map with the walls of that height, full walls first.
 
-        The first map has the infinite height, and free cells instead of obstacles and the areas that they enclose.
+        The first map has infinite height, and free cells instead of obstacles and the areas that they enclose.
         """
         if self.obstacle is None:
             return ((math.inf, self),)
@@ -420,7 +412,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return tuple(levels)
 
     def is_wall_at(self, points_m: Floats) -> Bools:
-        """Return whether world points (..., 3) [m] are in walls or in obstacles below their height."""
+        """Return whether world points (..., 3) [m] are in walls, or in obstacles below their height."""
         found = [
             (points_m[..., 2] <= top_m) & (level.state_at(points_m) == CellState.WALL)
             for top_m, level in self.wall_levels
@@ -430,13 +422,13 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
 
-        Messages call the argument `name`, and each position by its name in `names`, if there are any.
+        Messages contain the argument `name` and the `names` of positions, if given.
 
         Raises
         ------
         PositionError
             For another shape, fewer than `least`, a value that is not finite, or a point outside the map, inside a
-            wall, or not between floor and ceiling. Unknown cells are allowed (the paper asks for them).
+            wall, or not between floor and ceiling. Unknown cells are allowed (the paper needs them).
         """
         points = position_array(name, points_m, least=least)
         flat = points.reshape(-1, 3)
@@ -450,7 +442,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return points
 
     def _turned_hint(self, points_m: Floats) -> str:
-        """Say how positions (N, 3), three at least, would all be free if the array of states were turned."""
+        """Suggest a transposed array of states if it would make all positions (N, 3), at least three, free."""
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
         can_tell = len(points_m) >= 3 and self.environment.is_extruded and bool((np.abs(points_m) < 1e8).all())
         for name, state in turns.items() if can_tell else ():
@@ -459,7 +451,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return ""
 
     def _unit_hint(self, point_m: Floats) -> str:
-        """Ask for metres where a position (3,) far outside would be on the map in another unit."""
+        """Ask for metres if a position (3,) far outside would be on the map in another unit."""
         x0, y0, x1, y1 = self.bounds_m
         if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
             return ""
@@ -472,11 +464,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return ""
 
     def radios_can_stand(self, points_m: Floats) -> Bools:
-        """Return whether `require_positions` takes each of the points (N, 3) [m]."""
+        """Return whether radios can be at points (N, 3) [m]."""
         return ~np.any([fault for fault, _, _ in self._position_faults(points_m)], axis=0)
 
     def _position_faults(self, points_m: Floats) -> list[tuple[Bools, str, str]]:
-        """Return, for each fault, the points (N,) that have it, its description, and the remedy."""
         x0, y0, x1, y1 = self.bounds_m
         low, high = self.height_range_m
         finite = np.asarray(np.isfinite(points_m).all(axis=1))
@@ -494,7 +485,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
 
 def area_polygon(name: str, corners_m: ArrayLike) -> shapely.Polygon:
-    """Return the polygon with corners (M, 2) in x and y [m], or raise a MapError that names the argument."""
+    """Return the polygon with corners (M, 2) in x and y [m]; a MapError names the argument."""
     remedy = "give the corners (M, 2) of a polygon without crossings, x and y in metres"
     corners = float_array(name, corners_m, MapError, f"{remedy}.")
     if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
@@ -510,7 +501,7 @@ def area_polygon(name: str, corners_m: ArrayLike) -> shapely.Polygon:
 
 
 def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
-    """Return positions (3,) or (N, 3) [m] as a float64 array, or raise a PositionError that names them."""
+    """Return positions (3,) or (N, 3) [m] as a float64 array; a PositionError names them."""
     points = float_array(name, points_m, PositionError, "give x, y, z in metres.")
     if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
         raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
@@ -520,7 +511,7 @@ def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
 
 
 def with_height(points_m: Floats) -> Floats:
-    """Return positions (..., 3) [m]; positions (..., 2) without z get the default height."""
+    """Return positions (..., 3) [m]; positions (..., 2) get the default height."""
     return np.insert(points_m, 2, DEFAULT_HEIGHT_M, axis=-1) if points_m.shape[-1:] == (2,) else points_m
 
 
@@ -537,15 +528,15 @@ def cell_centres_m(partial: PartialMap, cells: NDArray[np.generic]) -> Floats:
 
 
 def nearest_free_m(partial: PartialMap, at_m: ArrayLike, count: int = 1) -> Floats:
-    """Return the centres (K, 2) of the free cells that are nearest to a position (2,) [m], at most `count`."""
+    """Return the centres (K, 2) of the free cells nearest to a position (2,) [m], at most `count`."""
     free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
     return free_m[np.hypot(*(free_m - np.asarray(at_m, dtype=np.float64)).T).argsort(kind="stable")[:count]]
 
 
 def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
-    """Return the cells in blocks of `factor` cells a side (ny, factor, nx, factor), and the blocks' lower-left corner.
+    """Return the cells in blocks (ny, factor, nx, factor), and the blocks' lower-left corner.
 
-    Blocks are aligned to the world and filled up with unknown cells, so that unknown cells around a map change nothing.
+    Blocks are aligned to the world and padded with unknown cells, so that unknown cells around a map have no effect.
     """
     corner = np.floor(np.round(np.array(partial.origin_m) / partial.resolution_m, 3)).astype(int) % factor
     padding = [(low, -(low + count) % factor) for low, count in zip(corner[::-1], partial.shape, strict=True)]
@@ -556,7 +547,7 @@ def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
-    """Unknown cells of regions within the grid that hold no square of `POCKET_M`, as in furniture and pillars."""
+    """Return unknown cells, as in furniture and pillars, of enclosed regions without a square of `POCKET_M`."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     size = max(1, math.ceil(POCKET_M / resolution_m - 1e-6))
     regions, count = ndimage.label(unknown, np.ones((3, 3), dtype=bool))
@@ -567,7 +558,7 @@ def unknown_pockets(state: States, resolution_m: float) -> Bools:
 
 
 def _has_unknown_room(state: States, resolution_m: float) -> bool:
-    """Return whether there is an unknown region as in `PartialMap.is_nearly_complete`, or there are no walls."""
+    """Return whether there is an unknown room as in `PartialMap.is_nearly_complete`, or there are no walls."""
     state = np.pad(state, math.ceil(BODY_M / resolution_m) + 1, constant_values=CellState.UNKNOWN)
     unknown, opened = state == CellState.UNKNOWN, state != CellState.WALL
     if opened.all():
@@ -583,14 +574,14 @@ def _has_unknown_room(state: States, resolution_m: float) -> bool:
 
 
 def frontier_cells(state: States) -> Bools:
-    """Free cells that share an edge with an unknown one; outside the grid all is unknown."""
+    """Return free cells that share an edge with an unknown one; all is unknown outside the grid."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
     return np.asarray(touches & (state == CellState.FREE))
 
 
 def uniform_cells(state: States) -> NDArray[np.int32]:
-    """Return the number of cells in every direction, corners included, that are in the state of each cell."""
+    """Return the number of cells in every direction, corners included, that have the state of each cell."""
     uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
@@ -600,7 +591,7 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
 
 
 def warn_of_odd_states(what: str, partial: PartialMap) -> None:
-    """Warn of a map, called `what`, that is probably wrong: without walls or free cells, or inverted."""
+    """Warn of a map, called `what`, without walls or free cells, or that looks inverted."""
     count = np.bincount(partial.state.ravel(), minlength=len(CellState))
     free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
     if partial.state.size < ODD_CELLS or not free + wall:
@@ -616,7 +607,7 @@ def warn_of_odd_states(what: str, partial: PartialMap) -> None:
 
 
 def require_map(name: str, value: object) -> None:
-    """Raise a MapError that names `name` unless `value` is a PartialMap."""
+    """Raise a MapError unless `value` is a PartialMap."""
     if not isinstance(value, PartialMap):
         raise MapError(f"{name} is of type {type(value).__name__}: give a PartialMap, such as load_map returns.")
 
@@ -630,7 +621,6 @@ def grid_array(name: str, values: ArrayLike, kinds: str, wanted: str = "integers
 
 
 def _checked_state(values: ArrayLike) -> States:
-    """Return cell states as a new read-only array, or raise a MapError."""
     wanted = "CellState integers FREE 0, WALL 1, UNKNOWN 2"
     state = grid_array("state", values, "iub", wanted)
     if state.size > MAX_CELLS:
@@ -646,9 +636,9 @@ def _checked_state(values: ArrayLike) -> States:
 
 
 def free_standing(state: States, resolution_m: float) -> Bools:
-    """Wall cells (ny, nx) that stand free: pieces of at most `FREE_STANDING_M` along x and y with free cells around.
+    """Return free-standing wall cells (ny, nx): pieces within `FREE_STANDING_M`, with free cells around.
 
-    Unknown cells that only walls touch are part of them.
+    Unknown cells that only walls touch belong to them.
     """
     state, square = np.pad(state, 1, constant_values=CellState.UNKNOWN), np.ones((3, 3), dtype=bool)
     unknown, _ = ndimage.label(state == CellState.UNKNOWN)
@@ -666,7 +656,6 @@ def free_standing(state: States, resolution_m: float) -> Bools:
 
 
 def _values(name: str, given: object) -> tuple[Any, ...]:
-    """Return the values that the cells of a layer count as a tuple, or raise a MapError."""
     values = tuple(given) if isinstance(given, tuple | list) else (given,)
     if len(values) > MAX_WALL_MATERIALS:
         raise MapError(f"{name} has {len(values)} entries: give at most {MAX_WALL_MATERIALS}.")
@@ -674,20 +663,17 @@ def _values(name: str, given: object) -> tuple[Any, ...]:
 
 
 def _checked_heights(heights: tuple[Any, ...]) -> tuple[float, ...]:
-    """Return heights of obstacles as numbers, or raise a MapError."""
-    return tuple(_number("obstacle_heights_m", each, 0.01, 100.0) for each in heights)
+    return tuple(_number("obstacle_heights_m", height_m, 0.01, 100.0) for height_m in heights)
 
 
 def _checked_materials(materials: tuple[Any, ...]) -> tuple[Material, ...]:
-    """Return materials of walls, or raise a MapError."""
-    other = next((type(each).__name__ for each in materials if not isinstance(each, Material)), None)
+    other = next((type(material).__name__ for material in materials if not isinstance(material, Material)), None)
     if other is not None:
         raise MapError(f"wall_materials holds a {other}: give a tuple of Material, such as Material.named returns.")
     return materials
 
 
 def _checked_names(names: tuple[Any, ...]) -> tuple[str, ...]:
-    """Return names of rooms, or raise a MapError."""
     if len({*names}) < len(names) or not all(isinstance(name, str) and name and name.isprintable() for name in names):
         raise MapError(f"room_names = {shown(names)} is not allowed: give different texts of printable characters.")
     return names
@@ -698,16 +684,15 @@ _LAYERS: dict[str, tuple[str, CellState, Callable[[tuple[Any, ...]], tuple[Any, 
     "obstacle": ("obstacle_heights_m", CellState.WALL, _checked_heights),
     "room": ("room_names", CellState.FREE, _checked_names),
 }
-"""Layers of a map: the field with the values that its cells count, the cells that it is for, and the check of these
-values."""
+"""Layers of a map: field of its values, state of its cells, check of its values."""
 
 
 def layers_of(found: Mapping[str, Any], cells: Callable[[Any], Any], values: Callable[[Any], Any]) -> dict[str, Any]:
-    """Return the fields of the layers of a file, whose cells and plain values (`layers`) two functions decode."""
+    """Return the fields of the layers of a file; two functions decode its cells and its plain values (`layers`)."""
     layers = {name: cells(found[name]) for name in _LAYERS if name in found}
     counted = {_LAYERS[name][0]: values(found[_LAYERS[name][0]]) for name in layers}
     return layers | {
-        name: tuple(Material(**each) if isinstance(each, dict) else each for each in plain)
+        name: tuple(Material(**value) if isinstance(value, dict) else value for value in plain)
         for name, plain in counted.items()
     }
 

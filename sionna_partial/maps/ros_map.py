@@ -21,7 +21,6 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
-from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.partial_map import (
     MAX_CELLS,
@@ -36,48 +35,42 @@ from sionna_partial.settings import Material
 logger = logging.getLogger(__name__)
 
 MODES = ("trinary", "scale", "raw")
-"""Modes in which map_server reads an image."""
 
 UNKNOWN_SHADE = 205
-"""Shade that map savers give to unknown cells [of 255]."""
 
 OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
-"""Thresholds of the maps that are written (map_server's; the shade 205 stays unknown)."""
+"""Thresholds of written maps (map_server's; the shade 205 stays unknown)."""
 
 MAX_YAML_BYTES = 1_000_000
-"""Largest map YAML that is read: more is another file [bytes]."""
 
 MAX_IMAGE_BYTES = 16 * MAX_CELLS
-"""Largest map image that is read [bytes]."""
 
 DARK_OCCUPANCY = 0.51
 """Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
 
 SPREAD_FRACTION, REPORTED_FRACTION = 0.25, 0.1
-"""Fractions of the seen cells between the thresholds from which a map has continuous values, and from which a map of
-other values gets a warning. No value may have more than the first fraction of the cells between the thresholds."""
+"""Fractions of seen cells between the thresholds from which a map has continuous values, and from which a map of other
+values gets a warning. No value may have more than the first fraction of these cells."""
 
 SEPARATION = 4.0
 """Least distance between the mean occupancies of free and wall cells, in standard deviations. Halves of a uniform
 distribution have 3.5."""
 
 VALLEY_PERCENT, VALLEY_FRACTION = 2.0, 0.5
-"""Half the width of the valley between free cells and walls [percent], and its largest number of cells as a fraction of
-the number around the means of both."""
+"""Half the width of the valley between free cells and walls [percent], and its largest count relative to the counts
+around both means."""
 
 FEW_CELLS = 100
-"""Number of dark grey pixels, or of wall cells, up to which nothing is said."""
+"""Number of dark grey pixels, or of wall cells, up to which there is no warning."""
 
 TOUCHED_WALLS = 0.1
 """Fraction of the walls that free cells touch up to which a map looks inflated."""
 
 MAX_YAW_RAD = 6.2832
-"""Largest yaw of a map's origin: one turn, as people round it; more is meant in degrees [rad]."""
+"""Largest yaw of an origin: one turn, as people round it. Larger values are degrees [rad]."""
 
 
 class _Sheet(NamedTuple):
-    """Settings of a map YAML for the reading of its image."""
-
     source: Path
     image: Path
     mode: str
@@ -87,7 +80,7 @@ class _Sheet(NamedTuple):
 
 
 class _EachKeyOnce(yaml.SafeLoader):
-    """Refuses a mapping that has a key twice, of which YAML keeps the last."""
+    """Loader that refuses duplicate keys, of which YAML keeps the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
@@ -98,7 +91,7 @@ class _EachKeyOnce(yaml.SafeLoader):
 
 
 class _Plain(yaml.SafeDumper):
-    """Writes NumPy numbers and arrays as Python numbers and lists."""
+    """Dumper that writes NumPy numbers and arrays as Python numbers and lists."""
 
 
 _Plain.add_multi_representer(
@@ -109,7 +102,7 @@ _Plain.add_multi_representer(np.ndarray, lambda dumper, value: dumper.represent_
 
 
 class _Pixels(NamedTuple):
-    """A decoded image, row 0 at the top.
+    """Decoded image, row 0 at the top.
 
     An opaque pixel of grey shade s (0 to 255) has the level s * `per_shade` + `opaque`.
     """
@@ -121,10 +114,10 @@ class _Pixels(NamedTuple):
 
 
 def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) -> PartialMap:
-    """Read a ROS map_server YAML and its image, and the mesh of the exported scene that the YAML is part of.
+    """Read a ROS map_server YAML and its image, and the mesh if the YAML belongs to an exported scene.
 
-    `strict` reads every pixel as map_server does, even where unknown cells become free or wall that way; `confined`
-    refuses an image outside the YAML's folder.
+    `strict` reads every pixel as map_server does, even where unknown cells become free or wall. `confined` refuses an
+    image outside the YAML's folder.
     """
     raw = _read_yaml(path)
     sheet = _read_sheet(path, raw, confined=confined)
@@ -147,21 +140,24 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state, cell_m, origin_m = turn_grid(np.flipud(state), resolution_m, origin)
     if interior is not None:
         interior *= round(resolution_m / cell_m) ** 2
-    mesh = _exported_mesh(path.parent, raw) if "mesh" in raw else None
+    mesh = None
+    if "mesh" in raw:
+        from sionna_partial.maps.mesh.files import read_exported_mesh  # few maps have a mesh, and trimesh is heavy
+
+        mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset"))
     layers: dict[str, Any] = {}
     for name, (listed, target, made) in _LAYERS.items():
         if name in raw:
             given = raw[name]
             image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
             cells = _decode(sheet._replace(image=image))
-            layers[target] = tuple(made(path, name, each) for each in _listed(path, name, given, listed))
+            layers[target] = tuple(made(path, name, value) for value in _listed(path, name, given, listed))
             layers[name] = _layer(path, name, cells, (listed, layers[target]), pixels.level.shape, origin)
     partial = PartialMap(state, cell_m, origin_m, height_m, interior, mesh, material, **layers)
     return notes.attached_to(partial)
 
 
 def _listed(path: Path, name: str, given: Any, listed: str) -> list[Any]:
-    """Return the list of materials or heights that the shades of the image of a layer number."""
     if not isinstance(given.get(listed), list):
         raise _refuse(path, name, given, f"give an image and a list of {listed}, as save_map does.")
     other = sorted(str(key) for key in given if key not in ("image", listed))
@@ -179,7 +175,6 @@ def _layer(
     shape: tuple[int, ...],
     origin: tuple[float, float, float],
 ) -> States:
-    """Return the numbers of cells, which are the shades of an image."""
     if image.mode != "L" or image.size != shape[::-1]:
         what = f"an image of {shape[1]} x {shape[0]} shades of grey, 8 bits each: 0 the default, k the k-th listed."
         raise MapError(f"{path}: the image of {name} is of another size or kind: give {what}")
@@ -195,14 +190,8 @@ def _layer(
     return np.rot90(cells, -turns)
 
 
-def _exported_mesh(folder: Path, raw: Mapping[Any, Any]) -> SceneMesh:
-    from sionna_partial.maps.mesh.files import read_exported_mesh  # few maps have a mesh, and trimesh is heavy
-
-    return read_exported_mesh(folder, raw["mesh"], raw.get("scene_offset"))
-
-
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
-    """Write a map as `path` (YAML) and a PGM image of the same stem, which read back as the same map, or neither.
+    """Write a map as `path` (YAML) and a PGM image of the same stem.
 
     The YAML of a map with a mesh completes the exported scene beside it.
     """
@@ -225,7 +214,7 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
 
 
 def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
-    """Return the keys that the YAML at `path` must have, of a map with a PGM image of the same stem."""
+    """Return the map_server keys of the YAML at `path`, for a PGM image of the same stem."""
     return {
         "image": path.with_suffix(".pgm").name,
         "mode": mode,
@@ -238,7 +227,6 @@ def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[flo
 
 
 def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint8]]) -> None:
-    """Write a YAML, and PGM images whose pixels (ny, nx) begin with the smallest y, or none of them."""
     with atomic_write(path, "w") as sheet, ExitStack() as together:
         sheet.write(text)
         sheet.flush()  # a full disk fails here, not after the pictures are there
@@ -249,7 +237,6 @@ def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint
 
 
 def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
-    """Return the YAML of a map with further keys, which can be read again as they are."""
     names = [] if not isinstance(extra, Mapping) else [*extra]
     own = sorted({*sheet, "interior_cells", "material", "mesh", *_LAYERS}.intersection(map(str, names)))
     if own or names != [name for name in names if isinstance(name, str)] or not isinstance(extra, Mapping):
@@ -271,14 +258,13 @@ def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
 
 
 def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
-    """Turn a grid (ny, nx) by the yaw of its origin (x, y, yaw), onto the world axes; UNKNOWN outside it.
+    """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
 
-    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is below the map's
-    resolution and left out. Any other yaw puts the grid onto cells of half the size, each with the state found at its
-    centre: a wall of one cell stays at least two new cells thick, more than a diagonal step needs (sqrt 2), so that no
-    wall gets holes. Where walls met at a corner alone, the gap is closed; a complete map stays complete.
+    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is ignored. Any other yaw
+    samples the grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs
+    (sqrt 2). Gaps where walls meet only at a corner are closed.
 
-    Returns the state, the edge of its cells [m], and the world x and y of its lower-left corner [m].
+    Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
     """
     x, y, yaw = origin
     ny, nx = state.shape
@@ -298,7 +284,6 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
     first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
 
     def turned(grid: States) -> States:
-        """Sample a grid of the map's shape at the centres of the new cells."""
         shape, unknown = (rows, columns), CellState.UNKNOWN
         return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
 
@@ -309,9 +294,9 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
 
 
 def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, free_percent: float) -> States:
-    """CellState of ROS occupancy values, as nav2's map_saver draws them: 0 to 100 percent, any other is unknown.
+    """Return the CellState of ROS occupancy values as nav2's map_saver draws them.
 
-    From `occupied_percent` a cell is wall; up to `free_percent` it is free.
+    Values outside 0 to 100 percent are unknown.
     """
     state = np.full(percent.shape, CellState.UNKNOWN, dtype=np.uint8)
     state[(percent >= 0) & (percent <= free_percent)] = CellState.FREE
@@ -322,11 +307,10 @@ def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, f
 def fitted_threshold(
     percent: Floats, count: Indices, free_percent: float, occupied_percent: float, notes: ImportNotes, remedy: str
 ) -> float | None:
-    """Return the occupancy that separates free cells from walls in a map of continuous values, None in any other.
+    """Return the occupancy that separates free cells and walls in a map of continuous values, else None.
 
-    Such a map, as of Cartographer, has many seen cells of many values between the thresholds. The threshold is in the
-    valley of the histogram (V,) of seen cells, between two distributions that are well separated, one with a mean below
-    50 percent and one above. Cells between the thresholds are counted in the notes, and warned of. An empty remedy
+    Such a map, as of Cartographer, has many different values between the thresholds. The result is in the valley of the
+    histogram (V,), between two well separated distributions with means below and above 50 percent. An empty remedy
     keeps the thresholds, which the caller chose.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
@@ -350,7 +334,6 @@ def fitted_threshold(
 
 
 def _split(percent: Floats, count: Indices, allowed: Bools) -> float | None:
-    """Return the threshold in the valley between two distributions, None where they are not separate."""
     order = np.argsort(percent)
     order = order[count[order] > 0]
     value, weight, allowed = percent[order], count[order].astype(np.float64), allowed[order]
@@ -363,7 +346,7 @@ def _split(percent: Floats, count: Indices, allowed: Bools) -> float | None:
     good &= high_mean - low_mean >= SEPARATION * np.sqrt((low_var + high_var) / 2)
     middle = (value[:-1] + value[1:]) / 2
     around, around_low, around_high = (
-        (np.abs(value - each[:, None]) < VALLEY_PERCENT) @ weight for each in (middle, low_mean, high_mean)
+        (np.abs(value - place[:, None]) < VALLEY_PERCENT) @ weight for place in (middle, low_mean, high_mean)
     )
     good &= around < VALLEY_FRACTION * np.minimum(around_low, around_high)
     if not good.any():
@@ -397,7 +380,7 @@ def _material(path: Path, field: str, value: object) -> Material | None:
             return Material.named(value)
         return None if value is None else Material(**value)  # type: ignore[arg-type]
     except (TypeError, SettingsError) as error:
-        names = ", ".join(each.name for each in fields(Material))
+        names = ", ".join(field.name for field in fields(Material))
         raise _refuse(path, field, value, f"give a name, or {names} ({error}).") from error
 
 
@@ -416,7 +399,7 @@ _LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
     "room": ("names", "room_names", _room_name),
 }
-"""Layers of a map by their keys in the YAML: the key of what their shades count, its field of the map, its reader."""
+"""Layers of a map by their keys in the YAML: key of the values that the shades count, field of the map, reader."""
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
@@ -449,7 +432,7 @@ def _number(path: Path, raw: Mapping[Any, Any], key: str, low: float, high: floa
 
 
 def _float(value: object) -> float:
-    """Return the number that is meant, NaN for none. YAML 1.1 takes 5e-2 for a text."""
+    """Return a number, NaN for anything else. YAML 1.1 reads 5e-2 as text."""
     try:
         return float(value) if isinstance(value, str) else number_of(value)
     except ValueError:
@@ -499,7 +482,7 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 
 def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Image:
-    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`, the argument and its value."""
+    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`."""
     try:
         with (
             open_regular(path, given.partition(" = ")[0], MapError, MAX_IMAGE_BYTES) as stream,
@@ -525,7 +508,6 @@ def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Imag
 
 
 def bare_image(path: Path) -> MapError:
-    """Return the error for an image without resolution."""
     remedy = f"give its YAML, such as '{path.with_suffix('.yaml')}'"
     if path.suffix.lower() != ".pgm":
         remedy += ", or resolution_m, the metres per pixel of a floor plan: a known length [m] over its pixels"
@@ -533,7 +515,7 @@ def bare_image(path: Path) -> MapError:
 
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
-    """Read every pixel to the letter of nav2's loadMapFromFile; occupancies between the thresholds are unknown."""
+    """Classify every pixel as nav2's loadMapFromFile does; occupancies between the thresholds are unknown."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
     if sheet.mode == "raw":
@@ -551,9 +533,9 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
 
 
 def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict: bool) -> States | None:
-    """Return the states of a map of continuous values, with thresholds that fit it; None for any other map.
+    """Return the states of a map of continuous values, with fitted thresholds; None for any other map.
 
-    Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than the shades beside it.
+    Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than its neighbours.
     """
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
@@ -595,7 +577,6 @@ def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
 
 
 def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
-    """Warn of dark grey pixels that lie between the thresholds, if they are more than the walls."""
     full = 255 * pixels.per_shade + pixels.opaque
     occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
     dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)
@@ -609,10 +590,10 @@ def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None
 
 
 def _keep_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
-    """Keep, in place, what map savers and painters mean by unknown: fully transparent pixels, and the shade 205.
+    """Keep transparent pixels and the shade 205 unknown, in place.
 
-    With a free_thresh above 0.196 (older nav2 wrote 0.25), or with an alpha channel, 205 reads as free. It is
-    kept unknown where more cells would be lost that way than would be unknown.
+    With a free_thresh above 0.196 (older nav2 wrote 0.25), or an alpha channel, 205 reads as free. It stays unknown
+    where more cells would be lost that way than would be unknown.
     """
     shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)

@@ -21,20 +21,19 @@ from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.partial_map import MAX_CELLS, MAX_WALL_MATERIALS, PartialMap
 
 MAX_BYTES = 200_000_000
-"""Largest JSON file that is read [bytes]."""
 
 CENTIMETRES = 100.0
 """Units of `size`, `pixelSize` and positions in a metre."""
 
 STATES = {"floor": CellState.FREE, "segment": CellState.FREE, "wall": CellState.WALL}
-"""States of the cells of each type of layer; walls replace floor."""
+"""States of cells by type of layer; walls replace floor."""
 
 _GIVE = "give a map in the JSON of Valetudo (__class ValetudoMap), or a recording of Valeronoi (.vwm) with its map"
 _COLUMNS = {"pixels": 2, "compressedPixels": 3}
 
 
 class VacuumFrame(NamedTuple):
-    """World axes of a ValetudoMap, whose y points down: the origin is the lower-left corner of its area."""
+    """Frame of a ValetudoMap, whose y points down, in world axes from the lower-left corner of its area."""
 
     size_y_m: float
     pixel_m: float
@@ -48,7 +47,7 @@ class VacuumFrame(NamedTuple):
 def read_json(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError]
 ) -> tuple[dict[str, Any], dict[str, Any], VacuumFrame]:
-    """Return the content of a JSON file, the ValetudoMap in it and its frame; an `error` names `field`."""
+    """Return the content of a JSON file, its ValetudoMap and the frame; an `error` names `field`."""
     content = read_bytes(path, field, error, MAX_BYTES)
     try:
         raw = json.loads(content)
@@ -69,7 +68,7 @@ def read_json(
 def read_vacuum_map(path: Path) -> PartialMap:
     """Read the ValetudoMap in a JSON file or in a recording of Valeronoi.
 
-    Floor and segments are free, and cells in no layer are unknown. Segments are the rooms of the map, by their names.
+    Floor and segments are free, cells in no layer are unknown. Segments are the rooms of the map.
     """
     _, raw, frame = read_json(path, "path", MapError)
     size = f"pixelSize of the map, {CENTIMETRES * frame.pixel_m:g} cm"
@@ -103,8 +102,6 @@ def read_vacuum_map(path: Path) -> PartialMap:
 
 
 class _Layer(NamedTuple):
-    """Type of a layer, name of its room, and its pixels (N, 2), x and y."""
-
     kind: str
     name: str
     cells: Indices
@@ -131,7 +128,6 @@ class _Layer(NamedTuple):
 
 
 def _whole(path: Path, name: str, values: Any, columns: int) -> Indices:
-    """Return whole numbers of 0 or more as rows (N, columns)."""
     remedy = f"give whole numbers from 0 to {MAX_CELLS:,}, {columns} for each pixel or row"
     array = real_array(f"{path}: {name}", values, MapError, f"{remedy}.", "iu" if values != [] else "iuf")
     if array.ndim != 1 or array.size % columns:
@@ -148,7 +144,6 @@ def _listed(path: Path, name: str, value: Any) -> Sequence[Any]:
 
 
 def _note_entities(path: Path, entities: Any, frame: VacuumFrame, notes: ImportNotes) -> None:
-    """Note the position of the charger, and the entities that are no part of the building."""
     listed = [entity for entity in _listed(path, "entities", entities or []) if isinstance(entity, Mapping)]
     for kind, count in Counter(str(entity.get("type"))[:80] for entity in listed).items():
         notes.skip(kind, count, "no part of the building")

@@ -1,7 +1,4 @@
-"""Cells of a map -> wall cells that outlines run through, and chains of such cells -> straight runs that fit them.
-
-Holes are filled, faces smoothed and short gaps closed; a run is the longest straight line within a tolerance.
-"""
+"""Wall cells of a map -> cells that outlines pass through -> chains of cells -> straight runs that fit them."""
 
 import math
 from typing import NamedTuple
@@ -21,7 +18,7 @@ MAX_FREE_GAP_M = 0.11
 """Longest gap of FREE cells that is closed [m]: log-odds mapping erases single wall cells."""
 
 MIN_RUN_CELLS = 3
-"""Length of a wall on both sides of a gap from which on the gap belongs to a seen wall [cells]."""
+"""Length of wall on both sides of a gap from which the gap belongs to a seen wall [cells]."""
 
 DEEP_CELLS = 4
 """Depth behind the face of a deep wall in which cells are FREE [cells]."""
@@ -30,28 +27,23 @@ PINHOLE_CELLS = 6
 """Largest hole in a wall that is filled [cells]."""
 
 _TURNS = (0, 2, -1, 1)
-"""Quarter turns of a mask, so that each side is at row 0 once, and each corner at row and column 0."""
 
 _SQUARE = np.ones((3, 3), dtype=bool)
 _POST_CELLS = 3
 _ROUGH, _DEEP = 0.05, 0.3
-"""Levelled cells, and wall cells behind faces, per cell of a face, from which on `CleanWalls.roughness` is 1."""
+"""Levelled cells, and wall cells behind faces, per cell of a face, from which `CleanWalls.roughness` is 1."""
 
 _RAGGED = 0.006, 0.012
-"""Fractions of ragged edges from which on depth is a sign of noise, in part and in full.
+"""Fractions of ragged edges from which depth is a sign of noise, in part and in full.
 
-Plans have less than 0.001, and up to 0.01 where they are tilted. Simulated lidars with range noise have 0.007 to 0.1,
-maps of real robots with walls of more than one layer 0.012 to 0.07.
+Plans have less than 0.001, and up to 0.01 where tilted; lidars with range noise have 0.007 to 0.1.
 """
 
 _DEPTH_M = 0.0125
-"""Depth of the wall cells behind faces at which the noise is 1 - 1/e [m].
-
-Simulated lidars of 1, 2, 3 and 5 cm range noise make 0.002, 0.03, 0.05 and 0.08 m, real robots 0 to 0.08 m.
-"""
+"""Depth of the wall cells behind faces at which the noise is 1 - 1/e [m]."""
 
 LEAST_NOISE = 0.05
-"""Noise of walls up to which a map counts as exact: those that were cut out of meshes have as much."""
+"""Noise of walls up to which a map counts as exact; cells cut out of meshes have as much."""
 
 RAGGED_FACTOR = 2.0
 """Largest distance of a line from ragged walls, in tolerances."""
@@ -71,11 +63,11 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 
 
 class CleanWalls(NamedTuple):
-    """Wall cells (ny, nx) that bear outlines.
+    """Wall cells (ny, nx) for outlines.
 
-    `peeled` (ny, nx) face FREE ones and were taken off walls two cells thick: the outline lies between both layers.
-    `noise` is 0 where walls are exact, to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts
-    ragged cells of thick walls: outlines follow faces as closely as it allows.
+    `peeled` (ny, nx) were removed from walls two cells thick: the outline is between both layers. `noise` is 0 for
+    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of thick
+    walls.
     """
 
     cells: Bools
@@ -85,13 +77,12 @@ class CleanWalls(NamedTuple):
 
 
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
-    """Clean the wall cells among the states (ny, nx) of a map.
+    """Clean the wall cells of a map with states (ny, nx).
 
-    Enclosed pinholes are filled; notches and bumps of one cell depth and at most two cells length are levelled; gaps of
-    UNKNOWN cells in seen walls are closed (up to `bridge_gap_m`), and short ones of FREE cells in straight walls
-    (`MAX_FREE_GAP_M`). Of walls that were seen from FREE cells, only the cells beside these are kept, since cells
-    behind were not seen; inner corners of deep walls are kept, too. Walls two cells thick are thinned. Thin walls,
-    posts and specks stay.
+    Enclosed pinholes are filled, notches and bumps of one by at most two cells are levelled, and gaps in seen walls are
+    closed: of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to `MAX_FREE_GAP_M`. Of walls seen
+    from FREE cells only the cells beside these, and inner corners of deep walls, are kept. Walls two cells thick are
+    thinned.
     """
     wall = _fill_pinholes(state == CellState.WALL)
     free = ~_fill_pinholes((state != CellState.FREE) | wall)
@@ -115,8 +106,8 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
-    Both touch a FREE cell by a corner alone. The faces end at an inner corner; behind an outer one, and behind a step
-    of a tilted face, another FREE cell is beside one of them. Deep are walls without FREE cells within `DEEP_CELLS`.
+    Both touch a FREE cell only by a corner. Behind an outer corner, and behind a step of a tilted face, another FREE
+    cell is beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
@@ -137,8 +128,8 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     """Return the noise of `CleanWalls`.
 
-    Rays that end at a wall without noise mark one layer of cells with smooth faces; with noise they mark several, with
-    rough ones. Walls of plans are thick too, but smooth.
+    Exact rays mark one layer of cells with smooth faces, noisy ones several with rough faces. Walls of plans are thick,
+    but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
@@ -149,7 +140,7 @@ def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
 def ragged_edges(wall: Bools) -> float:
     """Return the fraction of edges of walls that are shifted by one cell between two edges in line.
 
-    A straight wall has none, at any tilt, but at its ends.
+    Straight walls, at any tilt, have such edges only at their ends.
     """
     edges = ragged = 0
     for turns in _TURNS:
@@ -164,7 +155,6 @@ def ragged_edges(wall: Bools) -> float:
 
 
 def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
-    """Return the walls and the FREE cells with level faces, and the roughness of `CleanWalls`."""
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
     was_free = free
@@ -179,8 +169,8 @@ def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
-    A gap is a row of UNKNOWN cells beside FREE ones, at most `longest`, that ends at two pieces. The shortest line
-    between these closes it, or, where rays passed that line, the row itself.
+    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones. The shortest line between the pieces closes it,
+    or the row itself where rays passed that line.
     """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
     label, _ = ndimage.label(gap, structure=_SQUARE)
@@ -202,7 +192,7 @@ def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
 
 
 def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
-    """Row, first column and one past the last column of every horizontal run of True, in reading order."""
+    """Return row, first column and end column of every horizontal run of True, in reading order."""
     step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(step == 1)
     return row, start, np.nonzero(step == -1)[1]
@@ -216,7 +206,7 @@ def _fill_pinholes(wall: Bools) -> Bools:
 
 
 def _without_notches(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
-    """Fill notches of one or two FREE cells in faces that look towards larger rows: walls and FREE cells."""
+    """Fill notches of one or two FREE cells in faces towards larger rows; return walls and FREE cells."""
     wall, free = was_wall.copy(), was_free.copy()
     row, start, end = row_runs(free)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
@@ -227,7 +217,7 @@ def _without_notches(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
 
 
 def _without_bumps(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
-    """Move bumps of one or two cells back into faces that look towards larger rows: walls and FREE cells."""
+    """Remove bumps of one or two cells from faces towards larger rows; return walls and FREE cells."""
     wall, free = was_wall.copy(), was_free.copy()
     row, start, end = row_runs(wall)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
@@ -239,7 +229,6 @@ def _without_bumps(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
 
 
 def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> Bools:
-    """Return the cells of short horizontal gaps between walls that are longer than they are thick."""
     row, start, end = row_runs(wall)
     gap = np.where(row[1:] == row[:-1], start[1:] - end[:-1], 0)
     longest = min(MAX_GAP_CELLS, int(bridge_gap_m / resolution_m + 1e-6))
@@ -259,7 +248,7 @@ def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: flo
 
 
 def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
-    """Thin walls of two cells to one, keeping the cells that face FREE ones where only one side does."""
+    """Thin walls of two cells to one, keeping cells that face FREE ones if only one side does."""
     label, _ = ndimage.label(wall, structure=_SQUARE)
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
     kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
@@ -278,7 +267,7 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 
 
 def _peeled(wall: Bools, candidates: Bools) -> Bools:
-    """Return the candidates whose removal, one after the other, neither parts the wall nor opens it nor shortens it."""
+    """Return the candidates whose removal, one by one, neither splits, opens nor shortens the wall."""
     left = wall.copy()
     rows, columns = np.nonzero(candidates)
     for parity in range(4):
@@ -297,16 +286,14 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, measured along x or
-    y (whichever the line is steeper against). The middles of the steps of a digital straight line, 4- or 8-connected,
-    lie within half a cell of the line that it samples. A polyline that turns back from side to side four times or
-    more, and at least once in 10 cells, is ragged, and `RAGGED_FACTOR` times the tolerance is allowed: bumps and
-    notches of one cell then need no runs of their own. The split minimises the number of runs plus three times their
-    residual variances, in squared tolerances; a line is the least-squares one where that keeps the tolerance, and a
-    ragged one is parallel to an axis where that moves its ends by half a cell at most.
+    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
+    the line is steeper against. Ragged polylines, which turn back four times or more and at least once in 10 cells, get
+    `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
+    variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
+    ragged runs if that moves their ends by at most half a cell.
 
-    Returns the index of the corner where every run begins (r,), and a point x, y on and the direction x, y of its line
-    (r, 4).
+    Returns the index of the first corner of every run (r,), and a point x, y on and the direction x, y of its line (r,
+    4).
     """
     upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
     tolerance = tolerance + 1e-6
@@ -322,8 +309,7 @@ def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Float
 
 
 @njit(cache=True)
-def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ignore[no-untyped-def]
-    """Write where the cheapest run to every corner begins, and whether it is along y, by dynamic programming."""
+def _find_runs(points, swapped, tolerance, cost, previous, along_y):
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
@@ -334,8 +320,8 @@ def _find_runs(points, swapped, tolerance, cost, previous, along_y):  # type: ig
 
 
 @njit(cache=True)
-def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: ignore[no-untyped-def]
-    """Lengthen the run that begins at `start` while a line fits, and note where that makes a split cheaper."""
+def _extend(points, tolerance, start, swap, cost, previous, along_y):
+    """Lengthen the run from `start` while a line fits, and note where that makes a split cheaper."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
     moments = np.zeros(6)
@@ -361,8 +347,8 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):  # type: i
 
 
 @njit(cache=True)
-def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
-    """Point on and direction of the line that fits a run; a ragged one is parallel to an axis if that is as good."""
+def _line(points, start, end, tolerance):
+    """Return a point on and the direction of the line that fits a run; a ragged one may be parallel to an axis."""
     for factor in (1.0, RAGGED_FACTOR):
         limit, moments = factor * tolerance, np.zeros(6)
         polygon, size = _all_lines()
@@ -393,8 +379,7 @@ def _line(points, start, end, tolerance):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped-def]
-    """Keep the lines that pass the middles of an element's first and last unit edge within the tolerance."""
+def _clip_element(polygon, size, element, tolerance):
     x0, y0, x1, y1, steps = element
     if size > 0:
         size = _clip(polygon, size, x0, y0, tolerance)
@@ -404,8 +389,7 @@ def _clip_element(polygon, size, element, tolerance):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _middles(points, origin, k):  # type: ignore[no-untyped-def]
-    """Middles of the first and last unit edge of element k, relative to a corner, and the number of edges."""
+def _middles(points, origin, k):
     x, y = points[k, 0] - points[origin, 0], points[k, 1] - points[origin, 1]
     dx, dy = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
     a, b = abs(round(dx)), abs(round(dy))
@@ -417,7 +401,7 @@ def _middles(points, origin, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _accumulate(moments, element):  # type: ignore[no-untyped-def]
+def _accumulate(moments, element):
     """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
     x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
@@ -432,8 +416,7 @@ def _accumulate(moments, element):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _residual_variance(moments):  # type: ignore[no-untyped-def]
-    """Mean squared distance from the best line: the smaller eigenvalue of the covariance."""
+def _residual_variance(moments):
     mean_x, mean_y = moments[1] / moments[0], moments[2] / moments[0]
     xx = moments[3] / moments[0] - mean_x * mean_x
     xy = moments[4] / moments[0] - mean_x * mean_y
@@ -442,8 +425,7 @@ def _residual_variance(moments):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _all_lines():  # type: ignore[no-untyped-def]
-    """Polygon of all lines, with room to cut it, and its number of corners."""
+def _all_lines():
     polygon = np.empty((_CORNERS, 2))
     for k in range(len(_ALL_LINES)):
         polygon[k, 0], polygon[k, 1] = _ALL_LINES[k, 0], _ALL_LINES[k, 1]
@@ -451,7 +433,7 @@ def _all_lines():  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip(polygon, size, x, y, tolerance):  # type: ignore[no-untyped-def]
+def _clip(polygon, size, x, y, tolerance):
     """Keep the lines that pass (x, y) within the tolerance along y; return the number of corners left."""
     kept = np.empty((_CORNERS, 2))
     for side in (1.0, -1.0):

@@ -1,4 +1,4 @@
-"""Predictions that measurements correct: a Gaussian process on the residuals, correlated over the length of walks."""
+"""Correction of predictions by measurements: a Gaussian process on the residuals, correlated over walking lengths."""
 
 from __future__ import annotations
 
@@ -39,55 +39,55 @@ from sionna_partial.prediction.wall_materials import (
 from sionna_partial.settings import FREQUENCIES_HZ
 
 CELL_M = 0.3
-"""Smallest edge of the cells through which walks lead [m]."""
+"""Smallest edge of the cells of walks [m]."""
 
 UNKNOWN_COST = 3.0
-"""Length of a walk through unknown cells, in lengths of one through free cells."""
+"""Cost of a walk through unknown cells, relative to free cells."""
 
 UNSEEN_RANGE_M = 12.0
-"""Walk over which residuals stay correlated where both links have an end in a cell that was not seen [m]."""
+"""Correlation length of residuals if both links have an end in an unseen cell [m]."""
 
 LOCAL_VARIANCE, LOCAL_M = 0.2, 0.5
-"""Fraction of the variance of residuals that is correlated over this walk only [m]."""
+"""Fraction of the variance of residuals with the correlation length `LOCAL_M` [m]."""
 
 NOISES_DB, LIKELY_NOISE_DB, NOISE_SPREAD = (1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0), 3.0, 0.25
-"""Standard deviations of measurements that are tried where none is given, and the likeliest before, with the standard
-deviation of its logarithm [dB]."""
+"""Candidate standard deviations of measurements where none is given, the most probable one, and the prior standard
+deviation of its logarithm [dB].
+"""
 
 
 P_POWERS, UNSEEN_P_POWERS, FREE_P_POWERS = 0.01, 0.0001, 0.95
-"""Prior probability that powers were measured and no path gains, where the transmitter is in a cell that was seen, and
-where it is not: an offset of all measurements may then be a wall that was not seen, too. The third applies where
-paths go through walls, at the frequencies of radios whose offset is seldom known, and where the position of the
-transmitter is unknown: with the first, 90 % regions contain 69 % of transmitters if all powers are 8 dB low."""
+"""Prior probability that the measurements are powers, not path gains: with the transmitter in a seen cell, in an unseen
+cell (an offset may then be an unseen wall), and for paths through walls or an unknown position of the transmitter.
+
+With `P_POWERS`, the 90 % regions of `locate_transmitter` contain 69 % of transmitters if all powers are 8 dB low.
+"""
 
 
 class Kind(NamedTuple):
-    """Kind of measurements, path gains or powers, and its priors."""
+    """Kind of measurements, path gains or powers, with its priors."""
 
     mean: tuple[float, float]
-    """Expected common offset of all measurements [dB], and common factor on the loss over free space [1]."""
+    """Expected common offset [dB], and common factor on the loss over free space."""
 
     covariance: Floats
-    """Prior covariance (2, 2) of the two."""
 
     seen_range_m: float
-    """Walk over which residuals stay correlated where both ends of a link are in cells that were seen [m]."""
+    """Correlation length of residuals if both ends of a link are in seen cells [m]."""
 
     trace_std_db: float
-    """Standard deviation of the measured gain from a trace through observed space alone [dB]."""
+    """Standard deviation of measured gains from a trace through observed space [dB]."""
 
     deepest: float
-    """Residuals below minus this count as this when kinds are compared, because unseen walls make single links deeper
-    without bound [1]."""
+    """Limit of negative residuals when kinds are compared: unseen walls make single links arbitrarily deep."""
 
     exact: bool
-    """True if predictions that are certain without measurements stay certain; for a real radio no trace is."""
+    """True if certain predictions stay certain; for a real radio no trace is certain."""
 
     def learnt(self, others: Sequence[tuple[Floats, Floats]]) -> Kind:
-        """Update the prior by other transmitters of the building, whose differences are inferred as well.
+        """Update the prior by other transmitters, with unknown differences between transmitters.
 
-        `others` are the precisions (2, 2), and their products with the means, without a prior.
+        `others` are pairs of a precision (2, 2) and its product with the mean, without a prior.
         """
         if not others:
             return self
@@ -120,28 +120,27 @@ KINDS = (
     Kind((0.0, 1.0), np.diag([2.0, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
     Kind((0.0, 0.5), np.diag([40.0, 0.2]) ** 2, 4.0, 3.0, math.inf, True),
 )
-"""Path gains as a trace has them, and powers that a real radio received: what maps lack fills shadows."""
+"""Path gains as traced, and powers at a real radio, with shadows filled by objects that maps lack."""
 
 KINDS_THROUGH_WALLS = tuple(
     Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False) for offset_db in (2.0, 40.0)
 )
-"""Gains and powers that a real radio received through walls of a given material, whose loss is anything from none to
-twice the expected or more."""
+"""Gains and powers at a real radio, through walls whose loss may be from zero to over twice the expected loss."""
 
 UNKNOWN_FACTOR_STD = 0.3
-"""Standard deviation of the factor on losses where the candidates for an unknown material have losses of their own."""
+"""Standard deviation of the factor where candidate materials have losses of their own."""
 
 LEAST_WEIGHT = 0.01
-"""Probability of a candidate below which it is left out of predictions."""
+"""Smallest probability of a candidate in predictions."""
 
 BETWEEN_STDS = tuple(itertools.product((1.5, 3.0, 6.0, 9.0), (0.1, 0.2, 0.3)))
-"""Standard deviations of offset [dB] and factor between the transmitters of a building that are tried."""
+"""Candidate standard deviations of offset [dB] and factor between transmitters of a building."""
 
 LIKELY_BETWEEN, BETWEEN_SPREAD = (3.0, 0.2), 0.5
-"""The most probable ones before any measurement, and the standard deviation of their logarithms."""
+"""Most probable of them a priori, and the standard deviation of their logarithms."""
 
 MOST_POINTS = 500
-"""Number of measured positions from which on neighbours are averaged."""
+"""Number of measured positions above which neighbours are averaged."""
 
 _SWEEPS, _DAMPING = 8, 0.5
 _RANGES = 5.0
@@ -151,14 +150,14 @@ _LEAST_P = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Walks:
-    """Lengths of walks from P points to everywhere on a map: walls block them, unknown cells make them longer."""
+    """Lengths of walks from P points on a map, around walls; unknown cells make them longer."""
 
     partial: PartialMap
     points_m: Floats
     longest_m: float
 
     def lengths_m(self, points_m: Floats) -> Floats:
-        """Lengths (P, N) of walks to other points (N, 3) [m], infinite beyond `longest_m`."""
+        """Return the lengths (P, N) of walks to points (N, 3) [m], infinite beyond `longest_m`."""
         straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
         return np.maximum(self._lengths_m[:, self._cell_at(points_m)], straight_m)
 
@@ -168,25 +167,21 @@ class Walks:
 
     @cached_property
     def _blocks(self) -> tuple[States, Floats]:
-        """The cells of the map in blocks, which are the cells of walks, and the lower-left corner."""
         return aligned_blocks(self.partial, self._step)
 
     @cached_property
     def _cost(self) -> Floats:
-        """Cost of crossing a cell of walks, which is several cells of the map wide; 0 in walls."""
         blocks, _ = self._blocks
         unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
         return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
 
     @cached_property
     def _nearest(self) -> NDArray[np.intp]:
-        """The nearest cell that can be crossed, for each cell."""
         cell = ndimage.distance_transform_edt(self._cost == 0.0, return_distances=False, return_indices=True)
         return np.ravel_multi_index(tuple(cell), self._cost.shape)
 
     @cached_property
     def _lengths_m(self) -> NDArray[np.float32]:
-        """Lengths (P, K) of walks to all cells [m]."""
         ends, costs = grid_edges(self._cost)
         lengths_m = costs * self._step * self.partial.resolution_m
         graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
@@ -203,36 +198,31 @@ class Walks:
 
 @dataclass(frozen=True, eq=False)
 class _Links:
-    """The links of one transmitter (3,), and the correlation of their residuals with those that were measured."""
-
     walks: Walks
     tx_m: Floats
     frequency_hz: float
 
     @property
     def tx_seen(self) -> bool:
-        """Return whether the transmitter is in a cell that was seen."""
         return bool(self.walks.partial.state_at(self.tx_m[None])[0] == CellState.FREE)
 
     def free_space_db(self, rx_m: Floats) -> Floats:
         return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
 
     def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
-        """Correlation (P, N) of residuals at the measured positions and at other receivers (N, 3)."""
         walks_m = self.walks.lengths_m(rx_m)
         either_seen = self._both_seen(self.walks.points_m)[:, None] | self._both_seen(rx_m)
         range_m = np.where(either_seen, kind.seen_range_m, UNSEEN_RANGE_M)
         return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
     def _both_seen(self, rx_m: Floats) -> Bools:
-        """Return whether both ends of the links to receivers (N, 3) are in cells that were seen."""
         return self.tx_seen & (self.walks.partial.state_at(rx_m) == CellState.FREE)
 
 
 class _Sample(NamedTuple):
-    """M measurements in P groups of neighbours: positions (P, 3), whether received, sizes, group of each (M,).
+    """M measurements in P groups of neighbours: positions (P, 3), received (P,), sizes (P,), group (M,).
 
-    `level_db` (M,) are the gains without the antenna, or their upper limits [dB].
+    `level_db` (M,) are gains without the antenna, or their upper limits [dB].
     """
 
     measured: Measurements
@@ -252,7 +242,7 @@ class _Sample(NamedTuple):
         return np.bincount(self.group, weights=values) / self.size
 
     def noises_db(self) -> dict[float, Floats]:
-        """Return standard deviations (P,) of averages by the noise of a measurement [dB], given or tried."""
+        """Return standard deviations (P,) of averages by the given or candidate noise of a measurement [dB]."""
         std_db = self.measured.std_db
         if std_db is None:
             return {noise_db: noise_db / np.sqrt(self.size) for noise_db in NOISES_DB}
@@ -260,7 +250,7 @@ class _Sample(NamedTuple):
 
 
 class _Hypothesis(NamedTuple):
-    """A kind and a noise of the measurements, and their process: residuals, covariance and noise, without unit."""
+    """Kind and noise of the measurements, and their process: dimensionless residuals, covariance and noise."""
 
     log_p: float
     kind: Kind
@@ -272,11 +262,9 @@ class _Hypothesis(NamedTuple):
 
     @property
     def covariance(self) -> Floats:
-        """Covariance (P, P) of the residuals without noise."""
         return self.correlation + self.design.T @ self.kind.covariance @ self.design
 
     def log_evidence(self, received: Bools) -> float:
-        """Log-likelihood of the residuals (P,) where something was received, but for a constant."""
         z = np.maximum(self.residual, -self.kind.deepest)[received]
         factor = cho_factor(
             self.covariance[np.ix_(received, received)] + np.diag(self.noise[received] ** 2), lower=True
@@ -286,8 +274,8 @@ class _Hypothesis(NamedTuple):
     def in_common(self, received: Bools) -> tuple[Floats, Floats]:
         """Return the precision (2, 2) of offset and factor, and its product with their mean, without a prior.
 
-        Residuals that are correlated count once: least squares with their covariance would have a factor on shadows
-        from differences between neighbours alone, which a trace has wrong.
+        Correlated residuals count once. Least squares with their covariance would derive the factor on shadows from
+        differences between neighbours, which a trace predicts badly.
         """
         design, residual = self.design[:, received], self.residual[received]
         redundancy = self.correlation[np.ix_(received, received)].sum() / max(1, received.sum())
@@ -297,10 +285,10 @@ class _Hypothesis(NamedTuple):
 
 
 class _Fit(NamedTuple):
-    """The process under one material: weights (P,) and matrix (P, P) with which it predicts.
+    """Process under one material: weights (P,) and matrix (P, P) of its predictions.
 
-    `fading_db` is the part of the noise that other receivers have as well. Offset and factor have the posterior
-    covariance `common` (2, 2); `coupling` (2, P) gives their covariance with the process.
+    `fading_db` is the noise that other receivers share. Offset and factor have the posterior covariance `common` (2, 2)
+    and the covariance `coupling` (2, P) with the process.
     """
 
     kind: Kind
@@ -323,7 +311,7 @@ class _Fit(NamedTuple):
         return cls(best.kind, best.noise_db, fading_db, offset_db, factor, weights, precision, common, coupling)
 
     def common_variance(self, across: Floats, scale_db: Floats, below_db: Floats) -> Floats:
-        """Return the variance (N,) that uncertain offset and factor add to the process at other receivers [dB²]."""
+        """Return the variance (N,) added by uncertain offset and factor at other receivers [dB²]."""
         design = np.stack([np.ones(len(below_db)), below_db])
         shared = self.common @ design - 2.0 * scale_db * (self.coupling @ across)
         return (design * shared).sum(axis=0)
@@ -332,7 +320,6 @@ class _Fit(NamedTuple):
 def _hypotheses(
     sample: _Sample, links: _Links, prior: LinkPrediction, kinds: Sequence[Kind], p_powers: float
 ) -> Iterator[_Hypothesis]:
-    """Yield all hypotheses with the logarithms of their posterior probability, but for a constant."""
     measured, received = sample.measured, sample.received
     above_db = sample.level_db - prior.gain_mean_db
     below_db = prior.gain_mean_db - links.free_space_db(measured.rx)
@@ -351,9 +338,9 @@ def _hypotheses(
 
 
 class _Compared(NamedTuple):
-    """Measurements of one transmitter through walls, under K candidates for their material.
+    """Measurements of one transmitter through walls under K candidate materials.
 
-    `kinds` has the kinds of measurements under each candidate; `correlation` (P, P) is the correlation of residuals.
+    `kinds` are the kinds of measurements under each candidate.
     """
 
     sample: _Sample
@@ -382,7 +369,6 @@ class _Compared(NamedTuple):
         return cls(sample, links, materials, learnt, correlation)
 
     def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
-        """Return the log-posterior (2, K, S, N) of kinds, candidates, process and noise, and the evidence (K, S, N)."""
         received = self.sample.received
         below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))
         parts = []
@@ -405,28 +391,25 @@ class _Compared(NamedTuple):
         return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
 
     def fit(self, k: int, p: Floats) -> _Fit:
-        """Fit the process under a candidate, given the probabilities (2, S, N) of kinds, process and noise."""
         best, fading_db = self._hypothesis(k, p)
         return _Fit.of(best, self.sample.received, fading_db)
 
     def in_common(self, k: int, p: Floats) -> tuple[Floats, Floats]:
-        """Return the offset and factor of the measurements under a candidate, as `_Hypothesis.in_common`."""
         return self._hypothesis(k, p)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
-        """Return averages (P,) of the prior above free space, of the measured above the prior, and of its spread."""
+        """Return averages (P,) of prior above free space, measurement above prior, and the prior's deviation [dB]."""
         averaged, free_db = self.sample.averaged, self.links.free_space_db(self.sample.measured.rx)
         below_db, above_db = prior.gain_mean_db - free_db, self.sample.level_db - prior.gain_mean_db
         return averaged(below_db), averaged(above_db), averaged(prior.gain_std_db)
 
     @property
     def _given_db(self) -> float:
-        """Root mean square of the standard deviations of the measurements, 0 where none are given [dB]."""
         std_db = self.sample.measured.std_db
         return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
 
     def _hypothesis(self, k: int, p: Floats) -> tuple[_Hypothesis, float]:
-        """Return the most probable kind under a candidate, with the root mean squares of process and fading."""
+        """Return the most probable kind under candidate k, and the fading [dB]."""
         of_kind = p.sum(axis=(1, 2))
         number = int(of_kind.argmax())
         weights = p[number] if of_kind[number] > 0.0 else np.ones(p.shape[1:])
@@ -444,7 +427,7 @@ class _Compared(NamedTuple):
 
 
 def _fitting(log_evidence: Floats, candidates: int) -> Floats:
-    """Return the evidence (K, S, N) of another transmitter, averaged over candidates that are not compared."""
+    """Return the evidence (K, S, N) of another transmitter, averaged over its candidates if they are different ones."""
     if len(log_evidence) in (1, candidates):
         return log_evidence
     return logsumexp(log_evidence, axis=0, keepdims=True) - math.log(len(log_evidence))
@@ -453,19 +436,17 @@ def _fitting(log_evidence: Floats, candidates: int) -> Floats:
 @read_only
 @dataclass(frozen=True, eq=False)
 class Assimilation(Shown):
-    """Posterior of the links to other receivers, given measurements of one transmitter: see `fit`.
+    """Posterior of the links to other receivers, given measurements of one transmitter (`fit`).
 
     The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
-    Gaussian process, whose correlation falls off with the length of the walk between receivers. A gain at or below
-    the sensitivity is known to be at most that (expectation propagation; Rasmussen and Williams, Gaussian Processes for
-    Machine Learning, sections 3.6 and 3.9). Standard deviations of noise and of an offset that all measurements have in
-    common maximise the likelihood of the measurements. Where that offset is large, so that a real radio is behind them,
-    the predicted loss over free space is scaled, too.
+    Gaussian process whose correlation decreases with the walking length between receivers. A measurement at or below
+    the sensitivity is an upper bound (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine
+    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood; with a large offset, as of a real
+    radio, the predicted loss over free space is scaled, too.
 
-    Through walls of an unknown material there is a process for each candidate. Their evidence, with the evidence of
-    other transmitters, gives the probabilities of the candidates, and the deviations of process and fading.
+    Through walls of an unknown material there is one process per candidate, weighted by its evidence and that of other
+    transmitters.
 
-    `predict_map` does this for a map; for single links, predict the measured links, and those that are wanted.
 
     Examples
     --------
@@ -482,7 +463,7 @@ class Assimilation(Shown):
     """
 
     noise_db: float
-    """Standard deviation of the measurements [dB]: of those that were given, and of fading."""
+    """Standard deviation of the measurements, given noise and fading [dB]."""
 
     offset_db: float
     """Common offset of the measurements above the predicted gains [dB]."""
@@ -491,7 +472,7 @@ class Assimilation(Shown):
     """Factor on the predicted loss over free space."""
 
     material_weights: Floats
-    """Probability (K,) of each candidate for the material of walls, one where it is known."""
+    """Probability (K,) of each candidate wall material; one element if it is known."""
 
     _links: _Links = field(repr=False)
     _fits: tuple[_Fit | None, ...] = field(repr=False)
@@ -500,7 +481,7 @@ class Assimilation(Shown):
 
     @property
     def tx_m(self) -> Floats:
-        """The transmitter (3,) [m]."""
+        """Transmitter (3,) [m]."""
         return self._links.tx_m
 
     @classmethod
@@ -523,22 +504,22 @@ class Assimilation(Shown):
         ----------
         partial : PartialMap
         tx_m : (3,) array-like
-            The transmitter [m].
+            Transmitter [m].
         measured : Measurements
-            M links of this transmitter, at least one.
+            M links of this transmitter.
         prior : LinkPrediction
             Prediction of these links without the measurements.
         antenna_db : float or (M,) array-like
-            Gain of the transmitter's antenna in these links, which `measured` has and `prior` lacks [dB]. `update`
-            takes and returns predictions without it.
+            Gain of the transmitter's antenna, which `measured` includes and `prior` does not [dB]; `update` works
+            without it.
         frequency_hz : float
         p_powers : float, optional
-            Prior probability that powers were measured, with an unknown offset, and no path gains.
+            Prior probability that the measurements are powers with an unknown offset, not path gains.
         through_walls : bool
-            True if the prior comes from a trace through walls. The measurements are then ascribed to a real radio: the
-            loss of walls is inferred with them, and no trace is certain.
+            True for a trace through walls. The measurements are then from a real radio: the loss of walls is inferred,
+            and no trace is certain.
         others : sequence of Assimilation
-            Fits to other transmitters of the building through walls, from which losses and offsets are known in part.
+            Fits to other transmitters of the building through walls, which inform losses and offsets.
 
         Returns
         -------
@@ -547,7 +528,7 @@ class Assimilation(Shown):
         Raises
         ------
         MeasurementError
-            If `prior` has another number of links, or there are none.
+            If `prior` has another number of links, or there are neither links nor `others`.
         MapError, PositionError, SettingsError
             For arguments of another kind.
         """
@@ -590,7 +571,6 @@ class Assimilation(Shown):
         p_powers: float,
         others: Sequence[Assimilation],
     ) -> Assimilation:
-        """Fit the process under each candidate for the material of walls, and weigh them by their evidence."""
         materials, weights = prior.by_material
         compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
         log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
@@ -605,10 +585,10 @@ class Assimilation(Shown):
         return cls(noise_db, offset_db, factor, of_material, links, fits, in_common, evidence)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
-        """Return the prediction of links to receivers given the measurements.
+        """Return the prediction of links given the measurements.
 
-        A residual that the process predicts counts as a measurement of the gain with a noise of its own: it weighs the
-        link states, and the distribution of the gain given each, by Bayes' rule.
+        A predicted residual counts as a noisy measurement of the gain, which updates P(link state) and the gain given
+        each state by Bayes' rule.
 
         Parameters
         ----------
@@ -638,7 +618,7 @@ class Assimilation(Shown):
         return LinkPrediction.mixture(updated, self.material_weights[self.material_weights > 0.0])
 
     def _updated(self, fit: _Fit, across: Floats, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
-        """Update links under one material, whose residuals have the correlations (P, N) `across` with the measured."""
+        """Update links under one material; `across` (P, N) are correlations with the measured residuals."""
         kind, below_db = fit.kind, prior.gain_mean_db - self._links.free_space_db(rx_m)
         prior = self._shadowed(rx_m, prior, fit.factor)
         explained = np.clip(np.einsum("pn,pn->n", across, fit.precision @ across), 0.0, 1.0 - 1e-3)
@@ -665,7 +645,6 @@ class Assimilation(Shown):
         return prior.where(informed, updated) if kind.exact else updated
 
     def _shadowed(self, rx_m: Floats, prior: LinkPrediction, factor: float) -> LinkPrediction:
-        """Scale the predicted loss over free space."""
         if factor == 1.0:
             return prior
         free_db = self._links.free_space_db(rx_m)
@@ -676,9 +655,9 @@ class Assimilation(Shown):
 
 
 def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Group measurements (M,) that share a cell of the finest grid which leaves `most` groups or fewer.
+    """Group measurements (M,) by the cells of the finest grid with at most `most` groups.
 
-    Returned are the first measurement of each group, the group of each measurement, and the sizes of the groups.
+    Return the first measurement of each group, the group of each measurement, and the group sizes.
     """
     edge_m = 0.01
     while True:
@@ -690,13 +669,13 @@ def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp],
 
 
 def _positive(correlation: Floats) -> Floats:
-    """Make the correlation (P, P) of positions positive definite: walks are no Euclidean distances."""
+    """Make a correlation (P, P) positive definite: walks are no Euclidean distances."""
     values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
     return (vectors * np.maximum(values, _LEAST_EXPLAINED)) @ vectors.T
 
 
 def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Floats) -> tuple[Floats, Floats]:
-    """Weights (P,) and matrix (P, P) with which the process predicts; residuals of nothing received are bounds."""
+    """Return weights (P,) and matrix (P, P) of predictions; residuals that were not received are upper bounds."""
     precision = np.where(received, 1.0 / noise**2, 0.0)
     shift = precision * residual
     for _ in range(1 if received.all() else _SWEEPS):
@@ -719,7 +698,6 @@ def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Flo
 
 
 def _inverse(covariance: Floats, precision: Floats) -> Floats:
-    """(covariance + 1 / precision)^-1, precisions of 0 included."""
     root = np.sqrt(precision)
     factor = cho_factor(np.eye(len(root)) + root[:, None] * covariance * root, lower=True)
     return root[:, None] * cho_solve(factor, np.diag(root))

@@ -18,37 +18,37 @@ from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.predictor import LinkPrediction
 
 Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
-"""Links from a position (3,) to others (N, 3) [m] -> their prediction without the antenna at the others, its gain
-(N,) [dB], and P(indoor) of the others (N,)."""
+"""Return the links from a position (3,) to others (N, 3) [m]: their prediction without the antenna at the others, its
+gain (N,) [dB], and P(indoor) of the others (N,).
+"""
 
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
-"""Number of positions that are compared, least distance between them, and how far they go beyond free cells [m]."""
+"""Number of candidate positions, their smallest spacing, and their largest distance from free cells [m]."""
 
 MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
-"""Number of groups of neighbouring measurements, of each of which one is traced."""
+"""Number of groups of neighbouring measurements; one of each group is traced."""
 
 CORRELATION_M = 3.0
-"""Walk over which the errors of predictions stay correlated [m]; fitted so that the 90 % region holds 90 % of the
-transmitters of procedural homes, also of those that no measurement received."""
+"""Correlation length of prediction errors along walks [m]; with it the 90 % region holds 90 % of the transmitters of
+procedural homes, unreceived ones included.
+"""
 
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
-"""Standard deviation of a trace through observed space [dB]; how often a gain is anything in a range this wide [dB]."""
+"""Standard deviation of a trace through observed space [dB]; probability of an outlier, and its range [dB]."""
 
 OFFSETS_DB, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 40.0
-"""Offsets that powers may have in common, and the prior standard deviation of the offset [dB]."""
+"""Candidate offsets of powers, and the prior standard deviation of the offset [dB]."""
 
 OUTDOOR = 1e-6
-"""Weight of positions that are outdoors for certain."""
 
 REGION = 0.9
-"""Probability of the region that `likely_region` returns."""
 
 
 @dataclass(frozen=True, eq=False)
 class TransmitterPosterior:
-    """Probability (ny, nx) of each cell of a grid, whose centres are at x (nx,) and y (ny,) [m], at one height [m].
+    """Probability (ny, nx) of the cells of a grid with centres x (nx,) and y (ny,) [m], at one height [m].
 
-    `p_powers` (ny, nx) is the probability, given each cell, that powers were measured, with an offset, and no gains.
+    `p_powers` (ny, nx) is the probability, given the cell, that the measurements are powers with an offset.
     """
 
     x_m: Floats
@@ -65,7 +65,7 @@ class TransmitterPosterior:
 
     @cached_property
     def position_m(self) -> Floats:
-        """The cell (3,) from which the expected distance is smallest [m]."""
+        """Cell (3,) with the smallest expected distance [m]."""
         points_m, weights = self.points_m, self.probability.ravel()
         possible = weights > 0.0
         expected_m = [np.linalg.norm(points_m[possible] - each, axis=1) @ weights[possible] for each in points_m]
@@ -78,7 +78,7 @@ class TransmitterPosterior:
         return float(np.sqrt(square @ self.probability.ravel()))
 
     def draw(self, count: int) -> tuple[Floats, Floats, list[float | None]]:
-        """Return positions (K, 3) [m], drawn systematically, their weights (K,), and P(powers) given each."""
+        """Draw positions (K, 3) systematically [m]; return their weights (K,) and P(powers), too."""
         weights = self.probability.ravel()
         drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
         chosen, times = np.unique(drawn, return_counts=True)
@@ -87,7 +87,7 @@ class TransmitterPosterior:
 
 
 def likely_region(probability: Floats) -> Bools:
-    """Return the smallest set of cells that holds 90 % of a posterior."""
+    """Return the smallest set of cells with 90 % of a posterior."""
     order = np.argsort(-probability, axis=None, kind="stable")
     inside = np.cumsum(probability.ravel()[order]) < REGION * probability.sum()
     region = np.zeros(probability.size, dtype=bool)
@@ -104,12 +104,11 @@ def locate_transmitter(
     *,
     through_walls: bool = False,
 ) -> TransmitterPosterior:
-    """Compare positions by the likelihood of gains measured of one transmitter, weighted by P(indoor).
+    """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
-    Links are reciprocal: they are predicted from the measured positions to all others (`allowed` returns where one can
-    be). A gain has the distribution that is predicted, and noise; at or below the sensitivity it is at most that.
-    Errors at neighbouring positions are correlated: the log-likelihood is divided by how many count as one. Where the
-    material of walls is unknown, its candidates are compared together with the positions.
+    By reciprocity, links are predicted from the measured positions to all others; `allowed` returns the possible ones.
+    The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
+    with the positions.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
@@ -140,7 +139,6 @@ def locate_transmitter(
 
 
 def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
-    """Lay out positions over the free cells and around them, with probability 0."""
     cells = np.argwhere(partial.state == CellState.FREE)[:, ::-1]
     low_m, high_m = np.reshape(partial.bounds_m, (2, 2))
     if len(cells):
@@ -157,7 +155,6 @@ def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
 
 
 def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_db: Floats) -> Floats:
-    """Log-likelihood (O, N) of one measurement for each offset and predicted link."""
     probabilities, means_db, stds_db = prediction.by_state
     noise_db = LIKELY_NOISE_DB if measured.std_db is None else measured.std_db[0]
     spread_db = np.sqrt(stds_db**2 + noise_db**2 + TRACE_STD_DB**2)
@@ -171,6 +168,5 @@ def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_
 
 
 def _log_offset_prior() -> Floats:
-    """Log-probability of each offset."""
     weight = np.where(OFFSETS_DB == 0.0, 0.0, np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2))
     return np.log(FREE_P_POWERS * weight / weight.sum() + (1.0 - FREE_P_POWERS) * (OFFSETS_DB == 0.0))

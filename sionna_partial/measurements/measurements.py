@@ -24,33 +24,30 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
 
 LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
-"""Gains beyond these are in another unit, or of another sign [dB]. Noise may take an outage below the floor."""
+"""Limits of gains [dB]; others have another unit or sign. Noise may take an outage below -150 dB."""
 
 OUTAGE_DB = GAIN_FLOOR_DB + 10.0
-"""Up to this gain, noise included, a link counts as an outage [dB]."""
+"""Largest gain that counts as an outage, with noise [dB]."""
 
 SAME_M, MOST_LINKS = 0.01, 3000
-"""Links whose ends lie in the same cubes are one link [m]; number of links that are evaluated at most."""
+"""Edge of the cubes in which ends of repeated links are equal [m]; largest number of links."""
 
 _ROUNDING_DB = 1e-6
 
 LEAST_STD_DB, HIGHEST_STD_DB = 0.1, 30.0
-"""What smaller standard deviations of a gain count as, and the largest [dB]."""
+"""Smallest effective and largest allowed standard deviation of a gain [dB]."""
 
 FEW_REPEATS = 10
-"""Number of repetitions from which their scatter is believed rather than not."""
+"""Number of repetitions at which half of their scatter is attributed to noise."""
 
 SAME_TX_M = 0.5
-"""Distance within which measured links are of the same transmitter [m]."""
 
 MOST_MEASUREMENTS = 20_000
-"""Number of measurements that are held against predictions."""
 
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
-"""Number of other transmitters that the loss of walls is learnt from, and of the links of each."""
+"""Number of other transmitters for learning the loss of walls, and of links of each of them."""
 
 VACUUM_HEIGHT_M = 0.1
-"""Height of the antenna of a vacuum robot [m]."""
 
 _log = logging.getLogger(__name__)
 
@@ -59,7 +56,7 @@ _OTHER_HEADERS = {
     **{f"{axis}{unit}": f"rx_{axis}" for axis in "xyz" for unit in ("", "_m")},
     **dict.fromkeys(("rssi", "rssi_dbm", "rsrp", "rsrp_dbm", "power_dbm"), "power_dbm"),
 }
-"""Names that survey apps give to the position of the receiver, and to the received power."""
+"""Headers of survey apps for the receiver's position and the received power."""
 
 _NAMES = (*_CSV_COLUMNS, "power_dbm")
 _NAME_COLUMNS = (
@@ -82,22 +79,20 @@ class Measurements(Shown):
     Parameters
     ----------
     tx : (N, 3) float64 array, or None
-        Transmitter position of each link [m]; one position (3,) stands for all links. None, or NaN as x and y, where it
-        is not known; z may be.
+        Transmitter of each link [m], or one for all, (3,). None, or NaN as x and y, if unknown; z may be known.
     rx : (N, 3) float64 array
-        Receiver position of each link [m].
+        Receivers [m].
     gain_db : (N,) float64 array
-        Omnidirectional path gain [dB], negative. -150 is an outage.
+        Omnidirectional path gain [dB], negative; -150 is an outage.
     std_db : (N,) float64 array, optional
-        Standard deviation of each gain [dB], one number for all, 0.1 at least; estimated where it is needed and not
-        given.
+        Standard deviation of each gain, or one for all [dB], at least 0.1; estimated if not given.
     sensitivity_db : float
-        Of the receiver [dB]: gains at or below it are known to be no higher than that.
+        Sensitivity of the receiver [dB]: a gain at or below it is an upper bound.
 
     Raises
     ------
     MeasurementError
-        For arrays of other shapes, values that are not finite, or gains that no link has.
+        For wrong shapes, values that are not finite, or gains that no link has.
 
     Examples
     --------
@@ -138,18 +133,17 @@ class Measurements(Shown):
         object.__setattr__(self, "sensitivity_db", float(sensitivity_db))
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.gain_db)
 
     def take(self, index: NDArray[np.generic]) -> Measurements:
-        """Return the links that an index array or a mask (N,) selects."""
+        """Select links by an index array or a mask (N,)."""
         std_db = None if self.std_db is None else self.std_db[index]
         return Measurements(self.tx[index], self.rx[index], self.gain_db[index], std_db, self.sensitivity_db)
 
     def of_paths(self, antenna_db: Floats | float) -> tuple[Floats, Bools]:
-        """Return the levels (N,) [dB] without an antenna's gain, one for all or (N,), and whether each was received.
+        """Return the levels (N,) without the antenna's gain [dB], and the mask of received links.
 
-        Where nothing was received the level is an upper limit: the sensitivity, or the floor without one.
+        Without reception the level is an upper limit: the sensitivity, or -150 dB.
         """
         received = self.gain_db > self.sensitivity_db
         limit_db = self.sensitivity_db - antenna_db if self.sensitivity_db > GAIN_FLOOR_DB else GAIN_FLOOR_DB
@@ -162,7 +156,7 @@ class Measurements(Shown):
         return np.asarray(np.isfinite(self.tx).all(axis=1))
 
     def require_transmitters(self) -> None:
-        """Raise a MeasurementError unless the positions of all transmitters are known."""
+        """Raise a MeasurementError if the position of a transmitter is unknown."""
         missing = int((~self.tx_known).sum())
         if missing:
             raise MeasurementError(
@@ -182,10 +176,9 @@ def measurements_of(source: Any) -> Measurements:
     Parameters
     ----------
     source : Measurements, mapping, data frame, Dataset or path
-        With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB]; cells of a data frame may hold x, y, z. Instead
-        of `tx` there may be `tx_x`, `tx_y` and `tx_z` (N,), and likewise for `rx`. A CSV has these columns, with a
-        header; without `tx_z` or `rx_z`, heights are 1.5 m. `std_db` (N,) and `sensitivity_db` are optional, and so is
-        `tx` where the transmitter is not known.
+        With `tx` (N, 3) [m], `rx` (N, 3) [m] and `gain_db` (N,) [dB], or with one column per axis: `tx_x`, `tx_y`,
+        `tx_z`, `rx_x`, ... (N,), as in a CSV with a header; heights are 1.5 m by default. Cells of a data frame may
+        hold x, y, z. `std_db` (N,), `sensitivity_db` and `tx` are optional.
 
     Returns
     -------
@@ -194,7 +187,7 @@ def measurements_of(source: Any) -> Measurements:
     Raises
     ------
     MeasurementError
-        For a missing field or file, or values that are no measurements; the message names the first of them.
+        For a missing field or file, or invalid values.
     """
     if isinstance(source, Measurements):
         return source
@@ -223,25 +216,25 @@ def load_measurements(
     tx_power_dbm: float = 0.0,
     access_point: str | None = None,
 ) -> Measurements:
-    r"""Read measurements from a CSV with a header, as a survey app writes it, or from a recording of Valeronoi.
+    r"""Read measurements from a CSV of a survey app, or from a recording of Valeronoi.
 
     Parameters
     ----------
     path : path-like
-        Columns of a CSV are tx_x, tx_y, tx_z, rx_x, rx_y, rx_z [m], gain_db, std_db [dB]; x, y, z count as the
-        receiver's. Instead of gain_db there may be a received power: power_dbm, rssi or rsrp. Heights that are missing
-        are 1.5 m. A recording (.vwm) has mean received powers of a vacuum robot, 0.1 m high, at positions on the map
-        that `load_map` reads from the same file; transmitters are not known.
+        A CSV with a header has the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db
+        [dB]; power_dbm, rssi or rsrp are received powers, instead of gain_db. Missing heights are 1.5 m. A recording
+        (.vwm) has mean received powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same
+        file; transmitters are unknown.
     columns : mapping, optional
-        Headers of the file for names of these columns, as ``{"rx_x": "east", "power_dbm": "level"}``. A header for
-        gain_db that does not contain "gain" counts as a received power.
+        Headers of these columns in the file, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db
+        without the word "gain" is a received power.
     tx : (3,) array-like, optional
-        Position of the transmitter of all links [m], instead of its columns.
+        Transmitter of all links [m], instead of the columns.
     tx_power_dbm : float
-        Power that a receiver would report without path loss [dBm]. It is subtracted from received powers, never from
-        gain_db. If it is not known, leave it out: `predict_map` and `calibrate_materials` estimate a common offset.
+        Received power without path loss [dBm], subtracted from received powers, never from gain_db. Leave it out if
+        unknown: `predict_map` and `calibrate_materials` estimate a common offset.
     access_point : str, optional
-        BSSID or SSID of the access point of a recording; by default the one with most measurements.
+        BSSID or SSID in a recording; by default the access point with most measurements.
 
     Returns
     -------
@@ -250,8 +243,7 @@ def load_measurements(
     Raises
     ------
     MeasurementError
-        If the file cannot be read, has no rows, lacks a column or the access point, or has values that are no
-        measurements.
+        If the file cannot be read, has no rows, lacks a column or the access point, or has invalid values.
 
     Examples
     --------
@@ -275,7 +267,7 @@ def _read(
     tx_power_dbm: float = 0.0,
     access_point: str | None = None,
 ) -> dict[str, Floats]:
-    """Read the columns of a file by our names; `tx_power_dbm` is subtracted from received powers."""
+    """Read the columns of a file by our names; subtract `tx_power_dbm` from received powers."""
     is_recording = is_path(path) and Path(path).suffix.lower() == ".vwm"
     for name, value, other in (("columns", columns, is_recording), ("access_point", access_point, not is_recording)):
         if value is not None and other:
@@ -312,8 +304,7 @@ def _read(
 
 
 def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
-    """Return the received powers of an access point in a recording of Valeronoi, and their positions."""
-    from sionna_partial.maps.vacuum import read_json  # few measurements are recordings of robots
+    from sionna_partial.maps.vacuum import read_json  # rarely needed
 
     raw, _, frame = read_json(path, "measurements", MeasurementError)
     with decoding(path, "no recording of Valeronoi", MeasurementError):
@@ -343,7 +334,6 @@ def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
 
 
 def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
-    """Return our name for each header of a CSV, in lower case; `columns` has headers for some names."""
     names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
     if not isinstance(columns, Mapping | None):
         raise MeasurementError(f"columns = {shown(columns)} is no mapping: {_NAME_COLUMNS.format('rx_x')}.")
@@ -360,8 +350,8 @@ def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
     """Merge repeated measurements: L links with mean gains, the link of each measurement (N,), and variances (L,).
 
-    The variance [dB^2] of a link's mean is what the scatter of repetitions makes of it; without repetitions it is 0,
-    and all noise counts as that of the link.
+    The variance [dB^2] of a mean follows from the scatter of repetitions; without repetitions it is 0, and the noise is
+    part of the link.
     """
     cubes = np.round(np.hstack([measured.tx, measured.rx]) / SAME_M)
     keys = np.column_stack([cubes, measured.is_outage])
@@ -385,7 +375,6 @@ def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDAr
 
 
 def _field(source: Any, name: str) -> Any:
-    """Return a field by its name, None where there is none."""
     try:
         return source[name]
     except (KeyError, IndexError, TypeError, ValueError):
@@ -393,7 +382,6 @@ def _field(source: Any, name: str) -> Any:
 
 
 def _ends(source: Any, name: str) -> Any:
-    """Return positions (N, 3), from one field or from one for each axis."""
     positions = _field(source, name)
     if positions is not None:
         return positions
@@ -412,7 +400,7 @@ def _ends(source: Any, name: str) -> Any:
 
 
 def _numbers(name: str, values: ArrayLike, *, known: bool = True) -> NDArray[np.float64]:
-    """Return finite numbers, and NaN where they need not be known, as a new array, or raise a MeasurementError."""
+    """Return a new array of finite numbers, or NaN unless `known`, or raise a MeasurementError."""
     cells = list(np.asarray(values)) if getattr(values, "dtype", None) == np.dtype("O") else values
     array = float_array(name, cells, MeasurementError, "give finite numbers.")
     good = np.isfinite(array) | (np.isnan(array) & (not known))
@@ -436,7 +424,6 @@ def _positions(name: str, values: ArrayLike, count: int, *, known: bool = True) 
 
 
 def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], remedy: str) -> None:
-    """Raise a MeasurementError that names the first value that is not good."""
     if not good.all():
         first = tuple(int(index) for index in np.argwhere(~good)[0])
         more = f" (and {int((~good).sum()) - 1} more)" if (~good).sum() > 1 else ""
@@ -448,7 +435,7 @@ def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], re
 def measurements_of_each(
     partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
 ) -> list[Measurements | None]:
-    """Read the measurements of each transmitter, (1, 3) or unknown (0, 3) [m]; one at least has some."""
+    """Return the measurements of each transmitter, (1, 3) or unknown (0, 3) [m], or None; at least one has some."""
     measured = measurements_of(measurements)
     nearest = nearest_transmitters(measured.tx, sources_m)
     used = [bool(near.any()) or len(sources_m) == 1 for near in nearest]
@@ -460,9 +447,9 @@ def measurements_of_each(
 
 
 def nearest_transmitters(tx_m: Floats, sources_m: Sequence[Floats]) -> Bools:
-    """Return whether each of T transmitters at (1, 3) is the nearest to measured ones (N, 3) [m], and is one of them.
+    """Return (T, N) whether the transmitter at (1, 3) is the nearest to the measured one and the same [m].
 
-    The array is (T, N). Transmitters at one position share their measurements; no position is near an unknown (0, 3).
+    Transmitters at one position share their measurements; an unknown position (0, 3) has none.
     """
     apart_m = np.array([np.linalg.norm(tx_m - (each_m if len(each_m) else np.nan), axis=1) for each_m in sources_m])
     apart_m = apart_m.reshape(len(sources_m), len(tx_m))
@@ -472,7 +459,7 @@ def nearest_transmitters(tx_m: Floats, sources_m: Sequence[Floats]) -> Bools:
 def measurements_of_others(
     partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
 ) -> list[Measurements]:
-    """Choose links of the other transmitters that are nearest to those at (1, 3) [m], where links can be predicted."""
+    """Return usable links of the other transmitters nearest to those at (1, 3) [m]."""
     measured = measurements_of(measurements)
     usable = np.linalg.norm(measured.rx - measured.tx, axis=1) >= nearest_m(frequency_hz)
     for ends_m in (measured.tx, measured.rx):
@@ -491,7 +478,7 @@ def measurements_of_others(
 def _measured(
     partial: PartialMap, tx_m: Floats, measured: Measurements, nearest: Bools, frequency_hz: float
 ) -> Measurements:
-    """Choose the measurements of one transmitter, (1, 3) or unknown (0, 3) [m], where links can be predicted."""
+    """Return the usable measurements of one transmitter, (1, 3) or unknown (0, 3) [m]."""
     measured = _of_transmitter(measured, tx_m[0], nearest) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
@@ -513,7 +500,7 @@ def _measured(
 
 
 def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> Bools:
-    """Return whether receivers (N, 3) [m] are neither in walls nor at one of the transmitters (K, 3) [m]."""
+    """Return whether receivers (N, 3) [m] are neither in walls nor at a transmitter (K, 3) [m]."""
     usable = clear_of_walls(partial, rx_m)
     for each_m in tx_m:
         usable &= np.linalg.norm(rx_m - each_m, axis=1) >= nearest_m(frequency_hz)
@@ -521,7 +508,6 @@ def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: f
 
 
 def _of_transmitter(measured: Measurements, tx_m: Floats, nearest: Bools) -> Measurements:
-    """Return the measurements of a transmitter (3,) [m], to which it is the nearest (N,)."""
     measured.require_transmitters()
     if not nearest.any():
         apart_m = np.linalg.norm(measured.tx - tx_m, axis=1)
@@ -535,7 +521,6 @@ def _of_transmitter(measured: Measurements, tx_m: Floats, nearest: Bools) -> Mea
 
 
 def _of_unknown(measured: Measurements) -> Measurements:
-    """Return the measurements of a transmitter at an unknown position."""
     known = measured.tx_known
     if not known.all():
         return measured.take(~known)

@@ -1,4 +1,4 @@
-"""Rosbags: where the robot was, and received powers as measurements."""
+"""Rosbags: poses of the robot, and received powers as measurements."""
 
 from __future__ import annotations
 
@@ -24,17 +24,15 @@ if TYPE_CHECKING:
     import xarray as xr
 
 TF = "TFMessage"
-"""Type of messages with the transforms between the frames of a robot."""
 
 POSES = ("PoseWithCovarianceStamped", "PoseStamped", "Odometry")
-"""Types of messages with a pose, in the order in which they are preferred."""
 
 ROBOT_FRAMES = ("base_link", "base_footprint")
-"""Usual names of the frame of a robot (REP 105)."""
+"""Usual names of a robot's frame (REP 105)."""
 
 
 class _Track(NamedTuple):
-    """Poses of one frame in another one: N times [s], x, y, z [m] (N, 3), N rotations."""
+    """Poses of one frame in another: N times [s], x, y, z [m] (N, 3), N rotations."""
 
     parent: str
     time_s: NDArray[np.float64]
@@ -42,7 +40,7 @@ class _Track(NamedTuple):
     rotation: Rotation
 
     def at(self, time_s: NDArray[np.float64]) -> _Track:
-        """Interpolate; beyond the ends the first and the last pose stay."""
+        """Interpolate; beyond the ends the pose stays."""
         position_m = np.column_stack([np.interp(time_s, self.time_s, axis) for axis in self.position_m.T])
         if len(self.time_s) == 1:
             return _Track(self.parent, time_s, position_m, self.rotation[np.zeros(len(time_s), int)])
@@ -51,29 +49,28 @@ class _Track(NamedTuple):
 
 
 def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, frame: str | None = None) -> xr.Dataset:
-    """Read where the robot was from a rosbag.
+    """Read the robot's poses from a rosbag.
 
     Parameters
     ----------
     path : path-like
-        The recording: .bag, .mcap, .db3, or a folder.
+        A .bag, .mcap, .db3, or folder.
     topic : str or None
-        A topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`. By default the transforms if they
-        lead from the map to the robot, else the first of these types that there is.
+        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`. Default: transforms from the map to the
+        robot, else the first topic of these types.
     frame : str or None
-        Of transforms, the frame whose pose is meant, such as that of an antenna; by default `base_link`, or
-        `base_footprint`.
+        Frame of the transforms, such as an antenna's; default `base_link`, or `base_footprint`.
 
     Returns
     -------
     xarray.Dataset
-        On `time`: `time_s` since the start of the recording, `position_m` (time, 3) in the frame of the map [m], and
-        `yaw_rad`. Odometry that no transform leads to the map gets a `MapWarning`: it drifts away from the map.
+        On `time`: `time_s` since the start, `position_m` (time, 3) in the map's frame [m], and `yaw_rad`. Odometry
+        without a transform to the map drifts, and causes a `MapWarning`.
 
     Raises
     ------
     MeasurementError
-        If it is no rosbag or damaged, or there are no such poses.
+        If the file is no rosbag or damaged, or has no such poses.
 
     Examples
     --------
@@ -98,39 +95,38 @@ def measurements_from_bag(
     frame: str | None = None,
     rx_height_m: float = DEFAULT_HEIGHT_M,
 ) -> xr.Dataset:
-    """Read received powers from a rosbag as the table of measurements that `calibrate_materials` takes.
+    """Read received powers from a rosbag as a table of measurements.
 
-    Receivers are where the robot was at the stamps of the powers, interpolated between its poses. Where powers have
-    no stamps, the times at which the messages were recorded count, for powers and poses. Powers before the first pose
-    or after the last one are left out, as are those that are not finite.
+    Receivers are at the robot's interpolated poses at the stamps of the powers. Without stamps, the recording times of
+    powers and poses are used. Powers outside the time of the poses and powers that are not finite are left out.
 
     Parameters
     ----------
     path : path-like
-        The recording: .bag, .mcap, .db3, or a folder.
+        A .bag, .mcap, .db3, or folder.
     topic : str
         Topic of the received powers [dBm].
     tx : (3,) array-like, optional
-        Transmitter position [m]; None, and NaN in the table, where it is not known.
+        Transmitter [m]; None (NaN in the table) if unknown.
     tx_power_dbm : float
         Received power without path loss: transmit power and antenna gains less cable losses [dBm].
     field : str
-        Field of the messages that holds the power; the default is that of `std_msgs/Float32` and `Float64`.
+        Field of the messages with the power, by default as in `std_msgs/Float32`.
     pose_topic, frame : str or None
         As `topic` and `frame` of `poses_from_bag`.
     rx_height_m : float
-        Height of the receiving antenna above the floor [m].
+        Height of the receiving antenna [m].
 
     Returns
     -------
     xarray.Dataset
-        On `link`: `tx_x`, `tx_y`, `tx_z`, `rx_x`, `rx_y`, `rx_z` [m], `gain_db`, and `time_s` since the start of the
-        recording. `.to_dataframe().to_csv("measured.csv")` writes the CSV.
+        On `link`: `tx_x`, `tx_y`, `tx_z`, `rx_x`, `rx_y`, `rx_z` [m], `gain_db`, and `time_s` since the start.
+        `.to_dataframe().to_csv("measured.csv")` writes a CSV.
 
     Raises
     ------
     MeasurementError
-        If it is no rosbag or damaged, there are no such powers or poses, or the gains are none.
+        If the file is no rosbag or damaged, has no such powers or poses, or the gains are invalid.
 
     Examples
     --------
@@ -180,7 +176,6 @@ def _pose_table(track: _Track) -> xr.Dataset:
 
 
 def _power(message: Message, field: str, topic: str) -> float:
-    """Return the number in a field of a message; NaN and infinity count."""
     names = [name for name in dir(message.content) if not name.startswith("_")]
     try:
         return float(reduce(getattr, field.split("."), message.content))  # type: ignore[arg-type]
@@ -191,7 +186,6 @@ def _power(message: Message, field: str, topic: str) -> float:
 
 
 def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, stamped: bool) -> _Track:
-    """Poses of the robot in the frame of the map."""
     kinds, target = recording.kinds, _map_frame(recording)
     links = _transforms(recording, stamped=stamped) if TF in kinds.values() else {}
     frames = [frame] if frame else [name for name in ROBOT_FRAMES if name in links]
@@ -216,7 +210,6 @@ def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, 
 
 
 def _map_frame(recording: Recording) -> str:
-    """Frame of the map of a recording; "map" (REP 105) if there is none."""
     grids = [topic for topic, kind in recording.kinds.items() if kind == GRID]
     first = next(recording.messages(*sorted(grids, key="/map".__ne__)[:1]), None)
     return _frame(first.content.header.frame_id if first else "") or "map"
@@ -239,7 +232,6 @@ def _pose_track(recording: Recording, topic: str, *, stamped: bool) -> _Track:
 
 
 def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
-    """Poses of each frame in its parent."""
     rows: dict[tuple[str, str], list[Any]] = {}
     topics = [topic for topic, kind in recording.kinds.items() if kind == TF]
     for message in recording.messages(*topics):
@@ -252,7 +244,7 @@ def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
 
 
 def _track(parent: str, rows: Iterable[Any]) -> _Track:
-    """Sort poses by time; each time once."""
+    """Sort poses by time, without repeated times."""
     table = np.array([(time, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for time, p, q in rows], dtype=np.float64)
     table = table[np.isfinite(table).all(axis=1)]
     table = table[np.unique(table[:, 0], return_index=True)[1]]
@@ -264,7 +256,6 @@ def _track(parent: str, rows: Iterable[Any]) -> _Track:
 
 
 def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
-    """Return the transforms from a frame up to another one; none if they do not lead there."""
     chain: list[_Track] = []
     while frame != target:
         if frame not in links or len(chain) > len(links):
@@ -275,7 +266,7 @@ def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]
 
 
 def _composed(chain: list[_Track]) -> _Track:
-    """Poses of the first frame of a chain in the last one, at the times of the transform that changes most often."""
+    """Return poses of the first frame of a chain in the last one, at the times of the most frequent transform."""
     time_s = max(chain, key=lambda each: len(each.time_s)).time_s
     position_m, turn = np.zeros((len(time_s), 3)), Rotation.identity(len(time_s))
     for each in (link.at(time_s) for link in chain):

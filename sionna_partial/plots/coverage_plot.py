@@ -47,7 +47,7 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
-_REPORT_LINE_IN, _REPORT_WIDTH, _WIDE_ASPECT = 0.14, 114, 1.7
+_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 130, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -401,7 +401,7 @@ def report_figure(
     text_in = _REPORT_LINE_IN * (text.count("\n") + 2)
     figure = Figure(figsize=_A4_IN, layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(_A4_IN[1] - text_in, text_in))
-    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm)
+    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm, _A4_IN[1] - text_in - 0.6)
     title = " \N{MIDDLE DOT} ".join(["Radio coverage", *heading])
     figure.suptitle(f"{title}\n{headline('Prediction', maps)}", fontsize="medium", parse_math=False)
     axis = parts[1].subplots()
@@ -410,9 +410,30 @@ def report_figure(
     return figure
 
 
+def _report_grid(most: int, aspect: float, height_in: float) -> tuple[int, int]:
+    """Return the number of panels, two or more, and the columns that give them most of the page.
+
+    Colour bars are beside the panels of one column, and else below each panel.
+    """
+
+    def area(grid: tuple[int, int]) -> float:
+        count, columns = grid
+        more_in = _BESIDE_IN if columns == 1 else _BELOW_IN
+        width_in = min(_A4_IN[0] / columns - more_in[0], aspect * (height_in / math.ceil(count / columns) - more_in[1]))
+        return count * max(width_in, 0.0) ** 2
+
+    return max(((count, columns) for count in range(2, most + 1) for columns in (1, 2, count)), key=area)
+
+
 def _draw_report(
-    pictures: Any, coverage: xr.Dataset, maps: Mapping[str, xr.Dataset], powers_dbm: Floats, threshold_dbm: float
+    pictures: Any,
+    coverage: xr.Dataset,
+    maps: Mapping[str, xr.Dataset],
+    powers_dbm: Floats,
+    threshold_dbm: float,
+    height_in: float,
 ) -> None:
+    """Draw received power, its probability, and as it fits the strongest transmitter and the uncertainty."""
     power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
     strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
     thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
@@ -427,12 +448,13 @@ def _draw_report(
     panels = [
         Layer("Mean received power", lambda _: _taken(power, strongest), level, "viridis", "dBm"),
         Layer(f"P(received power > {threshold_dbm:g} dBm)", lambda _: above, probability, "cividis", "probability"),
-        Layer("Standard deviation of the received power", lambda _: spread, Normalize(0.0, 30.0), "magma", "dB"),
         Layer("Strongest transmitter", lambda _: strongest.astype(float), *servers),
+        Layer("Standard deviation", lambda _: spread, Normalize(0.0, 30.0), "magma", "dB"),
     ]
-    is_wide = coverage.sizes["x"] > _WIDE_ASPECT * coverage.sizes["y"]
-    count = 2 if is_wide else 3 + (len(maps) > 1)
-    axes = pictures.subplots(2, 1 if is_wide else 2).ravel()
+    if len(maps) == 1:
+        del panels[2]
+    count, columns = _report_grid(len(panels), coverage.sizes["x"] / coverage.sizes["y"], height_in)
+    axes = pictures.subplots(math.ceil(count / columns), columns, squeeze=False).ravel()
     x_m, y_m = (coverage[name].to_numpy() for name in TX_COORDINATES[:2])
     for axis, layer in zip(axes[:count], panels, strict=False):
         _draw(axis, next(iter(maps.values())), layer)
@@ -441,7 +463,8 @@ def _draw_report(
         for place in zip(maps, zip(x_m, y_m, strict=True), strict=True):
             axis.annotate(*place, (7, 0), textcoords="offset points", va="center", zorder=5, **_NAME)
         axis.set_title(layer.title, fontsize="medium")
-        bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, location="bottom", label=layer.label)
+        where = {"location": "right" if columns == 1 else "bottom", "shrink": 0.9}
+        bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, label=layer.label, **where)
         if not layer.label:
             bar.set_ticks(range(len(maps)), labels=[name[:_ROW_NAME] for name in maps])
     for axis in axes[count:]:
@@ -473,7 +496,7 @@ def _report_table(
 def _report_notes(coverage: xr.Dataset) -> list[str]:
     attributes = coverage.attrs
     notes = [
-        f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. "
+        f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. Axes are in m. "
         f"{attributes['map_observed_fraction']:.0%} of the map is observed. Predictor: {attributes['predictor']}. "
         f"Lines enclose the area above the threshold with a probability of {_LIKELY:g}. Unobserved floor counts with "
         "the probability that it is indoors."

@@ -1,4 +1,4 @@
-"""Features of links: TracedLinks + PartialMap -> LinkFeatures, with the walls and space along them as LinkContext."""
+"""Features of links: TracedLinks + PartialMap -> LinkFeatures; walls and space along the paths are the LinkContext."""
 
 import itertools
 import math
@@ -37,60 +37,59 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
-"""Attenuation lengths of unobserved space [m]: a path that crosses u of it counts exp(-u / length)."""
+"""Attenuation lengths of unobserved space [m]: a path through u metres has the weight exp(-u / length)."""
 
 _PATHS_AT_ONCE = 100_000
-"""Number of paths that are measured together, which bounds the memory."""
 
 SEEN_M = 1e-3
-"""Unobserved length below which a path is wholly in observed space [m]."""
+"""Largest unobserved length of a path in observed space [m]."""
 
 _ASIDE_CELLS = 1.5
-"""Distance to both sides within which a line must meet a known wall to cross it: the uncertainty of a map [cells]."""
+"""Offset of the parallel lines that must also meet a known wall: the uncertainty of a map [cells]."""
 
 _OPAQUE_CELLS = 3.0
-"""Length of a line in known walls from which it has no LOS, unless it is traced on exact walls [cells]."""
+"""Length of a line in known walls that excludes LOS, unless it is traced on exact walls [cells]."""
 
 _BEYOND_CELLS = 2
-"""Width of what is labelled around a map, so that walls that reach its border do not part it [cells]."""
+"""Margin around a map, so that walls that reach its border do not separate the outside [cells]."""
 
 
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkContext(Shown):
-    """Context of N links: walls along their paths, link states that the map allows, and windows of the map.
+    """Context of N links: walls along their paths, possible link states, and windows of the map.
 
     Parameters
     ----------
     tx_m, rx_m : (N, 3) float64 arrays
-        Positions of transmitter and receiver [m].
+        Positions [m].
     tx_seen, rx_seen : (N,) bool arrays
-        True where they are in observed cells.
+        True in observed cells.
     complete : (N,) bool array
-        True if the map is complete, and one of the ends is in an observed cell: then the trace is the truth.
+        True if the map is complete and one end is in an observed cell: the trace is the truth.
     nearly_complete : (N,) bool array
-        True if the map is nearly complete, and both ends are in observed cells: then the trace is close to the truth.
+        True if the map is nearly complete and both ends are in observed cells: the trace is close to the truth.
     walled_m : (N,) float64 array
-        Length of the direct line in cells of known walls [m]: outlines of walls may leave them open.
+        Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
-        Degree to which range noise thickened and roughened the walls of the map, 0 (exact) to 1.
+        Range noise of the map's walls, 0 (exact) to 1.
     possible : (N, 3) bool array
-        True for each LinkState that the map leaves possible, at least one.
+        True for each possible LinkState, at least one.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
-        Gain of all traced paths but the direct one, each attenuated by the unobserved space that it crosses [dB], at
-        least -150: of all of them first, of those wholly in observed space last.
+        Gain of the indirect paths, attenuated by unobserved space [dB], at least -150; the first column has all paths,
+        the last only paths in observed space.
     strongest_unobserved_m : (N,) float64 array
-        Unobserved length of the strongest path but the direct one [m]; the distance where there is none.
+        Unobserved length of the strongest indirect path [m]; the distance if there is none.
     windows : (W, *WINDOWS) uint8 array, optional
-        Windows of the map around the transmitters, for map networks.
+        Map around the transmitters, for map networks.
     straight_gain_db : (N,) float64 array
-        Gain of the direct path, through whatever known walls it crosses [dB], at least -150.
+        Gain of the direct path through known walls [dB], at least -150.
     straight_walls : (N,) float64 array
-        Number of known walls that it crosses; 0 where there is no direct path.
+        Number of known walls that it crosses; 0 without a direct path.
     wall_loss_db : (N,) float64 array
-        Mean loss of going through a known wall of the map [dB]: see `mean_wall_loss_db`.
+        From `mean_wall_loss_db` [dB].
     window_index : (N,) int array
-        The transmitter, and window, of each link.
+        Transmitter and window of each link.
     """
 
     tx_m: Floats
@@ -111,7 +110,6 @@ class LinkContext(Shown):
     windows: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
-        """Return the number of links N."""
         return len(self.tx_m)
 
     @classmethod
@@ -128,8 +126,7 @@ class LinkContext(Shown):
     ) -> "LinkContext":
         """Compute the context of links on their maps, without windows.
 
-        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`: those
-        from `tx_m` on which are not found here.
+        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
         """
         count = len(map_index)
         tx_seen, rx_seen, complete, nearly = (np.zeros(count, dtype=bool) for _ in range(4))
@@ -149,17 +146,17 @@ class LinkContext(Shown):
         return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkContext":
-        """Return the context with the windows of the maps that `on_maps` was given."""
+        """Return the context with windows of the maps given to `on_maps`."""
         keys, window_index = transmitters(map_index, self.tx_m)
         return replace(self, windows=draw_windows(maps, keys), window_index=window_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
-        """Return the links that an index array, a mask (N,) or a slice selects; the windows are shared."""
+        """Select links by an index array, a mask (N,) or a slice; the windows are shared."""
         return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, windows=self.windows)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkContext"]) -> "LinkContext":
-        """Return the links of all `parts`, one part after the other; without windows unless all parts have them."""
+        """Join links; there are windows only if all parts have them."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
         first: dict[int, int] = {}
         index, windows, count = [], [], 0
@@ -181,10 +178,7 @@ _COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "w
 
 
 class IndirectPaths:
-    """Sums over the indirect paths from T transmitters to N receivers (T, 3) and (N, 3) [m], while they are traced.
-
-    `wall_loss_db` is from `mean_wall_loss_db`.
-    """
+    """Running sums over the indirect paths from T transmitters to N receivers."""
 
     def __init__(self, partial: PartialMap, tx_m: Floats, rx_m: Floats, wall_loss_db: float) -> None:
         self.partial, self.tx_m, self.rx_m, self.wall_loss_db = partial, tx_m, rx_m, wall_loss_db
@@ -194,7 +188,7 @@ class IndirectPaths:
         self._strongest_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
 
     def add(self, paths: TracedLinks | SolvedPaths) -> None:
-        """Add paths, in world coordinates."""
+        """Add paths in world coordinates."""
         for start in range(0, len(paths.a), _PATHS_AT_ONCE):
             block = slice(start, start + _PATHS_AT_ONCE)
             indirect = start + np.flatnonzero(np.any(paths.interactions[block] > 0, axis=1))
@@ -218,7 +212,7 @@ class IndirectPaths:
         self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
 
     def context(self, link_state: States, unobserved_distance_m: Floats) -> LinkContext:
-        """Return the context of all T N links, transmitter by transmitter, without windows."""
+        """Return the context of all T N links without windows."""
         tx_m, rx_m = np.repeat(self.tx_m, len(self.rx_m), axis=0), np.tile(self.rx_m, (len(self.tx_m), 1))
         return LinkContext.on_maps(
             (self.partial,),
@@ -236,10 +230,7 @@ class IndirectPaths:
 
 
 def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> float:
-    """Return the mean loss of the known wall cells of a map [dB]; the settings have the default material.
-
-    It is `MOST_LOSS_DB` where no path goes through walls.
-    """
+    """Return the mean loss of the known wall cells [dB]; `MOST_LOSS_DB` if no path is traced through walls."""
     if not trace_settings.through_walls:
         return MOST_LOSS_DB
     materials = scene_settings.traced_material, *partial.wall_materials
@@ -253,9 +244,9 @@ def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_
 def path_unobserved_m(
     partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
 ) -> Floats:
-    """Return the length (P,) [m] of paths in unknown cells; 0 for links that a complete map encloses.
+    """Return the length (P,) of paths in unknown cells [m]; 0 for links that a complete map encloses.
 
-    They lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
+    Paths lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
     """
     total_m = np.zeros(len(start_m))
     rows = np.flatnonzero(~is_enclosed(partial, start_m, end_m))
@@ -270,31 +261,30 @@ def path_unobserved_m(
 
 
 def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
-    """Return the same length (P,) [m] of some paths of traced links, by their numbers (P,)."""
+    """Return `path_unobserved_m` of selected paths (P,) of traced links."""
     tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
     return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)
 
 
 def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
-    """Return the fraction (P,) of the power of paths that unobserved space of an attenuation length [m] lets pass."""
+    """Return the fraction (P,) of power that passes unobserved space of an attenuation length [m]."""
     return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
 
 
 def _possible_states(
     partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, seen: Bools, walled_m: Floats
 ) -> Bools:
-    """Return which link states a map leaves possible (N, 3), whatever the networks predict.
+    """Return the possible link states (N, 3) on a map.
 
-    - A direct line that crosses a known wall has no LOS. It crosses one where the lines a cell and a half to its left
-      and right both run into known walls, and it does itself (`walled_m`), or is blocked in the trace: past the corner
-      or along the face of a wall, one of the three stays clear. Posts are narrower, and outlines of noisy walls leak:
-      a line that is in known walls for three cells crosses one, too, but for LOS traced along exact walls.
-    - On a direct line that is wholly observed (`seen`) and meets no wall, LOS is as traced.
-    - Regions are the parts of a map that known walls separate, gaps of two cells or less being closed. Where the ends
-      are in different regions, or in one that is wholly observed, an outage of the trace is an outage, and in one that
-      is wholly observed there is no other.
+    - A direct line across a known wall has no LOS. It crosses one if the parallel lines 1.5 cells to its left and right
+      both meet known walls, and it does so itself (`walled_m`) or is blocked in the trace; at a corner or along a face,
+      one of the three stays clear. Posts are narrower, and outlines of noisy walls leak: three cells in known walls
+      also exclude LOS, unless it is traced along exact walls.
+    - A wholly observed direct line (`seen`) without walls has LOS as traced.
+    - Regions are separated by known walls, with gaps of two cells or less closed. If the ends are in different regions,
+      or in a wholly observed one, a traced outage is certain; a wholly observed region has no other outage.
 
-    The cells of a mesh do not show at which height its surfaces are: there the second rule alone holds.
+    Mesh cells do not give the heights of surfaces: only the second rule applies.
     """
     los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
     possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
@@ -317,7 +307,7 @@ def _possible_states(
 
 
 def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
-    """Return whether the lines `_ASIDE_CELLS` to the left and right of direct lines (N,) both run into known walls."""
+    """Return whether the lines `_ASIDE_CELLS` to either side of direct lines (N,) both meet known walls."""
     crosses = np.zeros((2, len(rx_m)), dtype=bool)
     for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
         starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
@@ -330,7 +320,7 @@ def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
 
 
 def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
-    """Return whether the ends of links (N,) are in different regions, and whether both are in a wholly observed one."""
+    """Return whether the ends (N,) are in different regions, and whether both are in a wholly observed one."""
     state = np.pad(partial.wall_levels[0][1].state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
     regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
     observed = np.ones(count + 1, dtype=bool)
@@ -341,9 +331,9 @@ def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bo
 
 
 def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
-    """Return the region (N,) of points (N, 3) [m], which may be in it or beside it; 0 where there is none, or two.
+    """Return the region (N,) at or beside points (N, 3) [m]; 0 if there is none or more than one.
 
-    `regions` are those of the map's cells and of the `_BEYOND_CELLS` around it; 0 within a cell of a wall.
+    `regions` include the margin `_BEYOND_CELLS`, and are 0 within a cell of a wall.
     """
     row, column = (index + _BEYOND_CELLS for index in partial.cell_index(points_m))
     around = [
@@ -358,30 +348,29 @@ def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkFeatures(Shown):
-    """Features of N links, or T N: the features of the paper (eq. 8), and further inputs of the other predictors.
+    """Features of N or T N links: the features of the paper (eq. 8), and further inputs of the other predictors.
 
     Parameters
     ----------
     link_state : (N,) or (T, N) uint8 array of LinkState
         Link state traced on the partial map.
     unobserved_distance_m : (N,) or (T, N) float64 array
-        Length of the segment from transmitter to receiver inside unknown cells [m].
+        Length of the direct segment in unknown cells [m].
     distance_m : (N,) or (T, N) float64 array
         Distance from transmitter to receiver [m].
     gain_db : (N,) or (T, N) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
     context : LinkContext, optional
-        Walls and space along and around the links, from `link_features`; one link after the other. The paper's
-        predictor does not use it.
+        Walls and space around the links, from `link_features`, in flat order; unused by the paper's predictor.
     frequency_hz : float, optional
-        Carrier frequency of the trace [Hz], from `link_features`. None is the frequency of the predictor.
+        Carrier frequency of the trace [Hz]. None is the frequency of the predictor.
     path_power : (N, C + 1, R + 1) float64 array, optional
-        Power of the paths of each link by crossed walls and by reflections, of those walls whose material is unknown.
+        Power by crossings of and reflections at walls of unknown material.
 
     Raises
     ------
     PredictorError
-        For arrays of other shapes, or with values that no link has.
+        For wrong shapes, or values that no link has.
 
     Examples
     --------
@@ -418,7 +407,6 @@ class LinkFeatures(Shown):
             raise PredictorError(f"context has {len(self.context)} links: give one of the same {count} links.")
 
     def __len__(self) -> int:
-        """Return the number of links, N or T N."""
         return self.distance_m.size
 
     @property
@@ -427,18 +415,18 @@ class LinkFeatures(Shown):
         return self.distance_m.shape
 
     def flat(self) -> "LinkFeatures":
-        """Return the links one after the other, transmitter by transmitter."""
+        """Return the links as (T N,), transmitter by transmitter."""
         return self if self.distance_m.ndim == 1 else self.take(slice(None))
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
-        """Return the links that an index array, a mask or a slice selects, one after the other."""
+        """Select links by an index array, a mask or a slice of the flat order."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
         path_power = None if self.path_power is None else self.path_power[index]
         return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz, path_power=path_power)
 
     def with_extra_losses(self, crossing_db: float, reflection_db: float, fraction: float = 1.0) -> "LinkFeatures":
-        """Return the features where walls lose more than in the trace: at each crossing and reflection [dB].
+        """Return the features with additional losses per crossing and reflection [dB].
 
         `fraction` of the walls of the map have an unknown material.
         """
@@ -458,12 +446,12 @@ class LinkFeatures(Shown):
         return replace(self, gain_db=gain_db, link_state=states, context=context)
 
     def free_space_shift_db(self, frequency_hz: float) -> float:
-        """Return the free-space gain at another frequency less the gain at the frequency of the links [dB]."""
+        """Return the free-space gain at `frequency_hz` less that at the frequency of the links [dB]."""
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkFeatures"]) -> "LinkFeatures":
-        """Return the links of all `parts`, one after the other."""
+        """Join links, one part after the other."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
         frequencies_hz = {part.frequency_hz for part in parts}
@@ -478,7 +466,7 @@ class LinkFeatures(Shown):
         return cls(**columns, context=context, frequency_hz=frequencies_hz.pop(), path_power=path_power)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
-        """Return the features with what map networks read of the maps; `map_index` (N,) is the map of each link."""
+        """Return the features with windows of the maps; `map_index` (N,) is the map of each link."""
         if self.context is None or self.context.windows is not None:
             return self
         return replace(self, context=self.context.with_windows(maps, map_index))
@@ -489,23 +477,23 @@ _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
-    """Return the context that features must have here."""
+    """Return the context, which must exist."""
     assert phi.context is not None
     return phi.context
 
 
 def excess_noise(wall_noise: Floats) -> Floats:
-    """Return the weight, 0 to 1, of the errors of maps with full noise: a little noise causes most of them."""
+    """Return the weight, 0 to 1, of the errors at full noise: a little noise causes most of them."""
     return np.sqrt(np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE))
 
 
 def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
-    """Shift gains by some dB, except the gains of outages. `ops` is NumPy, or keras.ops for tensors."""
+    """Shift gains by some dB, except the gains of outages."""
     return ops.where(gain_db > GAIN_FLOOR_DB, gain_db + shift_db, gain_db)
 
 
 def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return finite numbers of links as an array of a shape; a PredictorError for any other values or shape."""
+    """Return finite numbers as an array of the given shape, or raise a PredictorError."""
     count = " x ".join(map(str, shape))
     try:
         numbers = np.asarray(values, dtype=np.float64)
@@ -518,7 +506,7 @@ def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
 
 
 def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> States:
-    """Return link states as a uint8 array of a shape; a PredictorError for another shape or another value."""
+    """Return link states as a uint8 array of the given shape, or raise a PredictorError."""
     states = link_numbers(name, values, shape)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
     require_each(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
@@ -533,14 +521,14 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     partial : PartialMap
         The map on which the links were traced.
     links : TracedLinks
-        From one or T transmitters to N receivers.
+        Links on this map.
     windows : bool
-        Draw the map around the transmitters, which only the predictor "map" needs (20 ms each).
+        Draw the map around the transmitters for the predictor "map" (20 ms each).
 
     Returns
     -------
     LinkFeatures
-        Features of shape (N,) or (T, N), as `links`.
+        In the shape of `links`.
 
     Raises
     ------
@@ -586,12 +574,10 @@ def features_of_paths(
     *,
     material_unknown: bool = False,
 ) -> LinkFeatures:
-    """Extract the features of links from (3,) to (N, 3) [m] while their paths are traced, without keeping any path.
+    """Extract the features of links from (3,) to (N, 3) [m] during the trace, without keeping paths.
 
-    `blocks` are all paths between them, from `Simulation.blocks`, `settings` those of the trace, and `windows` those of
-    `map_windows` around the transmitter. Without windows there is no context, which the paper's predictor does not
-    need. Where the material of walls is unknown, the features have the power of the paths by their interactions with
-    these walls.
+    `blocks` are from `Simulation.blocks`, `windows` from `map_windows`; without windows there is no context. With
+    `material_unknown`, the features have the power of paths by their interactions with walls of unknown material.
     """
     limits = (settings[0].max_walls, settings[0].max_depth) if material_unknown else ()
     sums = LinkSums(1, len(rx_m), *limits)
@@ -610,7 +596,6 @@ def features_of_paths(
 def _features(
     paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float, *, context: bool = True
 ) -> LinkFeatures:
-    """Return the features of all links of `paths`, whose states and gains (N,) are given, without windows."""
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
     found = paths.context(link_state, unobserved_m) if context else None
@@ -618,7 +603,7 @@ def _features(
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
-    """Raise a PredictorError that names the first value that is not good."""
+    """Raise a PredictorError for the first bad value."""
     if not good.all():
         index = np.unravel_index(int(np.argmin(good)), np.shape(values))
         where = ", ".join(map(str, index))

@@ -1,11 +1,9 @@
-"""The networks that read maps and paths, as Keras 3 models: their inputs, two map networks, a link network, training.
+"""The networks that read maps and paths, as Keras 3 models: inputs, two map networks, a link network, training.
 
-The map networks read the windows around the transmitter, near and far, and write `MAP_FEATURES` numbers into each of
-their cells: U-Nets (Ronneberger, Fischer and Brox 2015), a smaller one for the far window. What they make of an empty
-window is subtracted, so that a map contributes nothing where nothing was observed, and the numbers fade to 0 towards
-the border of each window: nothing changes where one ends. The link network reads what the trace gives of a link, and
-the numbers of all windows at its receiver. It returns P(link state), and mean and log-variance of the gain in line of
-sight and without.
+The map networks are U-Nets (Ronneberger, Fischer and Brox 2015) that read the near and the far window around the
+transmitter and return `MAP_FEATURES` numbers per cell, less their output for an empty window: unobserved space adds
+nothing. The numbers fade to 0 at the border of each window. The link network reads the features of a link and these
+numbers at its receiver. It returns P(link state), and mean and log-variance of the gain given LOS and given NLOS.
 """
 
 import functools
@@ -42,33 +40,32 @@ Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
 Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
-"""Names of the networks; map networks are in the order of `CELLS_M`."""
+"""Names of the networks; map networks in the order of `CELLS_M`."""
 
 MAP_FEATURES = 16
-"""Number of values of a cell that the link network reads."""
 
 LINK_OUTPUTS = 7
-"""Logits of the link states, then mean and spread of the gain given LOS, and given NLOS."""
+"""Logits of the link states, then mean and spread of the gain given LOS and given NLOS."""
 
 WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
-"""Number of windows in a gradient step, and of links that are drawn for each of them."""
+"""Windows per gradient step, and links drawn per window."""
 
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
-"""Of AdamW; the rate falls to 0 along a cosine."""
+"""Parameters of AdamW; the rate falls to 0 along a cosine."""
 
 GAIN_WEIGHT = 0.05
-"""Weight of the score of the gain against the log-likelihood of the link state [1/dB]."""
+"""Weight of the gain's score against the log-likelihood of the link state [1/dB]."""
 
 WIDENING, SEEN_WIDENING = 0.15, 0.5
-"""By how much standard deviations are larger on maps of full noise, and where both ends are observed.
+"""Relative increase of standard deviations on maps of full noise, and for links with both ends observed.
 
-So that 90 % intervals on procedural homes, explored with range noise, drift and missed walls, hold 90 % of the gains.
+Chosen for 90 % coverage of the 90 % intervals on procedural homes explored with range noise, drift and missed walls.
 """
 
 _WIDTHS = ((16, 32, 48, 64), (8, 16, 24, 32))
 _HIDDEN_UNITS = 64
 _LOS_MOST_DB = 10.0
-"""Largest mean gain given LOS, over free space [dB]: other paths add power to the direct one, and never so much."""
+"""Largest mean gain given LOS over free space [dB]: other paths add at most this power."""
 
 _LOS_OFFSET = -1.5
 _NLOS_DB, _NLOS_SCALE_DB = -25.0, 20.0
@@ -93,12 +90,14 @@ FEATURES: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in ("strongest_unobserved_m", "straight_gain_db", "straight_walls", "wall_loss_db")},
     **dict.fromkeys(("tx_seen", "rx_seen", "possible", "walled_m"), ()),
 }
-"""Features of links, by their names in `LinkFeatures` or `LinkContext`, that networks, the mean loss of walls and
-multi-wall models read, and their columns in the order that data sets have them. Those without columns follow from the
-map and the positions."""
+"""Features of links by their names in `LinkFeatures` or `LinkContext`, and their columns in data sets.
+
+Features without columns follow from the map and the positions. Besides the networks, the mean wall losses and
+multi-wall models read them.
+"""
 
 Values = Mapping[str, Any]
-"""Features by name; `free_db`, the gain of free space, and `near_m`, the distance but at least 10 cm."""
+"""Features by name, with `free_db`, the free-space gain, and `near_m`, the distance but at least 10 cm."""
 
 Make = Callable[[Values, ModuleType], Any]
 
@@ -146,7 +145,7 @@ LINK_INPUTS: dict[str, Make] = {
     "gain_above_free": _excess(lambda of: of["gain_db"]),
     **{f"{name}_above_free": _excess(gain_db) for name, gain_db in _INDIRECT.items()},
 }
-"""The inputs of the link network in their order, without units: how each is made of features."""
+"""Inputs of the link network in order, dimensionless, as functions of the features."""
 
 _SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
 _LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
@@ -159,19 +158,19 @@ CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
         **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
     },
 )
-"""Inputs and outputs of the networks that a predictor may have in addition to the paper's: none, "paths", or "map"."""
+"""Inputs and outputs of the networks besides the paper's, for "paper", "paths" and "map"."""
 
 
 def feature_values(phi: LinkFeatures) -> dict[str, Any]:
-    """Return all features of links, which have a context, by name."""
+    """Return all features of links with a context, by name."""
     return {name: getattr(phi if hasattr(phi, name) else phi.context, name) for name in FEATURES}
 
 
 def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleType = np) -> Any:
-    """Return the inputs (N, len(LINK_INPUTS)) of the link network of a frequency.
+    """Return the inputs (N, len(LINK_INPUTS)) of the link network.
 
-    `values` are from `feature_values`, or tensors in their place; `ops` is NumPy, or keras.ops for tensors. Free space
-    is stronger by `shift_db` at that frequency than at the frequency of the links.
+    `values` are from `feature_values`, or tensors; `ops` is NumPy, or keras.ops for tensors. `shift_db` is the
+    free-space gain at `frequency_hz` less that at the links' frequency.
     """
     gains_db = {name: shifted_gain_db(values[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
     free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops)
@@ -181,32 +180,32 @@ def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleT
 
 
 def columns_of(phi: LinkFeatures) -> dict[str, Floats]:
-    """Return the columns (N,) that data sets have of links, which have a context."""
+    """Return the columns (N,) in data sets of links with a context."""
     values = feature_values(phi)
     stored = ((columns, np.atleast_2d(values[name].T)) for name, columns in FEATURES.items() if columns)
     return {name: column for columns, rows in stored for name, column in zip(columns, rows, strict=True)}
 
 
 def features_of_columns(columns: Mapping[str, Floats]) -> dict[str, Any]:
-    """Return the features by name that such columns hold."""
+    """Return the features by name from their columns."""
     stored = {name: [columns[column] for column in own] for name, own in FEATURES.items() if own}
     return {name: np.column_stack(values) if len(values) > 1 else values[0] for name, values in stored.items()}
 
 
 def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
-    """Return the inputs of the link network of a frequency for the features of N links, which have a context."""
+    """Return the inputs of the link network for links with a context."""
     inputs: Floats = link_inputs(feature_values(phi), frequency_hz, phi.free_space_shift_db(frequency_hz))
     return inputs.astype(np.float32)
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
-    """Return x and y (N, 2) [m] of receivers relative to their transmitters."""
+    """Return the horizontal offsets (N, 2) of receivers from their transmitters [m]."""
     context = context_of(phi)
     return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
-    """Build the networks, untrained, by name; the link network alone without map networks."""
+    """Build the untrained networks by name."""
     keras, start = import_keras(), kernel_starts(seed)
     networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
@@ -215,7 +214,7 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
 
 
 def kernel_starts(seed: int) -> Callable[[], Any]:
-    """Return a function that returns the initial values of one kernel after the other, drawn by `seed`."""
+    """Return a function that yields the initial values of successive kernels."""
     keras, seeds = import_keras(), itertools.count(1000 * seed + 1)
     return lambda: keras.initializers.GlorotUniform(seed=next(seeds))
 
@@ -229,7 +228,7 @@ def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[
 
 
 def u_net(keras: Any, start: Callable[[], Any], image: Any, widths: tuple[int, ...]) -> Any:
-    """Return what a U-Net makes of images (B, H, W, C): widths[0] numbers for each of their cells.
+    """Return the output (B, H, W, widths[0]) of a U-Net for images (B, H, W, C).
 
     H and W are multiples of 2 ** (len(widths) - 1); `start` returns the initial values of a kernel.
     """
@@ -263,7 +262,7 @@ def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.M
 
 
 def kind_of(networks: Networks) -> NetworkKind:
-    """Return which networks there are."""
+    """Return the kind of the networks."""
     return "map" if reads_maps(networks) else "paths" if LINK_NETWORK in networks else "paper"
 
 
@@ -273,10 +272,10 @@ def reads_maps(networks: Networks) -> bool:
 
 
 def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> list[Any]:
-    """Return what the map networks write into the cells of windows (B, *WINDOWS) in [0, 255], beyond an empty window's.
+    """Return the outputs of the map networks for windows (B, *WINDOWS) in [0, 255], less those for an empty window.
 
-    There is a tensor (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) for each network, none without map networks. In
-    training, values are normalised by the statistics of these windows rather than by those kept.
+    One tensor (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) per map network. In training, values are normalised by the
+    statistics of this batch.
     """
     if not reads_maps(networks):
         return []
@@ -286,7 +285,7 @@ def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> li
 
 
 class MapReader:
-    """Reads the windows of transmitters by map networks, and keeps what it has read last."""
+    """Reads windows by map networks, and keeps the latest results."""
 
     def __init__(self, networks: Networks) -> None:
         self._kept: dict[bytes, list[list[Any]]] = {}
@@ -295,11 +294,11 @@ class MapReader:
         self._compiled = tf.function(self._read, input_signature=signature, autograph=False)
 
     def __call__(self, windows: NDArray[np.uint8]) -> list[list[Any]]:
-        """Return what `read_maps` does of each window (W, *WINDOWS); the bytes depend on how many are read together."""
+        """Return `read_maps` of each window (W, *WINDOWS); the bytes depend on the windows read together."""
         key, kept = windows.tobytes(), self._kept
         if key not in kept:
             maps = self._read(windows.astype(np.float32))
-            self._read = self._compiled  # from the second time on: compiling takes longer than reading once
+            self._read = self._compiled  # from the second call on: compiling takes longer than one call
             each_window = [[each[at : at + 1] for each in maps] for at in range(len(windows))]
             self._kept = kept = dict([*kept.items()][1 - _MAPS_KEPT :]) | {key: each_window}
         return kept[key]
@@ -308,7 +307,8 @@ class MapReader:
 def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
     """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters.
 
-    `maps` are from `read_maps`, `links` are (B, R, len(LINK_INPUTS)), `offsets_m` (B, R, 2) of `receiver_offsets_m`.
+    `maps` are from `read_maps`, `links` (B, R, len(LINK_INPUTS)) from `link_inputs`, `offsets_m` (B, R, 2) from
+    `receiver_offsets_m`.
     """
     at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
     links = tf.concat([links, *at_receivers], axis=-1)
@@ -317,10 +317,7 @@ def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: A
 
 
 def _interpolated(maps: Any, offsets: Any) -> Any:
-    """Values (B, R, C) of maps (B, S, S, C) at offsets (B, R, 2) from their centres [cells].
-
-    They are bilinear between the centres of cells, and fade to 0 towards the border.
-    """
+    """Interpolate maps (B, S, S, C) at offsets (B, R, 2) from their centres [cells], fading to 0 at the border."""
     half = WINDOW_CELLS / 2
     inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
     centres = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
@@ -329,10 +326,9 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
 
 
 def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
-    """Return log-probabilities (..., 3) of the link states, and means [dB] and log-variances (..., 2) given LOS, NLOS.
+    """Return log-probabilities (..., 3), and means [dB] and log-variances (..., 2) given LOS and NLOS.
 
-    `outputs` (..., LINK_OUTPUTS) are those of the link network, `free_db` (...) is the gain of free space [dB]. The
-    mean given LOS is the free-space gain or up to `_LOS_MOST_DB` more.
+    `outputs` (..., LINK_OUTPUTS) are from the link network, `free_db` (...) is the free-space gain [dB].
     """
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
@@ -344,8 +340,8 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
 def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). States that are not possible have probability 0. On maps with
-    range noise, which the networks do not notice, standard deviations are larger.
+    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). Standard deviations grow with the range noise of the map, which
+    the networks do not notice.
     """
     widening = 1.0 + excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
@@ -362,9 +358,9 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
 def evaluate_context_networks(
     networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate the networks of a frequency on the features of N links, which have a context: see `distribution`.
+    """Return the `distribution` of N links with a context.
 
-    `read` is the reader of these networks, where one is kept.
+    `read` is the cached reader of these networks.
     """
     inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
@@ -378,7 +374,7 @@ def evaluate_context_networks(
 
 
 def _by_window(networks: Networks, context: LinkContext, read: MapReader | None) -> Iterator[tuple[list[Any], Indices]]:
-    """Yield what the map networks read around each transmitter, and its links; without them nothing, and all links."""
+    """Yield the map networks' outputs around each transmitter, and its links; without map networks, all links once."""
     if not reads_maps(networks):
         yield [], np.arange(len(context))
         return
@@ -391,7 +387,6 @@ def _by_window(networks: Networks, context: LinkContext, read: MapReader | None)
 
 
 def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:
-    """Return which windows (U,) links have, and the links of each of them."""
     used, counts = np.unique(context.window_index, return_counts=True)
     return used, np.split(np.argsort(context.window_index, kind="stable"), np.cumsum(counts)[:-1])
 
@@ -406,7 +401,7 @@ def fit_context_networks(
 ) -> dict[str, "keras.Model"]:
     """Fit the networks of `settings` to links with a context, and their true states and gains [dB] (N,).
 
-    Windows are turned and mirrored at random. The same links and settings give the same weights.
+    Windows are turned and mirrored at random. Equal links and settings give equal weights.
     """
     networks = context_networks(settings.seed, with_map=settings.networks == "map")
     examples = _Examples(phi, link_state, gain_db, settings)
@@ -425,7 +420,7 @@ def fit_context_networks(
 
 
 class _Examples:
-    """Training links by window; their columns have the names of the arguments of a gradient step."""
+    """Training links by window; columns have the names of the arguments of a gradient step."""
 
     def __init__(self, phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> None:
         self._used, links = _links_by_window(context_of(phi))
@@ -442,11 +437,9 @@ class _Examples:
         self._columns = {name: column[order] for name, column in columns.items()}
 
     def __len__(self) -> int:
-        """Return the number of windows W."""
         return len(self._used)
 
     def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
-        """Yield the arguments of so many gradient steps."""
         order = np.zeros(0, dtype=np.intp)
         for _ in range(steps):
             while len(order) < WINDOWS_AT_ONCE:
@@ -465,14 +458,14 @@ class _Examples:
 
 
 def turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
-    """One of the eight orientations of squares (K, S, S, C)."""
+    """Return one of the eight orientations of squares (K, S, S, C)."""
     image = image[:, :, ::-1] if turn & 1 else image
     image = image[:, ::-1] if turn & 2 else image
     return image.transpose(0, 2, 1, 3) if turn & 4 else image
 
 
 def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
-    """Offsets (R, 2) from the centre of a window that is turned so [m]."""
+    """Return offsets (R, 2) from the centre of a window turned by `turned` [m]."""
     x, y = offsets_m.T
     x = -x if turn & 1 else x
     y = -y if turn & 2 else y
@@ -480,7 +473,6 @@ def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.floa
 
 
 def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
-    """Return a function that takes one of so many gradient steps and returns the loss."""
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer = adam_w(weights, steps)
 
@@ -501,19 +493,19 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
 
 
 def adam_w(weights: Sequence[Any], steps: int) -> Any:
-    """Return the optimizer of so many gradient steps."""
+    """Return the optimizer for a number of gradient steps."""
     keras = import_keras()
     rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
     optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
-    optimizer.build(weights)  # or TensorFlow traces the step again, after the first has made variables
+    optimizer.build(weights)  # otherwise TensorFlow traces the step twice
     return optimizer
 
 
 def _crps(errors_db: Any, stds_db: Any) -> Any:
     """Continuous ranked probability score of Gaussians [dB] (Gneiting and Raftery 2007, Eq. 21).
 
-    Gains have longer tails than Gaussians. The likelihood widens them until the tails are covered, which makes the
-    90 % interval too wide for most links; this score does not.
+    Gains have longer tails than Gaussians. Unlike the likelihood, this score does not widen the 90 % interval to cover
+    them.
     """
     z = errors_db / stds_db
     density = tf.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)

@@ -1,10 +1,9 @@
-"""The networks of the paper's predictor, as Keras 3 models: architecture, evaluation, and training by likelihood.
+"""The networks of the paper's predictor, as Keras 3 models: architecture, evaluation, training by likelihood.
 
-All of them are side by side in one functional model. Its inputs are the features of `GAIN_INPUTS` in their own units,
-each (N, 1); its outputs, by name, are P(link state) given each partial link state (N, 3), mean and log-variance of the
-gain for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are
-scaled and clamped to the range of the training links inside the networks, so that nothing is extrapolated but an anchor
-of physics: the gain of the partial trace, or the free-space gain.
+One functional model has all of them side by side. Its inputs are the features of `GAIN_INPUTS` in their own units, each
+(N, 1). Its outputs by name are P(link state) given each partial link state (N, 3), mean and log-variance of the gain
+for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are scaled and
+clamped to the range of the training links; only the anchor, the traced or the free-space gain, is extrapolated.
 """
 
 import itertools
@@ -33,15 +32,14 @@ if TYPE_CHECKING:
     import keras
 
 NEAREST_M = 0.01
-"""Distance below which the gain of free space rises no more [m]."""
+"""Distance below which the free-space gain is constant [m]."""
 
 STATE_INPUTS = ("distance_m", "unobserved_distance_m")
 GAIN_INPUTS = (*STATE_INPUTS, "gain_db")
 INDOOR_INPUTS = ("unobserved_distance_m",)
-"""Unscaled inputs of the paper's networks; the link state of the partial trace selects the network."""
+"""Unscaled inputs of the paper's networks; the traced link state selects the network."""
 
 STD_RANGE_DB = (0.3, 40.0)
-"""Range of the standard deviation that a gain network can give [dB]."""
 
 _LINKS_AT_ONCE = 65_536
 _LARGEST = 1e30
@@ -56,21 +54,20 @@ Ranges = Mapping[str, tuple[float, float]]
 
 
 def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
-    """Return Friis' path gain between isotropic antennas [dB]; with keras.ops for `ops`, of tensors."""
+    """Return Friis' path gain between isotropic antennas [dB]; `ops` is NumPy, or keras.ops for tensors."""
     return gain_at_1m_db(frequency_hz) - 20.0 * ops.log10(ops.maximum(distance_m, NEAREST_M))
 
 
 def gain_at_1m_db(frequency_hz: float) -> float:
-    """Return the same at 1 m [dB]."""
+    """Return the free-space gain at 1 m [dB]."""
     return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 
 @dataclass(frozen=True)
 class GainNetwork:
-    """One row of the paper's table: a network for the gain given a link state and partial link states.
+    """Network for the gain given a link state and partial link states: one row of the paper's table.
 
-    Without links to learn from, gain minus anchor has the mean `prior_offset_db` and the standard deviation
-    `prior_std_db`.
+    Without training links, gain minus anchor has the mean `prior_offset_db` and the standard deviation `prior_std_db`.
     """
 
     name: str
@@ -83,11 +80,11 @@ class GainNetwork:
 
     @property
     def anchored_to_trace(self) -> bool:
-        """Return whether the mean is an offset from the gain of the partial trace; else from the gain of free space."""
+        """Return whether the mean is an offset from the traced gain, not from the free-space gain."""
         return self.partial_states == (LinkState.LOS,) and "gain_db" in self.inputs
 
     def anchor_db(self, phi: LinkFeatures, frequency_hz: float) -> Floats:
-        """Return the gain (N,) from which the network gives the offset [dB]."""
+        """Return the gain (N,) to which the network adds the offset [dB]."""
         return phi.gain_db if self.anchored_to_trace else free_space_gain_db(phi.distance_m, frequency_hz)
 
 
@@ -99,27 +96,26 @@ GAIN_NETWORKS = (
     GainNetwork("gain_nlos_given_nlos_outage", LinkState.NLOS, _NOT_LOS, GAIN_INPUTS, 20, -20.0, 15.0),
     GainNetwork("gain_nlos_given_los", LinkState.NLOS, (LinkState.LOS,), ("distance_m",), 10, -20.0, 15.0),
 )
-"""The gain networks of the paper (tab:path_loss_network). An outage has the gain -150 dB and needs none."""
+"""Gain networks of the paper (tab:path_loss_network). An outage has the gain -150 dB and needs none."""
 
 STATE_NETWORKS = {state: f"state_given_{state.name.lower()}" for state in LinkState}
-"""One multinomial logistic classifier of the link state for each partial link state (paper, Section III-D)."""
+"""Multinomial logistic classifiers of the link state by partial link state (paper, Section III-D)."""
 
 INDOOR_NETWORKS = {state: f"indoor_given_{state.name.lower()}" for state in LinkState}
-"""One logistic classifier P(indoor) for each partial link state (paper, "Indoor-Outdoor Estimation")."""
+"""Logistic classifiers P(indoor) by partial link state (paper, "Indoor-Outdoor Estimation")."""
 
 OUTPUT_WIDTHS = {
     **dict.fromkeys(STATE_NETWORKS.values(), len(LinkState)),
     **{row.name: 2 for row in GAIN_NETWORKS},
     **dict.fromkeys(INDOOR_NETWORKS.values(), 1),
 }
-"""Number of values for each link of every network, by name."""
 
 _BACKEND, _DATA_FORMAT = "tensorflow", "channels_last"
-"""Settings of Keras that our networks are made for."""
+"""Settings of Keras that our networks need."""
 
 
 def import_keras() -> ModuleType:
-    """Import Keras, after the libLLVM that has to come before TensorFlow; another backend raises a BackendError."""
+    """Import Keras after libLLVM, which must precede TensorFlow; raise a BackendError for another backend."""
     load_llvm()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
@@ -142,7 +138,7 @@ def import_keras() -> ModuleType:
 
 
 class _TensorFlow:
-    """TensorFlow, imported after Keras when something of it is first used."""
+    """TensorFlow, imported after Keras at first use."""
 
     def __getattr__(self, name: str) -> Any:
         import_keras()
@@ -156,7 +152,7 @@ tf: Any = _TensorFlow()
 
 
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
-    """Build a logistic classifier on clamped inputs: by softmax or, for one event, sigmoid; `bias` (K,) are logits."""
+    """Build a logistic classifier on clamped inputs: softmax or, for one event, sigmoid; `bias` (K,) are logits."""
     keras = import_keras()
     count = np.size(bias)
     tensors, scaled = _scaled_inputs(inputs, ranges)
@@ -170,7 +166,7 @@ def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike
 def gain_network(
     row: GainNetwork, ranges: Ranges, offset_db: float, std_db: float, frequency_hz: float, seed: int
 ) -> "keras.Model":
-    """Build a gain network that gives one offset from its anchor and one spread [dB] until it is trained.
+    """Build a gain network with constant offset and spread [dB] until it is trained.
 
     Its output (N, 2) is mean [dB] and natural logarithm of the variance [dB^2].
     """
@@ -197,7 +193,7 @@ def gain_network(
 
 
 def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
-    """Put networks side by side in one model: those of `OUTPUT_WIDTHS`, and any others, which share no inputs."""
+    """Put the networks of `OUTPUT_WIDTHS` and any others, with inputs of their own, side by side in one model."""
     keras = import_keras()
     inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in GAIN_INPUTS}
     outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
@@ -209,12 +205,12 @@ def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
 
 
 def own_input(name: str) -> str:
-    """Return the name of the input of a network that shares its input with no other."""
+    """Return the name of the input of a network with an input of its own."""
     return f"input_of_{name}"
 
 
 def parts(model: "keras.Model") -> dict[str, "keras.Model"]:
-    """Return the networks that `assemble` put together."""
+    """Return the networks of `assemble` by name."""
     return {name: model.get_layer(name) for name in model.output}
 
 
@@ -229,8 +225,8 @@ def distribution_by_paper(
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `GAIN_INPUTS` and partial link states (N,).
 
-    Free space is stronger by `shift_db` at the frequency of the networks than at the frequency of the links.
-    Returns probabilities of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
+    `shift_db` is the free-space gain at the networks' frequency less that at the links' frequency. Return probabilities
+    of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
     inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, tf)}
     inputs = {name: tf.cast(values, tf.float32) for name, values in inputs.items()}
@@ -255,7 +251,7 @@ def distribution_by_paper(
 def evaluate_paper(
     networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Evaluate `distribution_by_paper` on the features of N links, to arrays; `frequency_hz` is the networks'."""
+    """Return `distribution_by_paper` for N links as arrays; `frequency_hz` is the networks' frequency."""
     shift_db = phi.free_space_shift_db(frequency_hz)
     blocks = [
         distribution_by_paper(networks, network_inputs(block), block.link_state, shift_db) for block in _blocks(phi)
@@ -265,7 +261,7 @@ def evaluate_paper(
 
 
 def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> Floats:
-    """Return P(indoor) (N,) by the network that serves the partial link state of each link."""
+    """Return P(indoor) (N,) by partial link state."""
     p_indoor = np.zeros(len(phi))
     for state, name in INDOOR_NETWORKS.items():
         served = phi.link_state == state
@@ -275,13 +271,12 @@ def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) ->
 
 
 def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
-    """Cut features into blocks that bound the memory; there is at least one."""
     for start in range(0, max(1, len(phi)), _LINKS_AT_ONCE):
         yield phi.take(slice(start, start + _LINKS_AT_ONCE))
 
 
 def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
-    """Return the range [low, high] to which each network of the paper clamps and scales its inputs, by feature."""
+    """Return the range [low, high] to which each network of the paper clamps its inputs, by feature."""
     ranges = {}
     for name in OUTPUT_WIDTHS:
         network = model.get_layer(name)
@@ -293,7 +288,7 @@ def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
 
 
 def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, Any], Any]:
-    """Return inputs by name, and the tensor (N, len(names)) of them, scaled to [0, 1] and clamped."""
+    """Return inputs by name, and their tensor (N, len(names)) scaled to [0, 1] and clamped."""
     keras = import_keras()
     tensors = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
     columns = list(tensors.values())
@@ -305,12 +300,12 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
 
 
 def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
-    """Return a stock layer in single precision, whatever the user's global policy is."""
+    """Return a stock layer in single precision, regardless of the user's global policy."""
     return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)
 
 
 def fit_networks(phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> "keras.Model":
-    """Fit the classifiers and the gain networks to links and their true states and gains [dB] (N,), all indoors."""
+    """Fit classifiers and gain networks to links and their true states and gains [dB] (N,), all indoors."""
     networks = {}
     for partial_state, name in STATE_NETWORKS.items():
         cell = phi.link_state == partial_state
@@ -330,9 +325,9 @@ def fit_networks(phi: LinkFeatures, link_state: States, gain_db: Floats, setting
 def fit_indoor_networks(
     model: "keras.Model", phi: LinkFeatures, inside: Bools, settings: PredictorSettings
 ) -> "keras.Model":
-    """Return the networks of `model` with P(indoor) fitted to N links; `inside` (N,) is whether they are indoors.
+    """Return the networks of `model` with P(indoor) fitted to N links; `inside` (N,) is True indoors.
 
-    A partial link state with fewer links than `minimum_links` keeps what `model` has.
+    A partial link state with fewer than `minimum_links` links keeps its network.
     """
     networks = parts(model)
     for partial_state, name in INDOOR_NETWORKS.items():
@@ -358,7 +353,6 @@ def _fit_gain(row: GainNetwork, phi: LinkFeatures, gain_db: Floats, settings: Pr
 
 
 def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
-    """Range of every feature of the links; a wide one if they are too few to tell."""
     if len(phi) < settings.minimum_links:
         return _DEFAULT_RANGES
     spans = {name: (float(getattr(phi, name).min()), float(getattr(phi, name).max())) for name in _DEFAULT_RANGES}
@@ -366,9 +360,9 @@ def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
 
 
 def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> None:
-    """Set the weights of a logistic classifier to the minimum of the cross-entropy, a convex problem.
+    """Fit a logistic classifier by cross-entropy, a convex problem.
 
-    A slight penalty keeps weights finite where a straight line parts the classes.
+    A slight penalty keeps weights finite if the classes are separable.
     """
     keras = import_keras()
     scaled = keras.Model(network.input, network.get_layer("clamped").output)(network_inputs(phi, tuple(network.input)))
@@ -391,14 +385,13 @@ def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> N
 
 
 def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
-    """Negative log-likelihood of gains (N, 1) under means and log-variances (N, 2), up to a constant."""
     ops = import_keras().ops
     mean, log_variance = prediction[:, :1], prediction[:, 1:]
     return 0.5 * (log_variance + ops.square(gain_db - mean) * ops.exp(-log_variance))
 
 
 def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> None:
-    """Minimise the loss of a gain network in place; the same links and settings give the same weights."""
+    """Train a gain network in place; equal links and settings give equal weights."""
     keras = import_keras()
     trainer = keras.Model(network.input, network.output)
     decay = keras.optimizers.schedules.CosineDecay(settings.learning_rate, settings.steps)
@@ -417,7 +410,6 @@ def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings:
 def _batches(
     inputs: dict[str, NDArray[np.float32]], gain_db: NDArray[np.float32], size: int, rng: np.random.Generator
 ) -> Iterator[tuple[dict[str, NDArray[np.float32]], NDArray[np.float32]]]:
-    """Yield shuffled batches without end."""
     for start in itertools.cycle(range(0, len(gain_db), size)):
         if start == 0:
             order = rng.permutation(len(gain_db))

@@ -1,9 +1,9 @@
-"""Paths where nothing was seen: which traced paths survive, and which others there are.
+"""Paths in unobserved space: survival of traced paths, and analogues of missing ones.
 
-A small network gives the probability that a path traced on a partial map exists in the building. What the trace lacks
-is taken from similar links of the same link state in homes of `make_home`: their paths that a
-partial map did not show, turned to the direct line of the link (the method of analogues; Lorenz, Atmospheric
-Predictability as Revealed by Naturally Occurring Analogues, 1969). `training.paths` makes both.
+A small network gives the probability that a path traced on a partial map exists in the building. Missing paths are
+taken from similar links of the same link state in procedural homes: their paths that a partial map did not show, turned
+to the direct line of the link (method of analogues; Lorenz, Atmospheric Predictability as Revealed by Naturally
+Occurring Analogues, 1969). `training.paths` makes both.
 """
 
 import io
@@ -36,20 +36,20 @@ from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
 STATES = (LinkState.LOS, LinkState.NLOS)
 
 ANALOGUES = 8
-"""Number of analogues from which one is drawn."""
 
 _SCALE = np.array([[1.5, 0.5, 0.7, 8.0, 1.0, 1.0], [6.0, 0.5, 0.7, 8.0, 1.0, 1.0]])
-"""Units in which links with LOS, and without, are compared: gain above free space [dB], logarithms of distance and
-unobserved length, gain of the surviving paths above that of the link [dB], whether each end is in an observed cell."""
+"""Units of search keys for LOS and NLOS: gain above free space [dB], logarithms of distance and unobserved length, gain
+of surviving paths relative to the link's [dB], observed ends.
+"""
 
 _NEARLY = 0.3
-"""Largest excess distance of an analogue over the nearest link, as a fraction."""
+"""Largest relative excess of an analogue's distance over the nearest link's."""
 
 _TURN_DEG = (6, 3)
-"""Steps of zenith and azimuth in which directions of departure are counted [degree]."""
+"""Bins of zenith and azimuth for directions of departure [degree]."""
 
 _RARE = 1e-4
-"""Fraction of the power below which a direction does not count."""
+"""Fraction of the power below which a direction is left out."""
 
 _WEAKEST_DB, _TINY = -30.0, 1e-12
 _MAX_BYTES = 20_000_000
@@ -57,7 +57,7 @@ _MAX_BYTES = 20_000_000
 
 @dataclass(frozen=True, eq=False)
 class LinkGeometry:
-    """Direct lines of L links on a map, arrays (L,): lengths [m], ends in observed cells, zenith and azimuth [rad]."""
+    """Direct lines of L links on a map: lengths [m], observed ends, zenith and azimuth [rad], each (L,)."""
 
     distance_m: Floats
     unobserved_m: Floats
@@ -82,11 +82,11 @@ class LinkGeometry:
         return np.stack([np.pi - zenith_rad, wrapped(azimuth_rad + np.pi)], axis=1)
 
     def take(self, index: Indices | Bools) -> "LinkGeometry":
-        """Return some of the links."""
+        """Select links."""
         return LinkGeometry(*(getattr(self, column.name)[index] for column in fields(self)))
 
     def keys(self, state: LinkState, gain_db: Floats, survivors_db: Floats) -> Floats:
-        """Return by what links of one state are compared, (L, 6): their gain and that of their surviving paths too."""
+        """Return the (L, 6) search keys for analogues of links of one state."""
         columns = (
             gain_db - self.free_space_db,
             np.log(self.distance_m),
@@ -99,7 +99,7 @@ class LinkGeometry:
 
 
 def survival_inputs(links: TracedLinks, paths: Indices, unobserved_m: Floats, geometry: LinkGeometry) -> Floats:
-    """Return the inputs (P, 8) of the network for some traced paths, by their numbers (P,), on all links."""
+    """Return the inputs (P, 8) of the network for selected traced paths (P,)."""
     link, interactions = links.path_link[paths], links.interactions[paths]
     columns = (
         np.log1p(4.0 * unobserved_m),
@@ -115,28 +115,28 @@ def survival_inputs(links: TracedLinks, paths: Indices, unobserved_m: Floats, ge
 
 
 def wrapped(angle_rad: Floats) -> Floats:
-    """Angles within [-pi, pi)."""
+    """Return angles in [-pi, pi)."""
     return (angle_rad + np.pi) % (2.0 * np.pi) - np.pi
 
 
 @dataclass(frozen=True, eq=False)
 class PathModel:
-    """The network of survival, and B analogues with Q paths in all, those with LOS first.
+    """Survival network, and B analogues with Q paths, those with LOS first.
 
     Parameters
     ----------
     weights : tuple of 6 arrays
-        Kernel and bias of each layer; the last input is 1 with LOS, 0 without.
+        Kernel and bias of each layer; the last input is 1 for LOS, else 0.
     keys : (B, 6) float32 array
-        By what links are compared.
+        Search keys.
     los_count : () int array
         Number of analogues with LOS.
     first : (B + 1,) int64 array
-        First path of each.
+        First path of each analogue.
     spread_ns : (B,) float32 array
-        Delay spread of each [ns].
+        Delay spread of each analogue [ns].
     fraction : (Q,) float16 array
-        Of the power of the paths of an analogue.
+        Fraction of the power of the analogue.
     excess_ns : (Q,) float16 array
         Excess delay over the direct line [ns].
     departure_rad, arrival_rad : (Q, 2) float16 arrays
@@ -154,14 +154,14 @@ class PathModel:
     arrival_rad: NDArray[np.float16]
 
     def survival(self, inputs: Floats, state: LinkState) -> Floats:
-        """Probability (P,) that indirect paths exist, given the state of their links."""
+        """Return the probability (P,) that indirect paths exist, given the state of their links."""
         values = np.column_stack([inputs, np.full(len(inputs), float(state == LinkState.LOS))])
         for layer in (0, 2):
             values = np.maximum(values @ self.weights[layer] + self.weights[layer + 1], 0.0)
         return np.asarray(expit((values @ self.weights[4] + self.weights[5])[:, 0]))
 
     def analogues(self, state: LinkState, keys: Floats, quantile: Floats) -> Indices:
-        """Numbers (L,) of analogues of links of one state: the similar link at a quantile (L,) of delay spread."""
+        """Return the numbers (L,) of analogues: the similar link at a quantile (L,) of delay spread."""
         tree, start = self._trees[STATES.index(state)]
         ranks = np.arange(1, min(ANALOGUES, tree.n) + 1)
         similar = tree.query(keys, k=ranks, eps=_NEARLY, workers=core_count())[1] + start
@@ -170,9 +170,9 @@ class PathModel:
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]
 
     def departures_deg(self, state: LinkState) -> tuple[Indices, Floats]:
-        """Zenith and azimuth from the direct line (K, 2) [degree] in which unseen paths depart, and their power (K,).
+        """Return directions (K, 2) of unseen paths from the direct line [degree], and their power (K,).
 
-        The mean over all analogues of a state, which are as often mirrored as not.
+        They are the mean over all analogues of a state and their mirror images.
         """
         first = self.first[: self.los_count + 1] if state == LinkState.LOS else self.first[self.los_count :]
         here, counts = slice(first[0], first[-1]), np.diff(first)
@@ -210,11 +210,10 @@ class PathModel:
 
 
 class AntennaLinks:
-    """Links from (3,) to (N, 3) [m] with an antenna at the transmitter, while their paths are traced.
+    """Links from (3,) to (N, 3) [m] with an antenna at the transmitter, or at the receivers (`at_rx`).
 
-    Traced paths count with the antenna's field where they depart, the direct line of a link in LOS with the field in
-    its direction, and everything else with the mean over the directions of analogues. `paths` are traced for both
-    polarisations. With `at_rx` the antenna is at the other end of each link, where paths arrive.
+    Traced paths and the direct line of a link in LOS have the antenna's gain in their direction, all else the mean over
+    the directions of analogues. `paths` are traced for both polarisations.
     """
 
     def __init__(self, antenna: Antenna, frequency_hz: float, tx_m: Floats, rx_m: Floats, *, at_rx: bool) -> None:
@@ -234,10 +233,10 @@ class AntennaLinks:
     def predict(
         self, phi: LinkFeatures, prediction: LinkPrediction, complete: Bools
     ) -> tuple[LinkFeatures, LinkPrediction, Floats]:
-        """Return the features with the antenna, and the prediction as the sum of two terms; the link states stay.
+        """Return features with the antenna, and the prediction as the sum of two terms; link states stay.
 
-        The second term is the mean gain of the antenna (N,) over the states with a path [dB]. The first is the
-        prediction without it: only the differences between states are the antenna's.
+        The second term is the mean gain of the antenna (N,) over states with a path [dB]. The first is the prediction
+        without it, except for the antenna's differences between states.
         """
         traced_db, phi = phi.gain_db, replace(phi, gain_db=path_gain_db(self._power))
         antenna_db = phi.gain_db - traced_db
@@ -268,12 +267,10 @@ class AntennaLinks:
         return phi, prediction.mapped(relative), np.where(complete, antenna_db, mean_db)
 
     def _table(self) -> Floats:
-        """Gain in all whole degrees of zenith and azimuth (181, 360)."""
         angles_deg = np.stack(np.meshgrid(np.arange(181.0), np.arange(360.0), indexing="ij"), axis=-1)
         return self.antenna.gain(np.radians(angles_deg.reshape(-1, 2)), self.frequency_hz).reshape(181, 360)
 
     def _spread(self, state: LinkState, table: Floats) -> Floats:
-        """Mean gain (N,) over the directions in which unseen paths depart."""
         zenith_deg, azimuth_deg = np.round(np.degrees(self._direct_rad)).astype(np.intp).T
         mean = np.zeros(len(zenith_deg))
         for (down, left), power in zip(*PathModel.load().departures_deg(state), strict=True):

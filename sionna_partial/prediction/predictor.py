@@ -1,4 +1,4 @@
-"""Predictor: LinkFeatures -> LinkPrediction, by the paper's networks or by those that read maps and paths."""
+"""Predictors of link state and path gain: networks, models of the user, and mean wall losses."""
 
 from __future__ import annotations
 
@@ -57,28 +57,28 @@ if TYPE_CHECKING:
     import keras
 
 SHIPPED = ("map", "paper")
-"""Their names; the first is the default."""
+"""Names of the shipped predictors, the default first."""
 
 
 class TraceErrors(NamedTuple):
-    """Difference between the trace of a nearly complete map and the trace of the building.
+    """Errors of the trace of a nearly complete map against the trace of the building.
 
-    The depth of a link is how much weaker than free space it is traced [dB].
+    The depth of a link is its traced gain below free space [dB].
 
     Parameters
     ----------
     p_missed, missed_db, missed_std_db : float
-        P(NLOS) of a traced outage, which falls to 1/e of this in `MISSED_RANGE_M`; mean and standard deviation of its
-        gain over an outage [dB].
+        P(NLOS) of a traced outage, falling as exp(-distance / `MISSED_RANGE_M`); mean and standard deviation of its
+        gain above -150 dB [dB].
     p_blocked, blocked_db, blocked_std_db : float
         P(NLOS) of traced LOS; mean and standard deviation of the change of the gain [dB].
     p_opened : float
-        P(LOS) of traced NLOS, which falls to 1/e of this in a depth of `OPENED_DB`.
+        P(LOS) of traced NLOS, falling as exp(-depth / `OPENED_DB`).
     p_lost : float
-        P(outage) of traced NLOS, which grows from 0 to this over the depths `LOST_DB`.
+        P(outage) of traced NLOS, rising linearly from 0 over the depths `LOST_DB`.
     los_std_db, nlos_std_db, nlos_std_slope, nlos_slope : float
-        Standard deviation of the gain where the link state is as traced, and its growth with the depth; growth of the
-        gain with the depth from the first of `LOST_DB` on.
+        Standard deviations of the gain for an unchanged link state, and their growth with depth; growth of the gain
+        with depth beyond the first of `LOST_DB`.
     """
 
     p_missed: float
@@ -97,7 +97,7 @@ class TraceErrors(NamedTuple):
 
 EXACT = TraceErrors(0.03, 18.0, 10.0, 0.001, -12.0, 7.0, 0.01, 0.08, 0.2, 2.2, 0.03, 0.0)
 NOISY = TraceErrors(0.25, 15.0, 16.0, 0.01, -6.0, 5.0, 0.9, 0.2, 0.4, 3.5, 0.17, 0.05)
-"""On maps without and with full noise, measured on procedural homes, halls and warehouses with even seeds."""
+"""Errors on maps without and with full noise; measured on procedural homes, halls and warehouses with even seeds."""
 
 MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 
@@ -105,18 +105,18 @@ MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkPrediction(Shown):
-    """Predictive distribution of link state and path gain of links; every array is (N,) or (T, N) float64.
+    """Predictive distribution of link state and path gain; every array is (N,) or (T, N) float64.
 
-    `Predictor.predict` returns it for receivers that are indoors, `anywhere` for receivers that may be outdoors.
+    `Predictor.predict` returns it for receivers indoors, `anywhere` for receivers that may be outdoors.
 
     Parameters
     ----------
     p_los, p_nlos, p_outage : arrays
         Probabilities of the link states; they sum to 1.
     gain_mean_db, gain_std_db : arrays
-        Mean and standard deviation of the whole distribution, an outage counting -150 dB [dB].
+        Mean and standard deviation over all link states, with -150 dB for an outage [dB].
     gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
-        The same given line of sight, and given paths without it [dB].
+        Mean and standard deviation given LOS, and given NLOS [dB].
 
     Examples
     --------
@@ -140,16 +140,16 @@ class LinkPrediction(Shown):
     gain_nlos_std_db: Floats
 
     _materials: ClassVar[tuple[tuple[LinkPrediction, ...], Floats] | None] = None
-    """Distributions given each candidate for the material of walls, and their probabilities (K,), where unknown."""
+    """Distributions by candidate wall material, and their probabilities (K,)."""
 
     @property
     def by_material(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
-        """Distributions given each candidate for the material of walls, without residuals, and their weights (K,)."""
+        """Distributions by candidate wall material, without residuals, and their probabilities (K,)."""
         return self._materials or ((self,), np.ones(1))
 
     @classmethod
     def over_materials(cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float) -> LinkPrediction:
-        """Return the mixture over candidates for the material of walls, which is remembered.
+        """Return the mixture over candidate wall materials, and keep its parts.
 
         `residual_db` is the standard deviation of gains about the trace with the true material [dB].
         """
@@ -160,7 +160,7 @@ class LinkPrediction(Shown):
         return mixed
 
     def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
-        """Return a change of this distribution, with the same change of those given each material."""
+        """Apply `change` to this distribution and to its parts by material."""
         changed = change(self)
         if self._materials is not None:
             parts, weights = self._materials
@@ -169,14 +169,14 @@ class LinkPrediction(Shown):
 
     @property
     def link_state(self) -> States:
-        """Likeliest LinkState (N,)."""
+        """Most probable LinkState (N,)."""
         return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
 
     @classmethod
     def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType = np) -> Self:
         """Combine the distributions given each LinkState (3, N), by the laws of total expectation and variance.
 
-        `ops` is NumPy, or keras.ops for tensors, of which the standard deviation has finite derivatives.
+        `ops` is NumPy, or keras.ops for tensors; the standard deviation has finite derivatives.
         """
         mean_db = ops.maximum(ops.sum(probabilities * means_db, axis=0), GAIN_FLOOR_DB)
         variance = ops.sum(probabilities * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
@@ -195,7 +195,7 @@ class LinkPrediction(Shown):
 
     @property
     def by_state(self) -> tuple[Floats, Floats, Floats]:
-        """Arguments of `of_parts`: probabilities, means and standard deviations [dB] given each LinkState (3, N)."""
+        """Arguments of `of_parts`: probabilities, means and standard deviations [dB], each (3, N)."""
         nothing = np.zeros_like(self.p_outage)
         return (
             np.stack([self.p_outage, self.p_los, self.p_nlos]),
@@ -205,9 +205,9 @@ class LinkPrediction(Shown):
 
     @classmethod
     def of_trace(cls, phi: LinkFeatures) -> LinkPrediction:
-        """Return the trace itself as the prediction, as on a complete map (paper, eq. 9): no uncertainty is left.
+        """Return the trace as a prediction without uncertainty, as on a complete map (paper, eq. 9).
 
-        The components of link states that a link is not in have its traced gain, too.
+        Its gain is the mean given every link state.
         """
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
@@ -216,17 +216,17 @@ class LinkPrediction(Shown):
     def of_mean_losses(
         cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
     ) -> LinkPrediction:
-        """Return the prediction by the mean loss of walls, for links through walls, which have a context.
+        """Predict links through walls by the mean loss of walls.
 
-        `walls` (N,) are the expected numbers of unseen walls on their direct lines, `max_walls` is that of the trace.
+        `walls` (N,) are the expected numbers of unseen walls on the direct lines.
         """
         return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
-        """Return the trace on a nearly complete map, with its uncertainty (`TraceErrors`), of links with a context.
+        """Return the trace on a nearly complete map with its uncertainty (`TraceErrors`).
 
-        Known walls exclude LOS as everywhere. The regions that they separate do not make outages certain.
+        Known walls exclude LOS; separated regions do not make outages certain.
         """
         context, traced = context_of(phi), phi.link_state
         exact, noisy = np.array([EXACT, NOISY])[..., None]
@@ -248,10 +248,10 @@ class LinkPrediction(Shown):
         return cls.of_parts(np.stack([outage, los, 1.0 - outage - los]), np.maximum(means_db, GAIN_FLOOR_DB), stds_db)
 
     def probability_above(self, threshold_db: float | Floats) -> Floats:
-        """Return the probability (N,) that the path gain exceeds a threshold t [dB], an outage counting -150 dB.
+        """Return the probability (N,) that the path gain exceeds a threshold t [dB]; an outage has -150 dB.
 
-        ``p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t)``, where m and s are
-        means and standard deviations given the link state, and Phi is the normal distribution function.
+        ``p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t)`` with means m,
+        standard deviations s and the normal distribution function Phi.
         """
         probability = self.p_outage * (threshold_db < GAIN_FLOOR_DB)
         for p_state, mean_db, std_db in (
@@ -264,9 +264,9 @@ class LinkPrediction(Shown):
         return probability
 
     def amplified(self, change_db: ArrayLike) -> LinkPrediction:
-        """Return the links with gains that are higher by `change_db`, one for all or (N,), where there are paths [dB].
+        """Return the distribution with gains higher by `change_db`, a number or (N,) [dB].
 
-        Outages stay, and no gain falls below the floor.
+        Outages stay, and no gain falls below -150 dB.
         """
         has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
 
@@ -278,14 +278,14 @@ class LinkPrediction(Shown):
         return self.mapped(amplified)
 
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
-        """Return the links that an index array, a mask (N,) or a slice selects."""
+        """Select links by an index array, a mask (N,) or a slice."""
         return self.mapped(
             lambda links: LinkPrediction(*(getattr(links, column.name)[index] for column in fields(links)))
         )
 
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
-        """Return the links of all `parts`, one part after the other."""
+        """Join links, one part after the other."""
         joined = cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
         materials = [part._materials for part in parts if part._materials is not None]
         if len(materials) == len(parts) > 0:
@@ -295,7 +295,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
-        """Return the mixture of K distributions of the same links, given weights (K,) or (K, N), which sum to 1."""
+        """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1."""
         if len(parts) == 1:
             return parts[0]
         p_all, means_db, stds_db = (np.stack(each) for each in zip(*(part.by_state for part in parts), strict=True))
@@ -309,21 +309,20 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities / probabilities.sum(axis=0), mean_db, np.sqrt(variance))
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
-        """Return the same links in another shape, as (T, N)."""
+        """Return the links in another shape, such as (T, N)."""
         return self.mapped(
             lambda links: LinkPrediction(*(getattr(links, column.name).reshape(shape) for column in fields(links)))
         )
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
-        """Return `other` for the links of a mask (N,), and this distribution for the rest."""
+        """Return `other` where a mask (N,) is True, this distribution elsewhere."""
         columns = (column.name for column in fields(self))
         return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
 
     def anywhere(self, p_indoor: ArrayLike) -> LinkPrediction:
         """Return the distribution for receivers that may be outdoors, where every link is in outage.
 
-        By total probability (paper, "Indoor-Outdoor Estimation"), the probabilities of LOS and NLOS are those of a
-        receiver indoors times `p_indoor`, the rest is outage; mean and spread of the gain follow.
+        P(LOS) and P(NLOS) are multiplied by `p_indoor`, the rest is outage (paper, "Indoor-Outdoor Estimation").
 
         Parameters
         ----------
@@ -351,31 +350,31 @@ class LinkPrediction(Shown):
 class Predictor(Shown):
     """A predictor of link state and path gain, from `fit` or `load`.
 
-    That of the paper (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on
-    distance and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean
-    and log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved
-    distance for each partial link state; it is 1 until `fit_indoor`, as the paper has every receiver indoors.
+    The paper's (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on distance
+    and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean and
+    log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved distance
+    for each partial link state, 1 before `fit_indoor`.
 
-    With settings other than "paper", further networks read what each path crosses, and the map around the
-    transmitter (`map_networks`). They predict links whose features have a context; where the map is complete, the trace
-    itself is the prediction. For features without a context the paper's networks predict, fitted to the same links.
+    With `PredictorSettings.networks` other than "paper", further networks (`map_networks`) predict links whose features
+    have a context; on a complete map the trace is the prediction. Features without a context are predicted by the
+    paper's networks, fitted to the same links.
 
     Parameters
     ----------
     model : keras.Model
-        All networks side by side.
+        All networks, in one model.
     archive : bytes
         The model as a `.keras` file.
     settings : PredictorSettings
         Settings of the training.
     homes : tuple of str
-        Names of the homes that it was trained on.
+        Names of the training homes.
     links : mapping of str to int
         Number of training links by "true state given partial state".
     metrics : mapping
-        Metrics on homes that it was not trained on.
+        Metrics on other homes.
     versions : mapping of str to str
-        Versions of the packages that trained it.
+        Package versions at training.
     name : str
         "fitted", a shipped name, or the file's path.
 
@@ -404,7 +403,7 @@ class Predictor(Shown):
 
     @property
     def reads_maps(self) -> bool:
-        """Return whether it needs the windows of `link_features`."""
+        """Return whether features need windows (`link_features`)."""
         return reads_maps(parts(self.model))
 
     @classmethod
@@ -418,10 +417,10 @@ class Predictor(Shown):
         settings: PredictorSettings | None = None,
         progress: Progress | bool | None = None,
     ) -> Predictor:
-        """Train on links of known truth; the same links and settings give the same weights.
+        """Train on links of known truth; equal links and settings give equal weights.
 
-        Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, and by the
-        continuous ranked probability score (CRPS) in the others.
+        Link states are learned by cross-entropy; the gain by Gaussian likelihood in the paper's networks, by the CRPS
+        in the others.
 
         Parameters
         ----------
@@ -432,7 +431,7 @@ class Predictor(Shown):
         gain_db : (N,) array-like
             Omnidirectional path gain on the complete map [dB].
         homes : sequence of str
-            Names of the homes of the links, to be recorded.
+            Names of the homes, for the record.
         settings : PredictorSettings, optional
             The paper's networks by default.
         progress : bool or callable, optional
@@ -445,8 +444,7 @@ class Predictor(Shown):
         Raises
         ------
         PredictorError
-            For no links, arrays of other shapes or values, links of another frequency than the settings', or a training
-            that diverges.
+            For no links, wrong shapes or values, another frequency than the settings', or a training that diverges.
         """
         settings = settings or PredictorSettings()
         _require_features(features)
@@ -481,13 +479,13 @@ class Predictor(Shown):
     def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> Predictor:
         """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
 
-        A receiver that the map shows in a free cell is indoors for certain. `predict_map` and `evaluate` take P(indoor)
-        for the others only, and `train` fits it to the others only; the paper takes receivers from the whole map.
+        A receiver in a free cell is indoors for certain: `train`, `predict_map` and `evaluate` use P(indoor) for the
+        others only, unlike the paper.
 
         Parameters
         ----------
         features : LinkFeatures
-            Features of N links whose receivers are drawn uniformly over the wanted part of the map area.
+            Features of N links, with receivers uniform over the wanted part of the map.
         inside : (N,) array-like of bool
             True where the receiver is indoors.
 
@@ -498,7 +496,7 @@ class Predictor(Shown):
         Raises
         ------
         PredictorError
-            For arrays of other shapes or values, or a training that diverges.
+            For wrong shapes or values, or a training that diverges.
         """
         _require_features(features)
         indoors = link_numbers("inside", inside, features.shape).ravel() > 0.0
@@ -506,7 +504,7 @@ class Predictor(Shown):
         return replace(self, model=model, archive=pack(model))
 
     def predict(self, features: LinkFeatures) -> LinkPrediction:
-        """Predict link state and path gain of links whose receivers are indoors.
+        """Predict link state and path gain for receivers indoors.
 
         Gains are predicted relative to free space at the frequency of the features.
 
@@ -518,12 +516,12 @@ class Predictor(Shown):
         Returns
         -------
         LinkPrediction
-            Prediction in the shape of the features.
+            In the shape of the features.
 
         Raises
         ------
         PredictorError
-            For features with a context, but without the windows that map networks read.
+            For features with a context but without windows, if map networks read them.
         """
         _require_features(features)
         networks = parts(self.model)
@@ -544,15 +542,15 @@ class Predictor(Shown):
         return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
-        """Predict the probability that each receiver is indoors; 1 everywhere unless `fit_indoor` was called."""
+        """Return the probability that each receiver is indoors; 1 before `fit_indoor`."""
         _require_features(features)
         return evaluate_indoor(parts(self.model), features.flat()).reshape(features.shape)
 
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.
 
-        The card has the order of the features, their scaling (a record: it is applied inside the networks), settings,
-        homes, metrics, versions and the SHA-256 of the `.keras` file.
+        The card records features, their scaling (applied inside the networks), settings, homes, metrics, versions and
+        the SHA-256.
 
         Parameters
         ----------
@@ -583,8 +581,7 @@ class Predictor(Shown):
         Parameters
         ----------
         name_or_path : None, "map", "paper", path-like or Predictor
-            The shipped default, which is "map", the paper's predictor, or the `.keras` file of your own. A Predictor is
-            returned as it is.
+            A shipped predictor ("map" is the default), a `.keras` file, or a Predictor, which is returned unchanged.
 
         Returns
         -------
@@ -593,7 +590,7 @@ class Predictor(Shown):
         Raises
         ------
         PredictorError
-            If a file is missing, damaged, changed, or of another kind.
+            If a file is missing, damaged, changed or of another kind.
         """
         if isinstance(name_or_path, Predictor):
             return name_or_path
@@ -625,12 +622,12 @@ class Predictor(Shown):
 
 
 class OtherPredictor:
-    """A model of the user in place of a `Predictor`: any object with `predict(phi)`.
+    """A user's model instead of a `Predictor`: any object with `predict(phi)`.
 
-    It gets the `LinkFeatures` of N links that are not certain, and returns a `LinkPrediction`, or a mapping with arrays
-    (N,) `p_los`, `p_nlos`, `p_outage`, and means and standard deviations of the gain [dB]: `gain_mean_db` and
-    `gain_std_db` of all links with a path, or both `gain_los_...` and `gain_nlos_...`. P(indoor) is that of the default
-    predictor, unless the object has `predict_indoor(phi)`.
+    `predict` gets the `LinkFeatures` of the N links that are not certain. It returns a `LinkPrediction`, or a mapping
+    of (N,) arrays: `p_los`, `p_nlos`, `p_outage`, and `gain_mean_db`, `gain_std_db` of links with a path, or both
+    `gain_los_...` and `gain_nlos_...` [dB]. Without a method `predict_indoor(phi)`, the default predictor gives
+    P(indoor).
     """
 
     settings: PredictorSettings | None = None
@@ -641,7 +638,7 @@ class OtherPredictor:
         self.fingerprint = ""
 
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
-        """Predict links; a PredictorError for arrays that are no distribution."""
+        """Predict links; raise a PredictorError for arrays that are no distribution."""
         found = self._model.predict(phi)
         if isinstance(found, LinkPrediction):
             found = {column.name: getattr(found, column.name) for column in fields(found)}
@@ -673,15 +670,15 @@ class OtherPredictor:
         )
 
     def predict_indoor(self, phi: LinkFeatures) -> Floats:
-        """P(indoor) of links (N,)."""
+        """Return P(indoor) of links (N,)."""
         own = getattr(self._model, "predict_indoor", None) or _from_file(None).predict_indoor
         return np.clip(link_numbers(f"{self.name}.predict_indoor", own(phi), phi.shape), 0.0, 1.0)
 
 
 class MeanLosses:
-    """Predictor of links through walls: the mean loss of known walls times the expected number of unseen ones.
+    """Predictor of links through walls by the mean loss of known walls and the expected number of unseen walls.
 
-    P(indoor) is predicted by networks.
+    `networks` predict P(indoor).
     """
 
     name = WALL_LOSSES
@@ -700,13 +697,12 @@ class MeanLosses:
         return self.predict_each([phi])[0]
 
     def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
-        """Predict the same links with several losses of walls."""
+        """Predict the same links for several wall losses."""
         walls = self._walls.counts(features[0])
         return [LinkPrediction.of_mean_losses(phi, walls, self._max_walls) for phi in features]
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses
-"""Predictors of links that are not complete."""
 
 
 @overload
@@ -714,9 +710,9 @@ def warm_predictor(asked: Predictor | str | PathLike[str] | None) -> Predictor: 
 @overload
 def warm_predictor(asked: Any) -> Predictor | OtherPredictor: ...
 def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
-    """Return `Predictor.load`, which reads files of the same name, size and date once in a process, or a user's model.
+    """Return a user's model, or `Predictor.load` with files read once per process until they change.
 
-    The weights belong to all who load them so: they must not be changed.
+    Callers share the weights and must not change them.
     """
     if not isinstance(asked, (str, PathLike, type(None), Predictor)) and callable(getattr(asked, "predict", None)):
         return OtherPredictor(asked)
@@ -745,7 +741,7 @@ def _map_reader(model: keras.Model) -> MapReader:
 
 
 def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:
-    """Return the file of a predictor by its shipped name or path; None is the default."""
+    """Return the file of a predictor by its shipped name or path."""
     name = SHIPPED[0] if name_or_path is None else name_or_path
     return PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
 

@@ -1,7 +1,7 @@
-"""Predictor files: a `.keras` archive and a JSON card of the same stem beside it.
+"""Predictor files: a `.keras` archive and a JSON card beside it.
 
-Nothing in them is ever executed. The archive must have the SHA-256 that the card names, may hold only the few stock
-classes of Keras that our networks are made of, and is loaded in safe mode.
+Nothing in them is ever executed. The archive must have the SHA-256 in the card and hold only the stock Keras classes of
+our networks; it is loaded in safe mode.
 """
 
 import hashlib
@@ -26,13 +26,12 @@ if TYPE_CHECKING:
     import keras
 
 FORMAT = "sionna_partial predictor 2"
-"""First entry of every card."""
 
 SUFFIX, WEIGHTS_FILE, CHECKSUMS = ".keras", "model.weights.h5", "SHA256SUMS"
 
 _MAX_BYTES = 64_000_000
 _MAX_CONFIG_BYTES, _MAX_SIZE = 1_000_000, 512
-"""Bytes of the configuration of a model, and the largest number in it; ours have 150,000 and 112."""
+"""Largest configuration of a model [bytes], and largest number in it; ours have 150,000 and 112."""
 
 _CLASSES = {
     *("Functional", "InputLayer", "Concatenate", "Rescaling", "ReLU", "Dense", "Add"),
@@ -40,7 +39,7 @@ _CLASSES = {
     *("DTypePolicy", "GlorotUniform", "Zeros", "Ones", "Constant", "__keras_tensor__"),
 }
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
-"""Operations, which take no name: Keras numbers them through a process. Each of our networks has one of each."""
+"""Unnamed operations, which Keras numbers through a process. Each of our networks has one of each."""
 
 _INPUTS = dict.fromkeys(GAIN_INPUTS, (None, 1))
 _OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
@@ -54,7 +53,7 @@ _FIXED_ENTRIES = {
 
 
 def pack(model: "keras.Model") -> bytes:
-    """Return the `.keras` archive of a model, without the date that Keras writes: a training has one hash."""
+    """Return the `.keras` archive of a model without Keras's date, so that a training has one hash."""
     keras = import_keras()
     config = json.dumps(keras.saving.serialize_keras_object(model)).encode()
     metadata = json.dumps({"keras_version": keras.__version__}).encode()
@@ -70,14 +69,14 @@ def pack(model: "keras.Model") -> bytes:
 
 
 def digest(archive: bytes) -> str:
-    """SHA-256 of an archive, in hexadecimal."""
+    """Return the SHA-256 of an archive, in hexadecimal."""
     return hashlib.sha256(archive).hexdigest()
 
 
 def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
-    """Write the `.keras` file at `path` and the card beside it, whole or not at all.
+    """Write the `.keras` file at `path` and its card, whole or not at all.
 
-    Format, features and hash are added to the entries of `card`.
+    Format, features and hash are added to `card`.
     """
     if path.suffix != SUFFIX:
         raise PredictorError(f"path = '{path}' is no predictor: give the path of a {SUFFIX} file.")
@@ -88,7 +87,7 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
 
 
 def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
-    """Return model, archive and card of the predictor in the `.keras` file at `path` and its card, checked."""
+    """Read and check a `.keras` file and its card; return model, archive and card."""
     archive = _read(path)
     card = _read_card(path.with_suffix(".json"))
     if card["sha256"] != digest(archive):
@@ -101,7 +100,7 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
 
 
 def shipped_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
-    """Return the content of a file of the package, which must have its SHA-256; `make predictor` writes the list."""
+    """Return a file of the package, after a check of its SHA-256; `make predictor` writes the list."""
     remedy = "install sionna-partial again."
     content = read_bytes(path, "path", PredictorError, most, remedy)
     lines = read_bytes(PREDICTORS_FOLDER / CHECKSUMS, "path", PredictorError, most, remedy).decode().splitlines()
@@ -139,7 +138,7 @@ def _read_card(path: Path) -> dict[str, Any]:
 
 
 def _require_our_kind(path: Path, archive: bytes) -> None:
-    """Raise a PredictorError unless the archive is a Keras model of classes and sizes such as our networks have."""
+    """Raise a PredictorError unless the archive is a Keras model of our classes and sizes."""
     try:
         content = unzipped(archive, _MAX_BYTES)["config.json"]
         config, config_bytes = json.loads(content), len(content)
@@ -160,7 +159,7 @@ def _require_our_kind(path: Path, archive: bytes) -> None:
 
 
 def _sizes(entry: Any) -> Iterator[int]:
-    """Yield every whole number of a configuration except seeds: numbers of units and filters, shapes, strides."""
+    """Yield the whole numbers of a configuration except seeds: units, filters, shapes, strides."""
     if isinstance(entry, int):
         yield abs(entry)
     values = entry.items() if isinstance(entry, dict) else enumerate(entry) if isinstance(entry, list) else ()
@@ -170,7 +169,6 @@ def _sizes(entry: Any) -> Iterator[int]:
 
 
 def _classes(entry: Any) -> Iterator[str]:
-    """Yield every class that a configuration names; those from outside Keras with their module."""
     if isinstance(entry, dict) and "class_name" in entry:
         module, name = str(entry.get("module") or "keras"), str(entry["class_name"])
         yield name if module.split(".")[0] == "keras" else f"{module}.{name}"
@@ -180,7 +178,7 @@ def _classes(entry: Any) -> Iterator[str]:
 
 
 def _unpack(path: Path, archive: bytes) -> "keras.Model":
-    """Load the bytes that were checked: the file may change meanwhile."""
+    """Load the checked bytes: the file may change meanwhile."""
     keras = import_keras()
     with temporary_folder() as folder:
         copy = folder / f"model{SUFFIX}"

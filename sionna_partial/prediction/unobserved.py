@@ -1,7 +1,7 @@
 """Straight lines and windows on the cells of a map.
 
-The fraction of a line in each kind of cell is the grid integral behind d_unobs (paper, Section III-C). Windows around
-transmitters are the images that map networks read.
+The fraction of a line in unknown cells is the grid integral of d_unobs (paper, Section III-C). Windows around
+transmitters are the images of map networks.
 """
 
 import itertools
@@ -22,46 +22,44 @@ from sionna_partial.process import core_count, in_order, njit
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 GRAZE = 1e-9
-"""Fraction of a line up to which cells are only grazed: lines between grid points meet many corners, to rounding."""
+"""Fraction of a line up to which cells are only grazed: lines between grid points meet corners, up to rounding."""
 
 _BORDER_CELLS = 1e-6
-"""Distance within which a segment runs along the border of cells [cells]."""
+"""Distance within which a segment follows the border of cells [cells]."""
 
 _ALONG_CELLS = 1e-3
-"""Extent along one axis below which a segment may run along the border of cells [cells]."""
+"""Extent along one axis below which a segment may follow the border of cells [cells]."""
 
 _SEGMENTS_PER_CORE = 20_000
-"""Number of segments from which another core is used."""
+"""Number of segments for which another core is used."""
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
-"""Number of cells along each side of a window, and their edge in each of a transmitter's windows, near to far [m]."""
+"""Cells along each side of a window, and their edges in the near and far window of a transmitter [m]."""
 
 CHANNELS = ("free", "wall", "seen", "hidden", "detour")
-"""Values of a cell of a window, each in 255ths, and 0 where nothing was observed.
+"""Values of a cell of a window in 255ths, 0 where nothing was observed.
 
-free, wall: fraction of the cell's area that is known to be so. seen: fraction of the direct line from the transmitter
-that is observed. hidden: whether that line meets a known wall. detour: how much longer the walk is, see `_detours`.
+free, wall: known fraction of the cell. seen: observed fraction of the direct line from the transmitter. hidden: 1 if
+that line meets a known wall. detour: see `_detours`.
 """
 
 WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
-"""Shape of the windows of a transmitter."""
 
 _FINEST = 4
-"""Number of cells of the map along a cell of the window, at most: finer maps are made coarser, once for all windows."""
+"""Largest number of map cells along a window cell; finer maps are coarsened once for all windows."""
 
 _WALL_COST = 100.0
-"""Cost of walking through a cell of nothing but wall [cells]."""
+"""Cost of a walk through a cell of wall only [cells]."""
 
 _LONGEST_DETOUR = 40.0
-"""Detour that has the value 1 [cells]."""
+"""Detour with the value 1 [cells]."""
 
 
 def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
-    """Return the lengths (N,) [m] of segments inside unknown cells, exact to rounding; ends are (N, 3) or (3,) [m].
+    """Return the lengths (N,) of segments in unknown cells [m], exact up to rounding; ends are (N, 3) or (3,) [m].
 
-    Everything outside the grid is unknown. On a complete map nothing unknown can be reached from a known cell, and the
-    length of a segment that has an end in one is 0 by definition. A segment along the border of cells is in the freest
-    of them, as in `PartialMap.state_at`.
+    Outside the grid all is unknown. On a complete map, a segment with an end in a known cell has the length 0 by
+    definition. A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
@@ -70,15 +68,14 @@ def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
 
 
 def lengths_in_unknown_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
-    """Return the same lengths (N,) [m] of segments (N, 3), whether or not the map is complete."""
+    """Return these lengths (N,) [m] without the rule for complete maps."""
     return _lengths_m(partial, CellState.UNKNOWN, start_m, end_m)
 
 
 def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
-    """Return the lengths (N,) [m] of segments inside cells of known walls; ends are (N, 3) or (3,) [m].
+    """Return the lengths (N,) of segments in known wall cells, below the walls' tops [m]; ends are (N, 3) or (3,) [m].
 
-    Nothing outside the grid is a known wall. A segment along the border of cells is in a wall if all of them are. Above
-    obstacles there is none.
+    Outside the grid there is no known wall. A segment along the border of cells is in a wall if all of them are.
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m = np.zeros(len(end_m))
@@ -90,7 +87,7 @@ def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Flo
 def parts_at_walls(
     partial: PartialMap, start_m: Floats, end_m: Floats
 ) -> Iterator[tuple[PartialMap, Indices, Floats, Floats]]:
-    """Yield, for walls of each height, a map with them alone, the segments (N,) that go below it, and that part."""
+    """Yield, by height of walls, a map with these walls only, the segments (N,) below their top, and their parts."""
     for top_m, walls in partial.wall_levels:
         low, high = np.minimum(start_m[:, 2], end_m[:, 2]), np.maximum(start_m[:, 2], end_m[:, 2])
         rows = np.flatnonzero(low < top_m)
@@ -109,7 +106,7 @@ def _lengths_m(partial: PartialMap, kind: CellState, start_m: Floats, end_m: Flo
 
 
 def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
-    """Return whether each link (N,) meets nothing unknown: the map is complete and at least one end is known."""
+    """Return whether links (N,) meet nothing unknown: the map is complete and at least one end is known."""
     if not partial.is_complete:
         return np.zeros(len(end_m), dtype=bool)
     known = (partial.state_at(points_m) != CellState.UNKNOWN for points_m in (start_m, end_m))
@@ -118,7 +115,7 @@ def is_enclosed(partial: PartialMap, start_m: Floats, end_m: Floats) -> Bools:
 
 
 def in_cells(partial: PartialMap, points_m: Floats) -> Floats:
-    """Return x and y of points (..., 2 or 3) [m] in cells of a map's grid, rounded to 1e-6: borders are met exactly."""
+    """Return x and y of points (..., 2 or 3) [m] in cells, rounded to 1e-6, so that borders are met exactly."""
     return np.round((points_m[..., :2] - partial.origin_m) / partial.resolution_m, 6)
 
 
@@ -128,9 +125,9 @@ def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Flo
 
 
 def line_fractions(state: States, starts: Floats, ends: Floats, uniform: NDArray[np.int32] | None = None) -> Floats:
-    """Return the fractions (N, 3), in [0, 1], of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
+    """Return the fractions (N, 3) of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
 
-    All cells outside the grid are unknown. `uniform` is what `uniform_cells` returns of `state`, where it is at hand.
+    Cells outside the grid are unknown. `uniform` is `uniform_cells(state)`, if at hand.
     """
     uniform = uniform_cells(state) if uniform is None else uniform
     fractions = np.zeros((len(ends), len(CellState)))
@@ -146,7 +143,7 @@ def line_fractions(state: States, starts: Floats, ends: Floats, uniform: NDArray
 
 
 class Segment(NamedTuple):
-    """A segment in the plane: its start, its extent along each axis, and the inverse of that [cells]."""
+    """Segment in the plane: start, extent along each axis, and its inverse [cells]."""
 
     x: float
     y: float
@@ -167,7 +164,7 @@ def segment_between(x: float, y: float, end_x: float, end_y: float) -> Segment:
 
 @njit(cache=True)
 def enter_grid(segment: Segment, ny: int, nx: int) -> tuple[float, float, int, int]:
-    """Return the fractions at which a segment enters and leaves a grid, and the x and y lines it meets first inside."""
+    """Return the fractions at which a segment enters and leaves a grid, and the first x and y lines inside."""
     enter_x, leave_x = _enter_axis(segment.x, segment.step_x, nx)
     enter_y, leave_y = _enter_axis(segment.y, segment.step_y, ny)
     enter, leave = max(enter_x, enter_y), min(leave_x, leave_y)
@@ -182,8 +179,8 @@ def leave_cells(
 ) -> tuple[float, int, int]:
     """Walk from fraction `here` out of a cell and `skip` cells around it (Amanatides and Woo 1987).
 
-    Returns the fraction reached, at most `leave`, and the x and y lines met next. The distance to each line is computed
-    afresh, so that rounding does not add up.
+    Return the fraction reached, at most `leave`, and the next x and y lines. Distances to lines are computed afresh, so
+    that rounding errors do not add up.
     """
     turn_x, turn_y = (1 if segment.step_x > 0.0 else -1), (1 if segment.step_y > 0.0 else -1)
     at_x = (line_x + turn_x * skip - segment.x) * segment.pace_x if segment.step_x != 0.0 else np.inf
@@ -202,7 +199,7 @@ def leave_cells(
 
 @njit(cache=True, nogil=True)
 def _fill_fractions(state: States, uniform: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
-    """Add the fractions of segments in cells of each state to `fractions` (N, 3), over cells of one state at once."""
+    """Add the fractions of segments in each state to `fractions` (N, 3), skipping uniform cells."""
     ny, nx = state.shape
     for i in range(len(ends)):
         segment = segment_between(starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
@@ -226,7 +223,7 @@ def _fill_fractions(state: States, uniform: NDArray[np.int32], starts: Floats, e
 
 @njit(cache=True)
 def _enter_axis(start: float, step: float, size: int) -> tuple[float, float]:
-    """Return the fractions at which a segment enters and leaves [0, size] along one axis; enter > leave if never."""
+    """Return the fractions at which a segment enters and leaves [0, size] on one axis; enter > leave if never."""
     if step == 0.0:
         return (0.0, 1.0) if 0.0 <= start <= size else (1.0, 0.0)
     low, high = -start / step, (size - start) / step
@@ -235,7 +232,6 @@ def _enter_axis(start: float, step: float, size: int) -> tuple[float, float]:
 
 @njit(cache=True)
 def _first_line(position: float, step: float) -> int:
-    """Return the first grid line that is met from `position` in the direction of `step`."""
     return int(np.floor(position)) + 1 if step > 0.0 else int(np.ceil(position)) - 1
 
 
@@ -255,16 +251,13 @@ def _freest(state: States, x: float, y: float) -> int:
 
 
 def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, Indices]:
-    """Return map, x and y (W, 3) of the transmitters of links, and which is each link's (N,).
-
-    `map_index` (N,) is the map of each link, `tx_m` (N, 3) its transmitter [m].
-    """
+    """Return map, x and y (W, 3) of the transmitters of links, and the transmitter of each link (N,)."""
     keys, index = np.unique(np.column_stack([map_index, tx_m[:, :2]]), axis=0, return_inverse=True)
     return keys, index.reshape(-1)
 
 
 def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
-    """Draw the windows (W, *WINDOWS) of transmitters of `transmitters`."""
+    """Draw the windows (W, *WINDOWS) of `transmitters`."""
     windows = np.zeros((len(keys), *WINDOWS), dtype=np.uint8)
     for number in np.unique(keys[:, 0]).astype(int):
         here = keys[:, 0] == number
@@ -275,7 +268,7 @@ def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
 def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
     """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m] of one map.
 
-    Row 0 of a window has the smallest y, and the transmitter is in the middle.
+    Row 0 of a window has the smallest y; the transmitter is in the middle.
     """
     windows = np.zeros((len(tx_m), *WINDOWS), dtype=np.uint8)
     if not (partial.state == CellState.UNKNOWN).all():
@@ -287,7 +280,7 @@ def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
 
 
 def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
-    """Return a map with the largest multiple of its cells that is no larger than `cell_m`: any wall makes a wall."""
+    """Return a map with larger cells, of at most `cell_m`; a block with a wall is a wall."""
     factor = math.floor(cell_m / partial.resolution_m + 1e-9)
     if factor < 2:
         return partial
@@ -298,7 +291,7 @@ def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
 
 
 def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
-    """Draw the window with cells of `cell_m` around a transmitter, which may be in a wall that was drawn coarser."""
+    """Draw the window with cells of `cell_m` around a transmitter, which may be in a coarsened wall."""
     state, start = _surroundings(partial, tx_m, cell_m)
     if clear_around_tx:
         column, row = np.floor(start).astype(int)
@@ -316,7 +309,7 @@ def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx
 
 
 def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[States, Floats]:
-    """Extend or cut a map to what a window covers, and return where the transmitter is in it [cells]."""
+    """Return the map part of a window, and the transmitter in it [cells]."""
     half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)
     column, row = np.floor(start).astype(int)
@@ -327,20 +320,20 @@ def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[Sta
         known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
         top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
         state[top : top + known.shape[0], left : left + known.shape[1]] = known
-    return state, np.round(start - np.array([spans[1][0], spans[0][0]]), 6)  # the same wherever the grid begins
+    return state, np.round(start - np.array([spans[1][0], spans[0][0]]), 6)  # independent of the grid's origin
 
 
 def overlaps(edges: Floats, count: int) -> Floats:
-    """Fraction of each interval between `edges` (K + 1,) that each of `count` unit cells covers: (K, count)."""
+    """Return the fractions (K, count) of intervals between `edges` (K + 1,) covered by unit cells."""
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
     return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
 
 
 def _detours(wall: Floats) -> Floats:
-    """How much longer the route around known walls is than the straight one, in [0, 1] of `_LONGEST_DETOUR`.
+    """Return the excess length of routes around known walls, in [0, 1] of `_LONGEST_DETOUR`.
 
-    Routes go from the four cells in the middle from cell to cell, also across corners; walls are crossed at a cost.
+    Routes start at the four middle cells and go from cell to cell, also diagonally; walls are crossed at a cost.
     """
     half = WINDOW_CELLS // 2
     middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]

@@ -1,14 +1,12 @@
 """Number of walls that a straight line meets in unknown cells, and its effect on links through walls.
 
-A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls of each unknown cell: how many a line
-along x, and one along y, meets on a metre. The integral over the unknown part of a line is what a second network
-corrects by the lengths of the line and its known walls. They were trained on lines in procedural buildings, in which
-walls are counted without tracing anything further (`training.walls`). The number of walls has a negative binomial
-distribution (`count_probabilities`).
+A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls per metre of lines along x and y in
+each unknown cell. A second network corrects the integral over a line by its lengths and known walls. They were trained
+on lines through procedural buildings (`training.walls`). The number of walls has a negative binomial distribution
+(`count_probabilities`).
 
 The loss of an unseen wall is the mean loss of the known walls (`by_mean_losses`). Its constants were fitted to
-procedural homes, floors and halls of several materials, whose walls lose 3 to 26 dB; `benchmarks/unseen_walls.py`
-measures others.
+procedural homes, floors and halls of materials with 3 to 26 dB per wall; `benchmarks/unseen_walls.py` evaluates others.
 """
 
 import functools
@@ -38,56 +36,58 @@ if TYPE_CHECKING:
     import keras
 
 CELL_M = 0.3
-"""Edge of the cells that the network reads [m]."""
 
 WEIGHTS_FILE = PREDICTORS_FOLDER / "unseen_walls.npz"
-"""The shipped weights."""
 
 _WIDTHS, _UNITS = (16, 32, 48, 64), 24
 _LINE_INPUTS = 6
 _POINTS, _LENGTH_M = 96, 3.0
-"""Number of points of a line at which the walls per metre are read, and the unit of lengths [m]."""
+"""Number of integration points on a line, and the unit of lengths [m]."""
 
 _FIRST, _LEAST = -1.5, -4.0
 """Initial walls per metre in training, and smallest number of walls, as logits of a softplus."""
 
 _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
-"""Width of the unknown border around what is known [m]; cells at the border of an image that the network blurs, and
-that are left out; number of cells that it joins. Images are aligned to the world by such groups of cells: neither the
-corner of a map's grid nor unknown cells around it change anything. Beyond the image, its outermost cells count."""
+"""Width of the unknown border around known cells [m]; cells at the border of an image that are blurred, and left out;
+cells joined by pooling. Images are aligned to the world by such groups of cells, so that the result does not depend
+on the map's grid or the unknown cells around it. Beyond the image, its outermost cells count.
+"""
 
 _LINES_AT_ONCE = 16_384
 _MAX_BYTES = 10_000_000
 
 WALL_LOSSES = "the mean loss of unobserved walls"
-"""Stands for the predictor's name in coverage maps."""
+"""Predictor's name in coverage maps."""
 
 LONGEST_M = 50.0
-"""Longer lines have as many walls on a metre as a line of this length [m]: lines of the training are shorter."""
+"""Longest line in training: longer lines have the same walls per metre as a line of this length [m]."""
 
 DISPERSION = 0.2
-"""Variance of the number of walls in excess of a Poisson distribution, in squares of the mean: buildings differ."""
+"""Variance of the number of walls in excess of Poisson, in squares of the mean: buildings differ."""
 
 MOST_COUNTED = 32
-"""Largest number of unseen walls on a line that is told apart from larger ones."""
+"""Largest number of unseen walls with a probability of its own."""
 
 LOSS_OF_WALL, LARGEST_LOSS_DB = 0.78, 120.0
-"""Loss of the first unseen wall in losses of a known one, as other paths add power; and upper limit of the loss of many
-walls [dB]: paths around them are the strongest there."""
+"""Loss of the first unseen wall relative to a known one, as other paths add power; upper limit of the loss of many
+walls [dB], where paths around them dominate.
+"""
 
 FOUND_WALLS = 0.43
-"""Number of walls that unseen reflections compensate, for links that are traced without LOS."""
+"""Number of walls compensated by unseen reflections, for links without traced LOS."""
 
 AROUND_RATIO, AROUND_SPREAD = 3.0, 0.9
-"""Ratio of walls on the direct line to the largest number on a path, above 1, at which other paths still reach one half
-of the receivers; scale of the logistic function of this ratio. Measured on procedural floors."""
+"""Ratio of walls on the direct line to `max_walls`, above 1, at which other paths reach half of the receivers; scale of
+the logistic function of this ratio. Measured on procedural floors.
+"""
 
 LOS_GAIN_DB = 2.0
-"""By how much unseen reflections add to a link with LOS, for the square root of an expected wall."""
+"""Gain of unseen reflections on links with LOS, times the root of the expected number of walls."""
 
 SEEN_STD_DB, LOS_STD_DB, UNSEEN_STD = 0.5, 0.8, 0.52
-"""Standard deviations of gains whose direct line is observed [dB]; of links with LOS, for the square root of an
-expected wall [dB]; and of other links, for the square root of a wall, in losses of a wall."""
+"""Standard deviations of gains with an observed direct line [dB]; of links with LOS, times the root of the expected
+number of walls [dB]; and of other links, times the root of the number of walls, in losses of a wall.
+"""
 
 
 class WallDensity(NamedTuple):
@@ -96,11 +96,11 @@ class WallDensity(NamedTuple):
     Parameters
     ----------
     per_m : (1, ny, nx, 2) float32 tensor
-        Walls on a metre along x, and along y; 0 in what is known.
+        Walls per metre along x and y; 0 in known cells.
     origin_m : (2,) array
-        The corner of the first cell [m].
+        Corner of the first cell [m].
     lines : keras.Model
-        The network that corrects integrals.
+        Network that corrects integrals.
     """
 
     per_m: Any
@@ -108,7 +108,7 @@ class WallDensity(NamedTuple):
     lines: Any
 
     def counts(self, phi: LinkFeatures) -> Floats:
-        """Return the expected number of unseen walls on the direct line (N,) of links, which have a context."""
+        """Return the expected number of unseen walls on the direct lines (N,)."""
         context = context_of(phi)
         ends = ((end_m[:, :2] - self.origin_m) / CELL_M for end_m in (context.tx_m, context.rx_m))
         scale = np.minimum(1.0, LONGEST_M / phi.distance_m)
@@ -123,7 +123,7 @@ class WallDensity(NamedTuple):
 
 
 class UnseenWalls(NamedTuple):
-    """The two networks: walls of cells, and corrections of lines."""
+    """Two networks: walls of cells, and corrections of lines."""
 
     cells: "keras.Model"
     lines: "keras.Model"
@@ -155,7 +155,7 @@ class UnseenWalls(NamedTuple):
             np.savez_compressed(stream, **arrays)
 
     def of_map(self, partial: PartialMap) -> WallDensity:
-        """Read what is known of a map."""
+        """Estimate the walls of a map."""
         known = _known_part(partial)
         x0, y0, x1, y1 = known.bounds_m
         corner_m, pooled_m = np.array([x0, y0]), _POOLED * CELL_M
@@ -183,7 +183,6 @@ def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
 
 
 def _known_part(partial: PartialMap) -> PartialMap:
-    """Return the smallest part of a map that has all known cells; the map itself if there are none."""
     known = partial.state != CellState.UNKNOWN
     if not known.any():
         return partial
@@ -196,9 +195,9 @@ def _known_part(partial: PartialMap) -> PartialMap:
 def map_image(
     partial: PartialMap, shape: tuple[int, int] | None = None, start: Floats | tuple[float, float] = (0.0, 0.0)
 ) -> NDArray[np.uint8]:
-    """Return the fraction of free and wall of each coarse cell (ny, nx, 2) [1/255].
+    """Return the fractions of free and wall of coarse cells (ny, nx, 2) [1/255].
 
-    The image begins at `start` (x, y), counted from the origin of the map [cells], and has by default its extent.
+    The image begins at `start` (x, y) from the map's origin [cells], and by default covers the map.
     """
     coarse = CELL_M / partial.resolution_m
     counts = shape or [max(1, math.ceil(count / coarse - 1e-9)) for count in partial.shape]
@@ -232,7 +231,7 @@ def walls_met(per_m: Any, start: Any, end: Any) -> Any:
 
 
 def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m: Any, known: Any) -> Any:
-    """Return the expected number of unseen walls of lines (...), from integrals, lengths and known walls."""
+    """Return the expected number of unseen walls of lines (...) from integrals, lengths and known walls."""
     lengths = (tf.math.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
     share, none = unobserved_m / (distance_m + 0.1), tf.cast(known == 0.0, tf.float32)
     inputs = tf.stack([tf.math.log(integral + 0.02), *lengths, tf.math.log(1.0 + known), share, none], axis=-1)
@@ -241,9 +240,9 @@ def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m
 
 
 def count_probabilities(walls: Floats) -> Floats:
-    """Return the probabilities (K, N) of 0, 1, ... unseen walls, and of K - 1 or more, given the mean (N,).
+    """Return the probabilities (K, N) of 0, 1, ... and K - 1 or more unseen walls, given the mean (N,).
 
-    The distribution is negative binomial: Poisson distributions, whose means have a gamma distribution.
+    The distribution is negative binomial: Poisson with gamma-distributed means.
     """
     count, failures = np.arange(MOST_COUNTED)[:, None], 1.0 / DISPERSION
     ratios = (count + failures) / (count + 1.0) * (walls / (walls + failures))
@@ -258,9 +257,8 @@ def by_mean_losses(
 ) -> tuple[Floats, Floats, Floats]:
     """Return probabilities, means and standard deviations of the gain [dB] of links through walls, each (3, N).
 
-    They are by LinkState, from the features of N links, which have a context, the expected numbers of unseen walls on
-    their direct lines (N,), and the largest number of walls on a traced path. A link that is traced in line of sight
-    has LOS if there is no unseen wall.
+    Rows are by LinkState. `walls` (N,) are the expected numbers of unseen walls on the direct lines; `max_walls` is the
+    limit of the trace. A link with traced LOS has LOS if there is no unseen wall.
     """
     blocks = [slice(first, first + _LINES_AT_ONCE) for first in range(0, max(1, len(walls)), _LINES_AT_ONCE)]
     found = [_by_mean_losses(phi.take(block), walls[block], max_walls) for block in blocks]

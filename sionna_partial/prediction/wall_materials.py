@@ -1,16 +1,14 @@
-"""The unknown material of walls: candidates for the loss of a crossed wall and of a reflection, prior and evidence.
+"""The unknown material of walls: candidates for the losses of crossings and reflections, prior and evidence.
 
 Paths do not depend on the material of the walls, only their powers do. A trace with drywall therefore gives the gains
-under every candidate: each candidate adds a loss to every wall that a path crosses, and to every reflection. The trace
-has the usual tolerance of power: in an office at 2.4 GHz the best candidate is 0.9 and 2.1 dB off separate traces with
-brick and concrete (root mean square), and 0.9 and 2.0 dB with a tenth of the tolerance and 1.5 times the time.
+under every candidate, which adds a loss to every crossing and reflection. Its limits are
+coarse (`Limits.of`), as the candidates differ by much more (`benchmarks/through_walls.py --only material`).
 
-The prior of the loss of a wall is a mixture of log-normal distributions around the mean losses of common materials at
-the frequency (`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Losses that were measured on walls of one
-name scatter by a factor of 1.7 around them. Measured powers are evidence for candidates (`Assimilation`): residuals of
-a trace are a Gaussian process of standard deviation s, white noise n, an offset and a factor on the loss of walls that
-all links have in common. Candidates differ in their residuals alone, so that one eigenvalue decomposition of the
-correlation serves all candidates and all s and n.
+The prior of the loss of a wall is a mixture of log-normal distributions around the mean losses of common materials
+(`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Measured losses of one material scatter by a factor of
+1.7. Measured powers are evidence (`Assimilation`): residuals of a trace are a Gaussian process of standard deviation s,
+white noise n, a common offset and a common factor on the loss of walls. Candidates share the correlation, so that one
+eigenvalue decomposition serves all candidates, s and n.
 """
 
 import math
@@ -26,39 +24,41 @@ from sionna_partial.settings import DRYWALL, WALL_MATERIALS
 from sionna_partial.tracing.power import wall_loss_db
 
 COMMON = {"drywall": 0.4, "brick": 0.35, "concrete": 0.25}
-"""Materials of walls and the prior probability of each."""
+"""Wall materials and their prior probabilities."""
 
 MODELS_HZ = (1e9, 40e9)
-"""Frequencies that the models of all of them cover [Hz]."""
+"""Frequencies that all material models cover [Hz]."""
 
 SCATTER = math.log(1.7)
-"""Standard deviation of the logarithm of the loss of walls of one material."""
+"""Standard deviation of the logarithm of losses of one material."""
 
 CROSSINGS, LARGEST_DB, REFLECTIONS_DB = 8, (21.0, 40.0), (0.0, 3.0)
-"""Number of losses of a wall that are compared, limits of the largest one, and extra losses of a reflection [dB]."""
+"""Number of candidate wall losses, limits of the largest, and extra losses of a reflection [dB]."""
 
 BELOW = 1.3
-"""Ratio of the smallest mean loss of the common materials to the smallest loss that is compared."""
+"""Ratio of the smallest mean loss of a common material to the smallest candidate."""
 
 LIKELY_STD_DB, LIKELY_FADING_DB = 5.0, 3.0
 """Most probable standard deviations of measured powers about a trace with the best material and offset [dB]: of a
-spatial process, for furniture, doors and people that maps lack, and of fading (`benchmarks/reality.py`)."""
+spatial process, for unmapped furniture, doors and people, and of fading (`benchmarks/reality.py`).
+"""
 
 RESIDUAL_DB = math.hypot(LIKELY_STD_DB, LIKELY_FADING_DB)
-"""Standard deviation of gains about a trace before any measurement [dB]."""
+"""Prior standard deviation of gains about a trace [dB]."""
 
 STDS_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 0.4
-"""Standard deviations of the process that are tried [dB], and the standard deviation of their logarithm."""
+"""Candidate standard deviations of the process [dB], and the prior standard deviation of their logarithm."""
 
 FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
-"""Standard deviations of what differs from receiver to receiver that are tried [dB]."""
+"""Candidate standard deviations of fading, which differs from receiver to receiver [dB]."""
 
 FADING_SPREAD = 0.5
-"""Standard deviation of their logarithm before any measurement."""
+"""Prior standard deviation of the logarithm of fading."""
 
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
-"""Exponents of the evidence of a transmitter, and of other transmitters of the building: errors of a trace are
-correlated over more than the process has."""
+"""Exponents of the evidence of a transmitter and of other transmitters: errors of a trace are correlated more than the
+process assumes.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,11 +68,11 @@ class WallMaterials:
     Parameters
     ----------
     crossing_db, reflection_db : (K,) float64 arrays
-        Loss of a crossed wall, and of a reflection, beyond drywall [dB].
+        Losses per crossing and per reflection beyond drywall [dB].
     prior : (K,) float64 array
         Probability of each candidate.
     names : tuple of K str
-        The `COMMON` material whose loss is nearest on a logarithmic scale.
+        The `COMMON` material with the nearest loss on a logarithmic scale.
     traced_db : float
         Loss of a crossed wall of drywall [dB].
     """
@@ -100,16 +100,16 @@ class WallMaterials:
         return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
 
     def under(self, phi: LinkFeatures, fraction: float = 1.0) -> list[LinkFeatures]:
-        """Return the features of links under each candidate, for that `fraction` of the walls of the map."""
+        """Return the features under each candidate; `fraction` of the walls have an unknown material."""
         pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
         return [phi.with_extra_losses(*pair, fraction) for pair in pairs]
 
     def attributes(self, weights: Floats) -> dict[str, str | float]:
-        """Return the attributes of a coverage map: the materials as a text, and the mean loss of a wall [dB]."""
+        """Return the attributes of a coverage map: the materials as text, and the mean wall loss [dB]."""
         return {"wall_material": self.text(weights), "wall_loss_db": float(weights @ self.crossing_db) + self.traced_db}
 
     def text(self, weights: Floats) -> str:
-        """Return the probabilities (K,) of the candidates by material, the most probable first."""
+        """Return the probabilities (K,) by material as text, the most probable first."""
         sums = {name: float(weights @ [name == near for near in self.names]) for name in COMMON}
         shown = sorted(((round(p, 2), name) for name, p in sums.items()), reverse=True)
         return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)
@@ -118,9 +118,8 @@ class WallMaterials:
 class Residuals(NamedTuple):
     """Residuals of P averages of `size` (P,) measurements under K candidates.
 
-    `correlation` (P, P); residuals (K, P) less the expected common part, predictions above free space (K, P), and
-    standard deviations of the predictions without the process (K, P) [dB]; prior covariance (K, 2, 2) of offset [dB]
-    and factor.
+    `correlation` is (P, P); residuals less the expected common part, predictions above free space, and standard
+    deviations without the process are (K, P) [dB]; `covariance` (K, 2, 2) is the prior of offset [dB] and factor.
     """
 
     correlation: Floats
@@ -131,9 +130,9 @@ class Residuals(NamedTuple):
     covariance: Floats
 
     def log_evidence(self, noises_db: Floats) -> Floats:
-        """Return the log-likelihood (K, S, N) for `STDS_DB` and standard deviations of noise [dB], but for a constant.
+        """Return the log-likelihood (K, S, N), up to a constant, for `STDS_DB` and noises [dB].
 
-        Noise is taken to be as large, relative to the process, at all P.
+        The ratio of noise to process is assumed equal at all P.
         """
         root = np.sqrt(self.size)
         values, vectors = np.linalg.eigh(self.correlation * root[:, None] * root)
@@ -157,7 +156,7 @@ class Residuals(NamedTuple):
 
 
 def log_std_prior() -> Floats:
-    """Return the log-probability (S, N) of `STDS_DB` and `FADINGS_DB`, but for a constant."""
+    """Return the log-probability (S, N) of `STDS_DB` and `FADINGS_DB`, up to a constant."""
     apart = np.log(np.array(STDS_DB) / LIKELY_STD_DB) / STD_SPREAD
     fading_apart = np.log(FADINGS_DB / LIKELY_FADING_DB) / FADING_SPREAD
     log_prior: Floats = -0.5 * apart[:, None] ** 2 - 0.5 * fading_apart**2

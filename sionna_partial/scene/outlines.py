@@ -1,7 +1,7 @@
-"""PartialMap -> wall outlines -> the plan that beams run in.
+"""PartialMap -> wall outlines -> plan for beams.
 
-Outlines are straight segments through the centres of the boundary wall cells. A plan has walls that meet only at ends,
-the lines that they lie on, and an index of them.
+Outlines are straight segments through the centres of boundary wall cells. A plan has walls that meet only at ends,
+their lines, and an index of them.
 """
 
 import itertools
@@ -33,13 +33,12 @@ _OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
 
 Points = Floats
-"""Points (n, 2) [cells]."""
 
 _SAME_LINE_M = 1e-6
-"""Distance from a line within which the ends of collinear walls lie [m]."""
+"""Distance from a line within which the ends of collinear walls are [m]."""
 
 _WALLS_PER_CELL = 4.0
-"""Number of wall pieces in a cell of the index, on average over the cells that hold any."""
+"""Mean number of wall pieces in occupied cells of the index."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,10 +48,9 @@ class Outlines:
     Parameters
     ----------
     vertices_m : (V, 2) float64 array
-        Ends of the segments [m]. Segments that meet share a vertex; every vertex is used.
+        Ends of the segments [m]. Adjacent segments share a vertex.
     segments : (S, 2) int64 array
-        Indices into `vertices_m` of the two ends of every segment. Where just two segments meet, one ends and the other
-        begins.
+        Indices into `vertices_m`. Where just two segments meet, one ends and the other begins.
     """
 
     vertices_m: Floats
@@ -68,7 +66,6 @@ class _Graph:
 
     @cached_property
     def degree(self) -> Indices:
-        """Number of edges (V,) at every point."""
         return np.bincount(self.edges.ravel(), minlength=len(self.points))
 
 
@@ -76,8 +73,8 @@ class _Graph:
 class _FittedChain:
     """A chain of points (n,) of a graph, and the straight runs that fit it.
 
-    Runs have lines (R, 4) of a point x, y on them and a direction x, y [cells], and begin at `first` (R,). `corners`
-    are the indices of its points where the chain turns. Runs that are `plain` (R,) keep their corners.
+    Runs have lines (R, 4) of a point x, y and a direction x, y [cells], and begin at `first` (R,). `corners` are the
+    indices of points where the chain turns. `plain` (R,) runs keep their corners.
     """
 
     points: NDArray[np.int64]
@@ -92,7 +89,6 @@ class _FittedChain:
 
     @cached_property
     def beside(self) -> tuple[Indices, Indices]:
-        """Runs before and after each of the points."""
         k = np.arange(len(self.points))
         before, after = np.searchsorted(self.first, k) - 1, np.searchsorted(self.first, k, side="right") - 1
         if self.closed:
@@ -103,15 +99,13 @@ class _FittedChain:
 def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_gap_m: float = 0.5) -> Outlines:
     """Outline the walls of a map by few straight segments, which meet only at shared vertices.
 
-    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Of a wall that
-    was seen from one side, the face on that side is outlined. Only WALL cells, and short gaps between them
-    (`bridge_gap_m`), bear outlines. An end that UNKNOWN cells follow reaches the border of the last cell. A map that is
-    turned, mirrored, padded with UNKNOWN cells or moved has the same outlines, transformed; only where a map equals its
-    own mirror image may they depend on the orientation.
+    A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Walls seen from
+    one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. Outlines turn,
+    mirror and move with the map, unless it equals its own mirror image.
 
-    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres. From 0.5 on,
-    the staircase of a tilted wall becomes one straight line. Up to twice as much is allowed on maps whose walls range
-    noise made thick and rough, and again twice as much where a face turns back and forth at least once in 10 cells.
+    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres; from 0.5 on,
+    the staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
+    ragged faces (`fit_runs`).
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
@@ -135,12 +129,10 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 
 
 def lattice_outlines(partial: PartialMap) -> Outlines:
-    """Outline the wall cells of a map as they are: the staircase through the centres of the boundary wall cells.
+    """Outline wall cells without simplification: the staircase through the centres of boundary cells.
 
-    Cells that touch by a side are joined from centre to centre, and so are two that touch by a corner where no other
-    cell joins them. Collinear steps become one segment, at 0, 45 or 90 degrees; segments meet only at shared vertices.
-    Between the faces of thick walls there is nothing: a step with full blocks of two by two cells on either side is
-    left out. A lone cell is a square, its own border.
+    Cells that share a side are joined, and so are two that share only a corner. Steps between full blocks of two by two
+    cells are left out: thick walls have only faces. A lone cell is a square.
     """
     graph = _wall_graph(partial.state == CellState.WALL, cut_spurs=False)
     lines = []
@@ -154,7 +146,7 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
 
 
 def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
-    """Turn or mirror a grid to its one orientation of the smallest bytes, so that the outlines turn with the map.
+    """Turn or mirror a grid to the orientation with the smallest bytes, so that outlines turn with the map.
 
     Returns the grid, whether it was transposed, and whether columns and rows were flipped then.
     """
@@ -171,8 +163,8 @@ def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
 def _wall_graph(wall: Bools, *, cut_spurs: bool) -> _Graph:
     """Connect the centres of boundary wall cells (ny, nx).
 
-    Edges join wall cells that touch by a side, unless both blocks of two by two cells beside the edge are full, and
-    by a corner where a block holds just these two. Spurs of one cell are cut off. Single cells become squares.
+    Edges join cells by a side, unless both blocks of two by two cells beside it are full, and by a corner of a block
+    with only these two. Spurs of one cell are cut off. Single cells become squares.
     """
     w = np.pad(wall, 1)
     block = w[:-1, :-1] & w[:-1, 1:] & w[1:, :-1] & w[1:, 1:]
@@ -200,7 +192,6 @@ def _wall_graph(wall: Bools, *, cut_spurs: bool) -> _Graph:
 
 
 def _indexed(ends: NDArray[np.int64]) -> _Graph:
-    """Graph of edges given by the points of their ends (E, 2, 2)."""
     unique, inverse = np.unique(ends[..., 1].ravel() * _KEY + ends[..., 0].ravel(), return_inverse=True)
     edges = np.sort(inverse.reshape(-1, 2), axis=1)
     edges = np.unique(edges, axis=0) if len(edges) else edges
@@ -208,10 +199,10 @@ def _indexed(ends: NDArray[np.int64]) -> _Graph:
 
 
 def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
-    """Split a graph into chains of points (n,), which have every edge once.
+    """Split a graph into chains of points (n,) that contain every edge once.
 
-    A chain passes points of two edges, and junctions where another edge leads on in about the same direction; it
-    ends elsewhere. Loops, whose first point is the last, begin at the point farthest from their centre.
+    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops begin at
+    the point farthest from their centre, which is their first and last.
     """
     beside: list[list[int]] = [[] for _ in range(len(graph.points))]
     for a, b in graph.edges.tolist():
@@ -245,7 +236,7 @@ def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
 
 
 def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int]:
-    """Continuation of a chain at a junction: (from, junction) -> next point."""
+    """Return the continuation of a chain at a junction: (from, junction) -> next point."""
     onward: dict[tuple[int, int], int] = {}
     for junction in np.nonzero(graph.degree > 2)[0].tolist():
         arms, tips = beside[junction], []
@@ -269,13 +260,12 @@ def _onward(graph: _Graph, beside: list[list[int]]) -> dict[tuple[int, int], int
 
 
 def _turns(points: NDArray[np.generic]) -> Bools:
-    """Return whether a polyline (n, 2) turns at each of its inner points (n - 2,)."""
     step = np.diff(points.astype(np.float64), axis=0)
     return cross(step[1:], step[:-1]) != 0.0
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
-    """Vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
+    """Return vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
     peeled = np.pad(peeled, 2)
     column, row = points.T // 2 + 2
     towards = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -284,7 +274,6 @@ def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
 
 
 def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: float) -> _FittedChain:
-    """Fit straight runs to a chain, moved to the middle of walls two cells thick."""
     points = graph.points[chain] / 2.0
     corners = np.concatenate([[0], np.nonzero(_turns(points))[0] + 1, [len(points) - 1]])
     starts, lines = fit_runs(points[corners], tolerance)
@@ -298,7 +287,6 @@ def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: f
 
 
 def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points], list[Indices]]:
-    """Vertices of every chain, and the run that each of its segments belongs to."""
     nodes = _placed_nodes(graph, chains)
     lines, runs = [], []
     for chain in chains:
@@ -327,7 +315,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
 
 
 def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points]:
-    """Positions of chain ends and junctions: where the lines that meet there come closest."""
+    """Return positions of chain ends and junctions, closest to the lines that meet there."""
     lines: dict[int, list[Floats]] = {}
     pinned: set[int] = set()
     for chain in chains:
@@ -345,7 +333,7 @@ def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points
 
 
 def _closest(lines: Floats, near: Points) -> Points:
-    """Point of least squared distance to lines (k, 4), or the middle of the feet of `near` if that is far away."""
+    """Return the least-squares intersection of lines (k, 4), or the mean foot of `near` if that is far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (normal * (lines[:, :2] - near)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
@@ -353,7 +341,6 @@ def _closest(lines: Floats, near: Points) -> Points:
 
 
 def _meeting(pair: Floats, near: Points) -> Points:
-    """Vertices (1 or 2, 2) where two runs with lines (2, 4) meet near a point."""
     direction = pair[:, 2:]
     feet = pair[:, :2] + ((near - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
     if abs(cross(direction[0], direction[1])) > 0.05:
@@ -367,7 +354,6 @@ def _meeting(pair: Floats, near: Points) -> Points:
 
 
 def _make_crossing_plain(lines: list[Points], runs: list[Indices], chains: list[_FittedChain]) -> bool:
-    """Make runs plain whose segments meet others away from a shared vertex; return whether there were any."""
     if not lines:
         return False
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
@@ -389,7 +375,6 @@ def _make_crossing_plain(lines: list[Points], runs: list[Indices], chains: list[
 
 
 def _assembled(lines: list[Points], cell_m: float) -> Outlines:
-    """Join polylines whose segments meet only at equal vertices."""
     if not lines:
         return Outlines(np.zeros((0, 2)), np.zeros((0, 2), dtype=np.int64))
     pairs = np.concatenate([np.stack([line[:-1], line[1:]], axis=1) for line in lines])
@@ -401,7 +386,7 @@ def _assembled(lines: list[Points], cell_m: float) -> Outlines:
 
 
 def _extended(outlines: Outlines, state: States) -> Points:
-    """Vertices, with ends that UNKNOWN cells follow moved from the centre of the last cell to its border."""
+    """Return the vertices, with ends before UNKNOWN cells moved to the border of the last cell."""
     vertices, segments = outlines.vertices_m.copy(), outlines.segments
     ends, tails = segments.ravel(), segments[:, ::-1].ravel()
     along = vertices[ends] - vertices[tails]
@@ -420,7 +405,7 @@ def _extended(outlines: Outlines, state: States) -> Points:
 def cut_by_material(outlines: Outlines, partial: PartialMap) -> tuple[Outlines, Indices]:
     """Cut outlines where the material of the wall cells changes, and sort them by material (S,).
 
-    A point of an outline has the material of the nearest wall cell; a piece shorter than a cell, of its neighbour.
+    A point has the material of the nearest wall cell; pieces shorter than a cell, the material of a neighbour.
     """
     count = len(outlines.segments)
     if partial.wall_material is None or not count:
@@ -453,10 +438,10 @@ def cut_by_material(outlines: Outlines, partial: PartialMap) -> tuple[Outlines, 
 
 
 class WallIndex(NamedTuple):
-    """Square cells over a plan, row by row, and the wall pieces that may cross each.
+    """Index of the wall pieces that may cross each cell of a square grid, row by row.
 
-    `grid` (5,) is the corner x0 and y0 and the edge of the cells [m], and the numbers of columns and rows. The pieces
-    of a cell are `piece` (E,) from `start` (B + 1,) of the cell to `start` of the next.
+    `grid` (5,) is the corner x0, y0 and the edge of cells [m], and the numbers of columns and rows. Cell b has the
+    pieces `piece[start[b] : start[b + 1]]`.
     """
 
     grid: Floats
@@ -467,8 +452,8 @@ class WallIndex(NamedTuple):
 class Plan(NamedTuple):
     """Walls of a floor plan, cut where they cross.
 
-    `pieces_m` (K, 2, 2) are the end points of the pieces [m], `owner` (K,) the wall segments that they are parts of,
-    `line` (K,) the numbers of the infinite lines that they lie on, and `low` (K,) whether they end below the ceiling.
+    Pieces have end points `pieces_m` (K, 2, 2) [m], wall segments `owner` (K,), numbers of infinite lines `line` (K,),
+    and `low` (K,) where they end below the ceiling.
     """
 
     pieces_m: Floats
@@ -481,8 +466,8 @@ class Plan(NamedTuple):
 class PointBins(NamedTuple):
     """Points (N, 2) [m] sorted into square bins, row by row.
 
-    `order` (N,) is the index of each of them before sorting, `start` (B + 1,) the first point of each bin; `grid` (4,)
-    the corner x0 and y0 and the edge of the bins [m], and the number of columns.
+    `order` (N,) are the indices before sorting, `start` (B + 1,) the first point of each bin, `grid` (4,) the corner
+    x0, y0 and the edge of bins [m], and the number of columns.
     """
 
     points_m: Floats
@@ -492,7 +477,7 @@ class PointBins(NamedTuple):
 
 
 def prepare_plan(walls_m: Floats, low: Bools | None = None) -> Plan:
-    """Cut walls (S, 2, 2) [m], of which some may be `low` (S,), where they cross, and find collinear ones."""
+    """Cut walls (S, 2, 2) [m], some of them `low` (S,), where they cross, and find collinear ones."""
     pieces_m, owner = _split_at_crossings(walls_m)
     low = np.zeros(len(walls_m), dtype=np.bool_) if low is None else low
     return Plan(pieces_m, owner, _line_ids(pieces_m), low[owner], _index(pieces_m))
@@ -513,8 +498,8 @@ def bin_points(points_m: Floats) -> PointBins:
 
 
 @njit(cache=True)
-def grow(array, size):  # type: ignore[no-untyped-def]
-    """Return the array, enlarged to hold `size` rows if it does not."""
+def grow(array, size):
+    """Return the array, enlarged if it has fewer than `size` rows."""
     if size <= array.shape[0]:
         return array
     larger = np.empty((max(size, 2 * array.shape[0]),) + array.shape[1:], array.dtype)  # noqa: RUF005 (numba)
@@ -524,7 +509,7 @@ def grow(array, size):  # type: ignore[no-untyped-def]
 
 
 def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Cut segments where others cross them: the pieces (K, 2, 2), which meet only at ends, and their owners (K,)."""
+    """Cut segments where others cross them; return pieces (K, 2, 2) that meet only at ends, and their owners (K,)."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     lines = shapely.linestrings(walls)
     own, other = shapely.STRtree(lines).query(lines, predicate="intersects")
@@ -543,7 +528,7 @@ def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
 
 
 def _line_ids(walls: Floats) -> NDArray[np.int32]:
-    """Give numbers to the infinite lines that the segments lie on; collinear segments share one."""
+    """Assign numbers to infinite lines of segments; collinear segments share one."""
     if len(walls) == 0:
         return np.zeros(0, np.int32)
     along = walls[:, 1] - walls[:, 0]
@@ -563,7 +548,6 @@ def _line_ids(walls: Floats) -> NDArray[np.int32]:
 
 
 def _index(walls: Floats) -> WallIndex:
-    """Sort wall pieces into cells."""
     if len(walls) == 0:
         return WallIndex(np.array([0.0, 0.0, 1.0, 1.0, 1.0]), np.zeros(2, np.int64), np.zeros(0, np.int32))
     low, high = walls.min(axis=(0, 1)), walls.max(axis=(0, 1))
@@ -578,8 +562,7 @@ def _index(walls: Floats) -> WallIndex:
 
 
 @njit(cache=True)
-def _cells_of(walls, grid):  # type: ignore[no-untyped-def]
-    """Cells that each wall may cross: their numbers, and the walls."""
+def _cells_of(walls, grid):
     x0, y0, edge, columns, rows = grid[0], grid[1], grid[2], int(grid[3]), int(grid[4])
     cell, piece, count = np.empty(1024, np.int64), np.empty(1024, np.int32), np.int64(0)
     for i in range(len(walls)):

@@ -1,4 +1,4 @@
-"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the one module that writes scenes."""
+"""PartialMap -> SceneGeometry -> Mitsuba XML + PLY: the only module that writes scenes."""
 
 import itertools
 import logging
@@ -31,11 +31,10 @@ from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSetti
 _log = logging.getLogger(__name__)
 
 FLAT_SHAPES = ("floor", "ceiling")
-"""Shapes of an exported floor plan other than its walls."""
 
 
 SIONNA_LOAD_GHZ = 3.5
-"""Frequency at which Sionna RT evaluates the materials of a scene while it loads it [GHz]."""
+"""Frequency at which Sionna RT evaluates the materials of a scene while loading it [GHz]."""
 
 
 VERTEX_STD_M = 0.03
@@ -43,7 +42,7 @@ VERTEX_STD_M = 0.03
 
 
 class _Walls(NamedTuple):
-    """Outlines, and of each segment the number of its material (S,) and its height (S,) [m]."""
+    """Outlines, and material index and height [m] of each segment (S,)."""
 
     outlines: Outlines
     material: Indices
@@ -60,7 +59,6 @@ class Lid(NamedTuple):
 
 
 _NO_MATERIAL = Material(itu="vacuum")
-"""Stands for the default material where the materials that a map names are sought."""
 
 
 @dataclass(frozen=True)
@@ -72,19 +70,17 @@ class SceneGeometry:
     vertices_m : (V, 2) float64 array
         Ends of the wall outlines [m].
     segments : (S, 2) int64 array
-        Walls, as indices into `vertices_m`.
+        Walls, as indices into `vertices_m`, sorted by material.
     open_end : (V,) bool array
-        End of a wall because observation ended there: the space beyond it is not free.
+        True where a wall ends because observation ended.
     wall_material : (S,) int64 array
-        Index of the material of each wall in `materials`; walls are in the order of their materials.
-    materials : tuple of Material
-        The first is the material of floor and ceiling.
+        Index into `materials`; the first of these is also the material of floor and ceiling.
     top_m : (S,) float64 array
-        Height of each wall: `height_m`, or the height of an obstacle below it [m].
+        Height of each wall [m]; less than `height_m` for obstacles.
     lids : tuple of Lid
         Tops of obstacles that enclose an area.
     floor_m : (R, 4) float64 array
-        Rectangles x0, y0, x1, y1 of floor and ceiling [m], on a lattice of `cell_m`; they do not overlap.
+        Disjoint rectangles x0, y0, x1, y1 of floor and ceiling [m], on a lattice of `cell_m`.
     origin_m : (float, float)
         World x and y of the local frame's origin [m].
     """
@@ -104,7 +100,7 @@ class SceneGeometry:
 
     @property
     def shapes(self) -> tuple[str, ...]:
-        """Names of the shapes in the order in which faces are counted; those that are empty are not exported."""
+        """Names of the shapes in the order of faces; empty ones are not exported."""
         walls = (f"walls{index or ''}" for index in range(len(self.materials)))
         return (*walls, *FLAT_SHAPES, *(f"lid{number}" for number in range(len(self.lids))))
 
@@ -115,24 +111,21 @@ class SceneGeometry:
 
     @cached_property
     def plan(self) -> Plan:
-        """The walls, cut where they cross."""
         return prepare_plan(self.walls_m, self.top_m < self.height_m)
 
     @property
     def floor_face(self) -> int:
-        """First face of the floor, -1 if there is none: faces count through walls, floor and ceiling."""
+        """First face of the floor, -1 without a floor; faces are counted through walls, floor and ceiling."""
         return 2 * len(self.segments) if len(self.floor_m) else -1
 
     @property
     def ceiling_face(self) -> int:
-        """First face of the ceiling, -1 if there is none."""
         return self.floor_face + len(self.floor_mesh[1]) if len(self.floor_m) and self.ceiling else -1
 
     @property
     def lid_faces(self) -> list[int]:
-        """First face of each lid."""
         flats = len(self.floor_mesh[1]) * (1 + self.ceiling) if len(self.floor_m) else 0
-        return np.cumsum([2 * len(self.segments) + flats, *(len(each.triangles) for each in self.lids)])[:-1].tolist()
+        return np.cumsum([2 * len(self.segments) + flats, *(len(lid.triangles) for lid in self.lids)])[:-1].tolist()
 
     @cached_property
     def floor_mesh(self) -> tuple[Floats, NDArray[np.int64]]:
@@ -141,7 +134,7 @@ class SceneGeometry:
 
 
 def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> SceneSettings:
-    """Return the settings of a map's scene, with the map's own material, or drywall in place of None."""
+    """Return the settings of a map's scene, with None replaced by the map's own material or the default."""
     settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.traced_material
     used = partial.environment.known_materials(default)
@@ -155,7 +148,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
 
 
 def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
-    """Return whether neither the settings nor the map name the material of some walls; meshes name all or none."""
+    """Return whether settings and map leave the material of some walls open."""
     if partial.mesh is None:
         return settings.material is None and partial.unnamed_walls > 0.0
     named = partial.environment.known_materials(_NO_MATERIAL) != {_NO_MATERIAL}
@@ -163,7 +156,7 @@ def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw: int = 0) -> SceneGeometry:
-    """Turn a map into walls, floor and ceiling; the vertices of drawn walls, of draw 1 and more, are moved."""
+    """Convert a map to walls, floor and ceiling; `draw` >= 1 moves the vertices of walls at random."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
     walls = _walls(partial, settings)
@@ -187,7 +180,6 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw
 
 
 def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
-    """Outline walls, and obstacles of each height on their own, in the order of their materials."""
     parts, count = list[_Walls](), 0
     for top_m, walls in partial.wall_levels:
         if settings.outline == "cells":
@@ -198,10 +190,10 @@ def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
         height_m = np.full(len(material), min(top_m, partial.wall_height_m))
         parts.append(_Walls(replace(outlines, segments=outlines.segments + count), material, height_m))
         count += len(outlines.vertices_m)
-    material = np.concatenate([each.material for each in parts])
+    material = np.concatenate([part.material for part in parts])
     order = np.argsort(material, kind="stable")
-    vertices_m = np.concatenate([each.outlines.vertices_m for each in parts])
-    segments = np.concatenate([each.outlines.segments for each in parts])[order]
+    vertices_m = np.concatenate([part.outlines.vertices_m for part in parts])
+    segments = np.concatenate([part.outlines.segments for part in parts])[order]
     return _Walls(
         Outlines(vertices_m, segments), material[order], np.concatenate([each.top_m for each in parts])[order]
     )
@@ -216,24 +208,21 @@ def export_scene(
 ) -> Path:
     """Write a map as a scene folder that stock Sionna RT loads.
 
-    The folder holds `scene.xml`, `meshes/walls.ply`, `meshes/floor.ply` and `meshes/ceiling.ply` (those that are
-    not empty; `meshes/walls1.ply` and so on are walls of the map's `wall_materials`), and the map itself as
-    `map.yaml` and `map.pgm`, from which `load_map` reads it back. Scene coordinates are the map's world coordinates
-    less `scene_offset` in `map.yaml`: [0, 0], or the lower-left corner of a map that reaches farther than `FAR_M`
-    from the origin.
-
-    A map with a mesh has its `meshes/part0.ply` and so on, one for each material, in place of walls, floor and
-    ceiling, and a `scene_offset` of three whole numbers; axes on which it lies on both sides of the origin stay.
+    The folder holds `scene.xml`, the non-empty ones of `meshes/walls.ply`, `meshes/walls1.ply` (and so on, for
+    `wall_materials`), `meshes/floor.ply` and `meshes/ceiling.ply`, or `meshes/part0.ply` and so on for the materials
+    of a mesh, and the map as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates
+    minus `scene_offset` in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the
+    map, or whole metres on the far axes of a mesh.
 
     Parameters
     ----------
     partial : PartialMap
     folder : path-like
-        New or empty folder, or an exported scene that is replaced.
+        New or empty folder, or an exported scene, which is replaced.
     scene_settings : SceneSettings, optional
         Tolerances, floor extent and material.
     frequency_hz : float
-        Frequency [Hz] at which an ITU material is evaluated that Sionna RT cannot load by its name.
+        Frequency [Hz] for ITU materials that Sionna RT cannot load by name.
 
     Returns
     -------
@@ -245,7 +234,7 @@ def export_scene(
     SettingsError
         For a frequency that the material does not cover.
     OutputError
-        If writing fails; nothing half written is left behind.
+        If writing fails. No partial scene remains.
 
     Examples
     --------
@@ -259,8 +248,8 @@ def export_scene(
     require_map("partial", partial)
     settings, environment = scene_settings_of(partial, scene_settings), partial.environment
     offset_m = environment.scene_offset_m(partial.bounds_m)
-    for each in environment.known_materials(settings.traced_material):
-        each.require_frequency(frequency_hz)
+    for material in environment.known_materials(settings.traced_material):
+        material.require_frequency(frequency_hz)
     with atomic_folder(folder) as target:
         write_map(partial, target, settings, offset_m=offset_m, frequency_hz=frequency_hz)
         write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})
@@ -278,7 +267,7 @@ def write_map(
 ) -> tuple[Path, SceneGeometry | SceneMesh]:
     """Write the scene of a map into an existing folder; return its `scene.xml` and its geometry.
 
-    Settings come from `scene_settings_of`; `offset_m` as of `write_scene`.
+    `settings` come from `scene_settings_of`; `offset_m` as in `write_scene`.
     """
     environment = partial.environment
     if isinstance(environment, SceneMesh):
@@ -294,11 +283,10 @@ def write_map(
 def write_scene(
     geometry: SceneGeometry, folder: Path, *, offset_m: Sequence[float], frequency_hz: float = CARRIER_FREQUENCY_HZ
 ) -> Path:
-    """Write `scene.xml`, whose path is returned, and its meshes into an existing folder.
+    """Write `scene.xml` and its meshes into an existing folder, and return the path of `scene.xml`.
 
-    The world x and y `offset_m` become the scene's origin; `geometry.origin_m` gives local coordinates. Wall i is made
-    of the triangles 2 i and 2 i + 1, counted through `geometry.shapes`; walls of one material that meet share vertices,
-    so that they form wedges.
+    World x and y `offset_m` become the origin; `geometry.origin_m` gives local coordinates. Wall i has the triangles 2
+    i and 2 i + 1, counted through `geometry.shapes`. Adjacent walls of one material share vertices and so form wedges.
     """
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     scene = _new_scene(folder)
@@ -322,11 +310,10 @@ def write_mesh_scene(
     default_material: Material,
     frequency_hz: float = CARRIER_FREQUENCY_HZ,
 ) -> Path:
-    """Write `scene.xml`, whose path is returned, and the meshes of a SceneMesh into an existing folder.
+    """Write `scene.xml` and the meshes of a SceneMesh, and return the path of `scene.xml`.
 
-    The shape `part0` has the triangles of the mesh's first material, in their order, `part1` the triangles of the
-    second, and so on; parts without triangles are left out. Triangles of a part share their vertices. The world
-    position `offset_m`, (x, y) or (x, y, z), becomes the scene's origin.
+    The shapes `part0`, `part1`, ... have the triangles of each material in order; empty ones are left out. The world
+    position `offset_m`, (x, y) or (x, y, z), becomes the origin.
     """
     shift = np.zeros(3)
     shift[: len(offset_m)] = offset_m
@@ -341,7 +328,7 @@ def write_mesh_scene(
 
 
 def constants_of(material: Material, frequency_hz: float) -> tuple[float, float]:
-    """Return relative permittivity and conductivity [S/m] at a frequency (of ITU: ITU-R P.2040-3, eq. 28 and 29)."""
+    """Return relative permittivity and conductivity [S/m] at a frequency (ITU-R P.2040-3, eq. 28 and 29)."""
     if material.itu is None:
         grown = (frequency_hz / CARRIER_FREQUENCY_HZ) ** material.conductivity_exponent
         return material.relative_permittivity, material.conductivity_s_m * grown
@@ -367,7 +354,7 @@ def _write_xml(scene: ET.Element, folder: Path) -> Path:
 
 
 def _write_ply(path: Path, vertices_m: Floats, triangles: NDArray[np.integer]) -> None:
-    """Write a mesh with all digits of its vertices (trimesh would round them to float32)."""
+    """Write a mesh in float64; trimesh would round to float32."""
     faces = np.empty(len(triangles), dtype=[("count", "u1"), ("index", "<i4", 3)])
     faces["count"], faces["index"] = 3, triangles
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {len(vertices_m)}"]
@@ -377,7 +364,6 @@ def _write_ply(path: Path, vertices_m: Floats, triangles: NDArray[np.integer]) -
 
 
 def _add_shape(scene: ET.Element, name: str, material: str) -> None:
-    """Add the shape of `meshes/NAME.ply` to a scene, of a material that it has."""
     shape = ET.SubElement(scene, "shape", type="ply", id=name)
     ET.SubElement(shape, "string", name="filename", value=f"meshes/{name}.ply")
     ET.SubElement(shape, "boolean", name="face_normals", value="true")
@@ -385,7 +371,7 @@ def _add_shape(scene: ET.Element, name: str, material: str) -> None:
 
 
 def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz: float) -> None:
-    """Add a material to a scene: an ITU one by its name where Sionna RT can load it so, any other by its constants."""
+    """Add an ITU material by name if Sionna RT can load it so, any other by its constants."""
     itu = material.itu
     # Sionna RT 2.2.0 has no display colour for vacuum, and fails.
     if itu is not None and itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu]):
@@ -400,7 +386,6 @@ def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz
 
 
 def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64]]]:
-    """Vertices (V, 3) [m] and triangles (F, 3) of each shape, in the local frame."""
     low = np.column_stack([geometry.vertices_m, np.zeros(len(geometry.vertices_m))])
     up = np.array([0.0, 0.0, geometry.height_m])
     (a, b), levels = geometry.segments.T, np.unique([geometry.height_m, *geometry.top_m])
@@ -420,7 +405,7 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64
 
 
 def _lids(partial: PartialMap, walls: _Walls) -> Iterator[Lid]:
-    """Cover the areas that outlines of obstacles of one height enclose, and that are not for the most part free."""
+    """Cover the areas inside outlines of obstacles of one height, except mostly free ones."""
     free = partial.state == CellState.FREE
     row, column = np.indices(partial.shape)
     centres_m = (np.stack([column, row], axis=-1) + 0.5) * partial.resolution_m
@@ -442,7 +427,7 @@ def _lids(partial: PartialMap, walls: _Walls) -> Iterator[Lid]:
 
 
 def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
-    """Find the vertices (V,) where one wall ends and the cell beyond its end is not free."""
+    """Return the vertices (V,) where a single wall ends and the next cell is not free."""
     ends, tails = outlines.segments.ravel(), outlines.segments[:, ::-1].ravel()
     along = outlines.vertices_m[ends] - outlines.vertices_m[tails]
     along *= 0.75 * partial.resolution_m / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
@@ -453,9 +438,9 @@ def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
 
 
 def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.int64]]:
-    """Corners (V, 2) and counterclockwise triangles (F, 3) of an area.
+    """Return corners (V, 2) and counterclockwise triangles (F, 3) of an area.
 
-    Triangles share whole edges: an edge inside the area must not look like the rim of a screen, which diffracts.
+    Triangles share whole edges: an inner edge must not look like the rim of a screen, which diffracts.
     """
     area = shapely.simplify(shapely.union_all(shapely.box(*np.rint(rectangles_m / cell_m).T)), 0.0)
     rings = shapely.get_coordinates(shapely.orient_polygons(_pieces(area))).reshape(-1, 4, 2)[:, :3]
@@ -478,7 +463,6 @@ def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
 
 
 def floor_cells(partial: PartialMap, extent: str) -> Bools:
-    """Return the cells (ny, nx) that floor and ceiling cover."""
     if extent == "none":
         return np.zeros(partial.shape, dtype=bool)
     free = partial.wall_levels[0][1].state == CellState.FREE
@@ -487,7 +471,6 @@ def floor_cells(partial: PartialMap, extent: str) -> Bools:
 
 
 def _rectangles(mask: Bools) -> NDArray[np.int64]:
-    """Cover the cells of a mask exactly by few rectangles x0, y0, x1, y1 in cells: equal runs of rows merge."""
     row, start, end = row_runs(mask)
     order = np.lexsort((row, end, start))
     row, start, end = row[order], start[order], end[order]

@@ -1,7 +1,6 @@
-"""The one door to Sionna RT: Dr.Jit and Mitsuba are imported here and nowhere else.
+"""The only package that imports Dr.Jit and Mitsuba.
 
-- `finder` writes the scene of a map and finds its paths: exact candidates of floor plans (`plan`), or those that rays
-  find in meshes (`mesh`), which `engine` verifies on Sionna RT's internals.
-- `trace` is the door for links, and shoots rays for what only rays find; `path_set` is the forward model: power and
-  vertices of paths found once, for other parameters, and their derivatives.
+- `finder` writes the scene of a map and finds its paths: candidates of floor plans (`plan`) or meshes (`mesh`), which
+  `engine` verifies.
+- `simulation` is the entry for links; `path_set` evaluates and differentiates paths for other parameters.
 """

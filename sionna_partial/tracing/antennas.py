@@ -1,4 +1,4 @@
-"""Antennas: patterns, measured ones too, arrays of Sionna RT as NumPy arrays, and the transmit antenna of a map."""
+"""Antennas: patterns, Sionna RT's arrays as NumPy arrays, and the transmit antenna of a map."""
 
 import logging
 import math
@@ -33,20 +33,22 @@ from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
 from sionna_partial.tracing.power import ISOTROPIC, Gains
 
 PATTERNS, POLARISATIONS = ("iso", "dipole", "hw_dipole", "tr38901"), ("V", "H", "VH", "cross")
-"""Antenna patterns and polarisations that Sionna RT has."""
+"""Antenna patterns and polarisations of Sionna RT."""
 
 MAX_ANTENNAS = 4096
 """Largest number of antennas of a codebook."""
 
 MAX_GAIN_DBI, MAX_LOSS_DB = 60.0, 200.0
-"""Largest gain of a pattern, and how far below it a direction may be."""
+"""Largest gain of a pattern [dBi], and largest loss relative to it [dB]."""
 
 MAX_RADIATED, NOTED_RADIATED = 2.0, 1.25
-"""Power that a pattern radiates as a fraction of the power that it is fed: patterns above the first are refused, and
-patterns above the second logged. No antenna exceeds 1, but two cuts give the power of a measured antenna to 2 dB."""
+"""Radiated fraction of the fed power above which patterns are refused, and logged.
+
+No antenna exceeds 1, but two cuts give the power of a measured antenna to 2 dB only.
+"""
 
 FREQUENCY_RATIO = 1.3
-"""Ratio of frequencies from which on the pattern of an antenna differs."""
+"""Ratio of frequencies from which the pattern of an antenna differs."""
 
 _DIPOLE_DBI = 2.15
 _LARGEST_GAP_DEG = 90.0
@@ -67,12 +69,12 @@ def planar_array(rows: int, columns: int, pattern: str = "iso", polarization: st
 
 
 def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.complex128]:
-    """Return the beams of a planar array that are orthogonal to each other, as weights of its antennas.
+    """Return the orthogonal beams of a planar array as weights of its antennas.
 
     Parameters
     ----------
     rows, columns : int
-        Those of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
+        As of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
     polarisations : int
         2 for a dual-polarised array: beams of the first polarisation come first.
 
@@ -84,7 +86,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
     Raises
     ------
     SettingsError
-        For numbers that are none of an array.
+        For numbers out of range.
 
     Examples
     --------
@@ -103,7 +105,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
 
 @dataclass(frozen=True)
 class Antennas:
-    """One antenna array, at every transmitter or at every receiver.
+    """Antenna array at every transmitter or at every receiver.
 
     Antennas are numbered as in Sionna RT: all positions (A, 3) [m] with the first of K patterns, then with the second.
     Rotations from the array to the world are (1, 3, 3), or one for each of E ends.
@@ -136,19 +138,18 @@ class Antennas:
         return cls(positions_m, array.antenna_pattern.patterns, rotation)
 
     def __len__(self) -> int:
-        """Return the number of antennas, K A."""
         return len(self.patterns) * len(self.positions_m)
 
     def rotations(self, end: NDArray[np.integer[Any]]) -> Floats:
-        """Rotation (P, 3, 3) at the end of each path (P,), or (1, 3, 3) if all are the same."""
+        """Return the rotation (P, 3, 3) at the end of each path (P,), or (1, 3, 3) if all are the same."""
         return self.rotation if len(self.rotation) == 1 else self.rotation[end]
 
     def advance_m(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> Floats:
-        """Return the path advance (P, A) [m] of plane waves from zenith and azimuth (P, 2) at each antenna position."""
+        """Return the path advance (P, A) [m] of plane waves from zenith and azimuth (P, 2) at each antenna."""
         return self._local(directions(angles_rad)[0], end) @ self.positions_m.T
 
     def fields(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> NDArray[np.complex128]:
-        """Patterns (P, K, 2) along the world's theta and phi, in directions of zenith and azimuth (P, 2)."""
+        """Return the patterns (P, K, 2) along the world's theta and phi, for zenith and azimuth (P, 2)."""
         toward, theta, phi = directions(angles_rad)
         local_rad = zenith_azimuth(self._local(toward, end))
         local_theta = np.einsum("pij,pj->pi", self.rotations(end), directions(local_rad)[1])
@@ -157,7 +158,6 @@ class Antennas:
         return np.stack([np.stack([cosine * t - sine * p, sine * t + cosine * p], axis=1) for t, p in found], axis=1)
 
     def _local(self, vectors: Floats, end: NDArray[np.integer[Any]]) -> Floats:
-        """Vectors (P, 3) of the world in the coordinates of the array."""
         if len(self.rotation) == 1:
             return vectors @ self.rotation[0]
         return np.einsum("pji,pj->pi", self.rotation[end], vectors)
@@ -179,15 +179,13 @@ class AntennaPattern(Shown):
         Loss relative to it at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
         above, and downwards from the horizon.
     frequency_hz : float, optional
-        Frequency at which it was measured. Traces at a frequency that differs by a factor of more than 1.3 log a
-        warning.
+        Frequency of the measurement. Traces that differ by a factor of more than 1.3 log a warning.
 
     Raises
     ------
     SettingsError
         For a gain above 60 dBi, cuts of another shape or with values outside 0 to 200 dB, or a pattern that radiates
-        more than twice the power that it is fed. A gain that is the same in all directions is no pattern: one above
-        0 dBi stands for an amplifier, and logs a warning.
+        more than twice the fed power. A uniform gain above 0 dBi is an amplifier and logs a warning.
 
     Examples
     --------
@@ -218,12 +216,13 @@ class AntennaPattern(Shown):
             require_number("frequency_hz", self.frequency_hz, 0.0, 1e12, open_low=True)
         if self.uniform_gain_dbi is None:
             self._require_passive()
-        elif self.radiated > NOTED_RADIATED:
-            message = "antenna %r: a gain of %g dBi in all directions is no antenna, unless an amplifier is part of it"
-            _log.warning(message, self.name, self.gain_dbi)
+            fault = f"it radiates {self.radiated:.2f} times the power that it is fed: its gain or cuts are too large"
+        else:
+            fault = f"a gain of {self.gain_dbi:g} dBi in all directions is no antenna, unless it has an amplifier"
+        if self.radiated > NOTED_RADIATED:
+            _log.warning("antenna %r: %s", self.name, fault)
 
     def _require_passive(self) -> "AntennaPattern":
-        """Raise a SettingsError if it radiates too much, otherwise return it."""
         radiated = self.radiated
         most_dbi = self.gain_dbi - 10.0 * math.log10(radiated)
         remedy = (
@@ -231,16 +230,11 @@ class AntennaPattern(Shown):
             f"narrower cuts, or at most {most_dbi:.1f} dBi."
         )
         require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
-        if radiated > NOTED_RADIATED:
-            message = (
-                "antenna %r radiates %.2f times the power that it is fed: its gain is too high, or its cuts too wide"
-            )
-            _log.warning(message, self.name, radiated)
         return self
 
     @property
     def radiated(self) -> float:
-        """Power that it radiates in all directions, as a fraction of the power that it is fed."""
+        """Power radiated in all directions, as a fraction of the fed power."""
         angles_rad, weights = _sphere()
         return float(weights @ np.abs(self.amplitude(angles_rad)) ** 2)
 
@@ -273,12 +267,12 @@ class AntennaPattern(Shown):
 
     @property
     def uniform_gain_dbi(self) -> float | None:
-        """Gain of a pattern that is the same in all directions [dBi]; None of any other pattern."""
+        """Gain if it is the same in all directions [dBi], otherwise None."""
         cuts = self.horizontal_db, self.vertical_db
         return None if any(np.ptp(cut) for cut in cuts) else self.gain_dbi - max(float(cut[0]) for cut in cuts)
 
     def amplitude(self, local_rad: Floats) -> NDArray[np.complex128]:
-        """Square root (P,) of the gain towards zenith and azimuth (P, 2)."""
+        """Return the square root (P,) of the gain towards zenith and azimuth (P, 2)."""
         down_deg, left_deg = np.degrees(local_rad[:, 0]) - 90.0, np.degrees(local_rad[:, 1])
         cuts = ((left_deg, self.horizontal_db), (down_deg, self.vertical_db))
         loss_db = sum(np.interp(angle_deg, np.arange(360), cut, period=360.0) for angle_deg, cut in cuts)
@@ -289,16 +283,15 @@ class AntennaPattern(Shown):
 def load_antenna(path: str | Path) -> AntennaPattern:
     r"""Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
 
-    A gain without unit is in dBd, as the format has it. Horizontal angles are clockwise from the main direction,
-    vertical ones from the horizon downwards. An electrical tilt is in the cuts. Antennas are computed with vertical
-    polarisation: other polarisations than vertical and horizontal log a warning.
+    A gain without unit is in dBd. Horizontal angles are clockwise from the main direction, vertical ones from the
+    horizon downwards; cuts include an electrical tilt. Antennas are computed with vertical polarisation: other
+    polarisations than vertical and horizontal log a warning.
 
     Raises
     ------
     SettingsError
-        If the file cannot be read, is larger than 1 MB, lacks its gain or one of the cuts, has one of them twice, has a
-        cut with a gap of more than 90 degrees, is of a horizontally polarised antenna, or of one that radiates more
-        than twice the power that it is fed.
+        If the file cannot be read, exceeds 1 MB, lacks its gain or a cut or repeats one, has a gap of more than 90
+        degrees in a cut, is of a horizontally polarised antenna, or of one that radiates more than twice the fed power.
 
     Examples
     --------
@@ -334,7 +327,7 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     require(
         unit.lower() in ("dbd", "dbi") and _is_finite(gain), "GAIN", header["GAIN"], "give a number and dBd or dBi."
     )
-    name = "".join(each for each in header.get("NAME", Path(path).stem) if each.isprintable())[:100] or "antenna"
+    name = "".join(filter(str.isprintable, header.get("NAME", Path(path).stem)))[:100] or "antenna"
     _require_vertical(name, header.get("POLARIZATION", ""))
     left, gain_dbi = np.roll(cuts["HORIZONTAL"][::-1], 1), float(gain) + _DIPOLE_DBI * (unit.lower() == "dbd")
     frequency_hz = _frequency_hz(header.get("FREQUENCY", ""))
@@ -365,7 +358,7 @@ def _frequency_hz(text: str) -> float | None:
 
 
 def _cut(lines: list[str], count: int, where: str) -> Floats:
-    """Losses (360,) [dB] at whole degrees of a cut with so many lines of angle and loss."""
+    """Return the losses (360,) [dB] at whole degrees of a cut with `count` lines of angle and loss."""
     pairs = [line.split() for line in lines]
     remedy = f"{count} lines of angle [degree] and loss [dB] follow, the angles increasing from 0 to 360."
     good = len(pairs) == count and all(len(pair) == 2 and all(map(_is_finite, pair)) for pair in pairs)
@@ -388,25 +381,25 @@ def _is_finite(text: str) -> bool:
 
 @dataclass(frozen=True)
 class Antenna(Checked):
-    """Antenna of a transmitter: a pattern or a planar array of it with a beam, and where it points.
+    """Antenna of a transmitter: a pattern, or a planar array of it with a beam, and its direction.
 
     Parameters
     ----------
     pattern : {"iso", "dipole", "hw_dipole", "tr38901"} or AntennaPattern
-        A pattern of Sionna RT, one from `AntennaPattern.sector`, or a measured one from `load_antenna`.
+        A pattern of Sionna RT, from `AntennaPattern.sector`, or from `load_antenna`.
     azimuth_deg : float
-        Counterclockwise from x, as seen from above [degree].
+        Counterclockwise from x, seen from above [degree].
     downtilt_deg : float
         Below the horizon; negative for an elevation [degree].
     rows, columns : int
-        Numbers of antennas of the array, which are half a wavelength apart.
+        Numbers of antennas of the array, half a wavelength apart.
     beam : int
         Row of ``dft_codebook(rows, columns)``; 0 is the beam in the main direction.
 
     Raises
     ------
     SettingsError
-        For a value out of range, or an array of patterns that radiates more than twice the power that it is fed.
+        For a value out of range, or an array of patterns that radiates more than twice the fed power.
 
     Examples
     --------
@@ -437,7 +430,6 @@ class Antenna(Checked):
             require(bool(radiated <= MAX_RADIATED), "rows, columns", (self.rows, self.columns), remedy)
 
     def _array_gain(self, local_rad: Floats) -> Floats:
-        """Gain (P,) of the array over one of its elements, towards zenith and azimuth (P, 2)."""
         toward, (column, row) = directions(local_rad)[0], divmod(self.beam, self.rows)
         gain = np.ones(len(local_rad))
         for along, size, beam in ((toward[:, 1], self.columns, column), (-toward[:, 2], self.rows, row)):
@@ -454,7 +446,6 @@ class Antenna(Checked):
         return value
 
     def __str__(self) -> str:
-        """Return a description, for titles and attributes."""
         pattern = self.pattern
         parts = [f"{pattern.name}, {pattern.gain_dbi:g} dBi" if isinstance(pattern, AntennaPattern) else pattern]
         parts += [f"{self.rows} x {self.columns}, beam {self.beam}"] if self.rows * self.columns > 1 else []
@@ -464,7 +455,7 @@ class Antenna(Checked):
 
     @property
     def uniform_gain_dbi(self) -> float | None:
-        """Gain of an upright antenna that is the same in all directions [dBi]; None of any other antenna."""
+        """Gain of an upright antenna if it is the same in all directions [dBi], otherwise None."""
         if self.rows * self.columns > 1 or self.downtilt_deg:
             return None
         if isinstance(self.pattern, AntennaPattern):
@@ -472,7 +463,7 @@ class Antenna(Checked):
         return 0.0 if self.pattern == "iso" else None
 
     def fields(self, angles_rad: Floats, frequency_hz: float) -> NDArray[np.complex128]:
-        """Field (P, 2) along the world's theta and phi, in directions of zenith and azimuth (P, 2)."""
+        """Return the field (P, 2) along the world's theta and phi, for zenith and azimuth (P, 2)."""
         measured = isinstance(self.pattern, AntennaPattern)
         array = planar_array(self.rows, self.columns, "iso" if measured else str(self.pattern))
         turned = np.radians([self.azimuth_deg, self.downtilt_deg, 0.0])
@@ -489,14 +480,14 @@ class Antenna(Checked):
         return found
 
     def warn_of_frequency(self, frequency_hz: float) -> None:
-        """Log a warning if its pattern was measured at a frequency that is far from the frequency of the trace."""
+        """Log a warning if its pattern was measured at a frequency far from the trace's."""
         measured_hz = getattr(self.pattern, "frequency_hz", None)
         if measured_hz and abs(math.log(frequency_hz / measured_hz)) > math.log(FREQUENCY_RATIO):
             message = "antenna '%s' was measured at %g GHz, and is used at %g GHz, where its pattern is another one"
             _log.warning(message, self, measured_hz / 1e9, frequency_hz / 1e9)
 
     def gain(self, angles_rad: Floats, frequency_hz: float) -> Floats:
-        """Gain (P,) of vertical polarisation towards zenith and azimuth (P, 2)."""
+        """Return the gain (P,) of vertical polarisation towards zenith and azimuth (P, 2)."""
         return np.asarray(np.abs(self.fields(angles_rad, frequency_hz)[:, 0]) ** 2)
 
     def largest_gains(self, frequency_hz: float) -> Gains:
@@ -504,7 +495,7 @@ class Antenna(Checked):
         return _largest_gains(self, frequency_hz)
 
     def power(self, paths: SolvedPaths, frequency_hz: float, *, at_rx: bool = False) -> Floats:
-        """Power (P,) of paths that were traced for both polarisations, with an isotropic, vertical antenna opposite."""
+        """Return the power (P,) of paths with both polarisations, with an isotropic, vertical antenna opposite."""
         fields = self.fields(paths.arrival_rad if at_rx else paths.departure_rad, frequency_hz)
         transfer = paths.transfer[:, :, 0] if at_rx else paths.transfer[:, 0]
         return np.asarray(np.abs(np.einsum("pi,pi->p", transfer, fields)) ** 2)
@@ -539,7 +530,6 @@ def _largest_gains(antenna: Antenna, frequency_hz: float) -> Gains:
 
 
 def _evaluated(pattern: Any, local_rad: Floats) -> list[NDArray[np.complex128]]:
-    """Zenith and azimuth component (P,) of a pattern, which Sionna RT evaluates."""
     import mitsuba as mi
 
     if not len(local_rad):  # Dr.Jit would abort

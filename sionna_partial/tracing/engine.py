@@ -1,8 +1,7 @@
-"""Everything that leans on Sionna RT's internals: candidates in, verified paths out.
+"""Sionna RT's internals: candidates in, verified paths out.
 
 Sionna RT's `PathSolver` runs a candidate generator, `ImageMethod` and `FieldCalculator`. Here the latter two run on our
-candidates: `ImageMethod` verifies every path and `FieldCalculator` gives every coefficient. Positions go in as plain
-arrays: `Scene.targets()`, which compiles a kernel for each receiver, is left out.
+candidates. `Scene.targets()`, which compiles a kernel for each receiver, is avoided.
 
 Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a verification with each kind.
 """
@@ -30,10 +29,9 @@ from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
-"""Mitsuba variant of Sionna RT on a CPU."""
 
 TESTED_VERSION = "2.2"
-"""Release of Sionna RT whose internals this module leans on."""
+"""Release of Sionna RT whose internals are used."""
 
 REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast engine back."""
 
@@ -81,7 +79,7 @@ def engine_fault() -> str:
 
 
 def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> Any:
-    """Load a scene into Sionna RT, its shapes kept apart, with isotropic antennas: vertical, or V and H for 2."""
+    """Load a scene into Sionna RT with separate shapes and isotropic antennas: vertical, or V and H for 2."""
     rt = load_sionna()
     scene = rt.load_scene(str(scene_xml), merge_shapes=False)
     scene.frequency = frequency_hz
@@ -90,7 +88,6 @@ def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> 
 
 
 def set_antennas(scene: Any, polarisations: int) -> None:
-    """Give a scene isotropic antennas: vertical, or V and H for 2 polarisations."""
     array = load_sionna().PlanarArray
     polarization = "V" if polarisations == 1 else "VH"
     scene.tx_array = scene.rx_array = array(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
@@ -123,7 +120,6 @@ class _Verification:
         self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
 
     def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
-        """Verify the candidates in a buffer, and return it with their vertices."""
         buffer = self._image_method(
             scene=_IncoherentScene(scene.mi_scene),
             paths=buffer,
@@ -139,7 +135,7 @@ class _Verification:
     def evaluate(
         self, scene: Any, buffer: Any, source: Any, targets: Any, field: tuple[int, Any], diffraction: bool
     ) -> Any:
-        """Return verified candidates with their coefficients, for a number of samples and patterns of antennas."""
+        """Return verified candidates with their coefficients, for a number of samples and antenna patterns."""
         import drjit as dr
         import mitsuba as mi
 
@@ -177,7 +173,7 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
 
 
 def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
-    """Return verified candidates without the faces that cost nothing: a refraction does not change a path."""
+    """Return verified candidates without further faces of a wall, which cost nothing."""
     if candidates.same_wall is None:
         return buffer
     import drjit as dr
@@ -204,11 +200,10 @@ def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
 
 
 _ALIGNMENT_BYTES = 64
-"""Alignment of Dr.Jit's own arrays [bytes]."""
 
 
 def to_device(kind: Any, values: NDArray[Any]) -> Any:
-    """Hand an array over to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
+    """Copy an array to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
     count = values.size * values.itemsize
     room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
     skip = -room.ctypes.data % _ALIGNMENT_BYTES
@@ -226,8 +221,8 @@ class Variables:
     shift_m : tuple of 3
         Added to the x, y, z of the transmitters, each with 1 or T entries [m].
     relative_permittivity, conductivity_s_m, thickness_m : tuples
-        One entry for each of `SceneSolver.materials`; [S/m] and [m]. ITU materials add their change with the frequency.
-        They are values, not additions, which would drown in the conductivity of a metal.
+        Values, not changes, which would drown in a metal's conductivity, for each of `SceneSolver.materials`; [S/m]
+        and [m]. ITU materials add their change with the frequency.
     frequency_hz
         Added to the carrier frequency [Hz].
     """
@@ -241,10 +236,10 @@ class Variables:
 
 @dataclass(frozen=True)
 class HeldPaths:
-    """Paths that stay where they are: functions that give their power (C,).
+    """Functions that give the power (C,) of paths with fixed vertices.
 
-    `evaluate` runs the field calculator of a verification. `repeat` has no derivatives, and replays the kernels that
-    Dr.Jit has recorded: the tracing in Python takes most of the time.
+    `evaluate` runs the field calculator. `repeat` replays kernels that Dr.Jit has recorded, which is faster, without
+    derivatives.
     """
 
     evaluate: Callable[[_Verification], Any]
@@ -252,10 +247,10 @@ class HeldPaths:
 
 
 class SceneSolver:
-    """Verifies candidates in one exported scene.
+    """Solver of candidates in one exported scene.
 
-    Faces are counted through `shapes`, names of shapes of the scene; those that the scene lacks count none. Antennas
-    are vertically polarised, except after `polarised`.
+    `shapes` are names in face order; shapes that the scene lacks have no faces. Antennas are vertically polarised,
+    except after `polarised`.
     """
 
     def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
@@ -272,13 +267,12 @@ class SceneSolver:
             np.array([names.index(shape.radio_material.name) for shape in objects], np.int64), faces
         )
         shape = np.repeat(np.array([shape.object_id for shape in objects], np.uint32), faces)
-        self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last stands for no face, -1
+        self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last is for no face, -1
         primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
         self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
         self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
 
     def polarised(self, polarisations: int) -> "SceneSolver":
-        """Return the same solver of the same scene with transfer matrices of 1 or 2 polarisations."""
         solver = copy(self)
         set_antennas(self._scene, polarisations)
         solver._field = self._field[0], self._scene.tx_array.antenna_pattern.patterns
@@ -289,17 +283,16 @@ class SceneSolver:
         """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
         constants = ("relative_permittivity", "conductivity", "thickness")
         return {
-            name: np.ravel([getattr(each, constant) for constant in constants]).astype(np.float64)
-            for name, each in self._scene.radio_materials.items()
+            name: np.ravel([getattr(material, constant) for constant in constants]).astype(np.float64)
+            for name, material in self._scene.radio_materials.items()
         }
 
     @property
     def mi_scene(self) -> Any:
-        """The Mitsuba scene."""
         return self._scene.mi_scene
 
     def verify(self, candidates: Candidates, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
-        """Verify candidates and compute their coefficients: the paths, and the candidate (P,) that each was.
+        """Verify candidates and compute their coefficients; return the paths and the candidate (P,) of each.
 
         The transmitter (3,) and the receivers (N, 3) are in scene coordinates [m].
         """
@@ -323,7 +316,7 @@ class SceneSolver:
     ) -> tuple[Any, Any]:
         """Verify candidates from T transmitters to N receivers, in scene coordinates, for other variables.
 
-        Returns their power (C,), 0 where there is no path, and vertices (C D,) [m]. Derivatives need slower loops.
+        Returns their power (C,), 0 for invalid ones, and vertices (C D,) [m]. Derivatives need slower loops.
         """
         import drjit as dr
         import mitsuba as mi
@@ -337,7 +330,6 @@ class SceneSolver:
             return power, mi.Point3f(buffer.vertices_x.array, buffer.vertices_y.array, buffer.vertices_z.array)
 
     def held(self, candidates: Candidates, tx_index: NDArray[np.int32], tx_m: Floats, rx_m: Floats) -> HeldPaths:
-        """Verify candidates once, for `power`."""
         import drjit as dr
 
         ends, diffraction = (_points(tx_m), _points(rx_m)), candidates.wedges is not None
@@ -356,7 +348,7 @@ class SceneSolver:
         return HeldPaths(evaluate, dr.freeze(lambda: evaluate(self._symbolic), state_fn=state))
 
     def power(self, paths: HeldPaths, variables: Variables, *, differentiable: bool) -> Any:
-        """Power (C,) of paths that stay where they are for other materials and another frequency."""
+        """Return the power (C,) of paths with fixed vertices for other materials and another frequency."""
         import drjit as dr
 
         with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):
@@ -381,7 +373,6 @@ class SceneSolver:
         return _without_same_walls(buffer, candidates)
 
     def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
-        """Squared magnitude of the coefficients of verified paths."""
         import drjit as dr
 
         buffer = verification.evaluate(self._scene, buffer, *ends, self._field, diffraction)
@@ -390,17 +381,16 @@ class SceneSolver:
 
     @contextmanager
     def _changed(self, variables: Variables) -> Iterator[None]:
-        """Give the scene another frequency and all materials other values for a while."""
         materials = self._scene.radio_materials.values()
-        kept = [(each, each.relative_permittivity, each.conductivity, each.thickness) for each in materials]
+        kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
         frequency = self._scene.frequency
         try:
             self._scene.frequency = frequency + variables.frequency_hz  # ITU materials follow
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
-            for (each, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
-                each.relative_permittivity = new[0] + (each.relative_permittivity - permittivity)
-                each.conductivity = new[1] + (each.conductivity - conductivity)
-                each.thickness = new[2]
+            for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
+                material.relative_permittivity = new[0] + (material.relative_permittivity - permittivity)
+                material.conductivity = new[1] + (material.conductivity - conductivity)
+                material.thickness = new[2]
             yield
         finally:
             self._scene.frequency = frequency
@@ -409,7 +399,6 @@ class SceneSolver:
                 material.conductivity, material.thickness = conductivity, thickness
 
     def _buffer(self, candidates: Candidates) -> Any:
-        """Fill one of Sionna RT's path buffers with unverified candidates."""
         import mitsuba as mi
         from sionna.rt.path_solvers.paths_buffer import PathsBuffer
 
@@ -429,7 +418,7 @@ class SceneSolver:
         return buffer
 
     def _wedge_geometry(self, wedges: Wedges, index: NDArray[np.int32]) -> Any:
-        """Wedges of candidates as Sionna RT describes them: normal of the 0-face x edge points along that face."""
+        """Return the wedges of candidates for Sionna RT: normal of the 0-face x edge points along that face."""
         import drjit as dr
         import mitsuba as mi
         from sionna.rt.utils.wedges import WedgeGeometry
@@ -456,7 +445,6 @@ class SceneSolver:
 
 
 def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
-    """Yield the derivatives of results with respect to one variable after the other."""
     import drjit as dr
 
     for leaf in leaves:
@@ -466,7 +454,6 @@ def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
 
 
 def _points(positions_m: Floats) -> Any:
-    """Hand positions (N, 3) over to Dr.Jit."""
     import drjit as dr
     import mitsuba as mi
 
@@ -476,7 +463,6 @@ def _points(positions_m: Floats) -> Any:
 
 
 def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
-    """Copy the valid paths of a buffer out of Dr.Jit, and their rows in it."""
     buffer.schedule()
     a = buffer.a[0][0]
     valid = np.flatnonzero(buffer.valid.numpy() & ((a.real.numpy() != 0.0) | (a.imag.numpy() != 0.0)))
@@ -487,7 +473,7 @@ def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, 
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
         vertices_m=np.stack(
-            [each.numpy()[valid] for each in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
+            [axis.numpy()[valid] for axis in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
         ),
         tx_m=tx_m,
         rx_m=rx_m,

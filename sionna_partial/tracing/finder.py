@@ -1,4 +1,4 @@
-"""The scene of a map on disk, and where its paths come from: exact candidates of a floor plan, rays in a mesh."""
+"""Scene files of a map, and finders of the paths in them."""
 
 import itertools
 from collections.abc import Iterator
@@ -33,23 +33,23 @@ from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
 CANDIDATES_AT_ONCE = 100_000
-"""Number of candidates that Sionna RT verifies together, which bounds the memory."""
+"""Number of candidates verified together, which bounds the memory."""
 
 Found = tuple[Candidates | None, SolvedPaths]
-"""Paths in scene coordinates, and the candidates that they were, one for one; None where rays found them."""
+"""Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
 
 _DIRECTED = 0.5
-"""Factor of the tolerance with an antenna, whose gain is bounded within a degree only."""
+"""Factor of the tolerance with a directive antenna, whose gain is bounded within one degree."""
 
 Kinds = tuple[list[Kind], list[Kind]]
-"""Kinds of candidates between opaque walls, and kinds of candidates that go through walls."""
+"""Kinds of candidates between opaque walls, and of candidates through walls."""
 
 
 @dataclass(frozen=True)
 class PlanScene:
-    """An extruded floor plan on disk, with the names of its shapes in the order in which faces are counted.
+    """An extruded floor plan on disk; `shapes` are its shape names in face order.
 
-    `floor` (ny, nx) are the cells of its map that have a floor.
+    `floor` (ny, nx) are the cells that have a floor. Limits of paths through walls may be `coarse`.
     """
 
     xml: Path
@@ -59,17 +59,16 @@ class PlanScene:
     wedges: Wedges
     partial: PartialMap
     floor: Bools
+    coarse: bool = False
 
     @cached_property
     def interior(self) -> Interior:
-        """The space between its walls, for paths through them."""
         depth_m, partial = self.settings.wall_depth_m, self.partial
         walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
         solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
-        return Interior(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
+        return Interior.of(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
-        """Return the kinds of candidates between a transmitter (3,) with an antenna and receivers (N, 3)."""
         geometry, settings = self.geometry, self.settings
         room = Room.of(geometry, tx_m, rx_m, solver.material_of_face, gains)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
@@ -79,7 +78,7 @@ class PlanScene:
             opaque.append(DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, materials, walls))
         if not settings.through_walls:
             return opaque, []
-        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials)
+        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials, coarse=self.coarse)
         if not settings.diffraction:
             return opaque, [crossing]
         return opaque, [crossing, CrossedEdgeCandidates(geometry, self.wedges, crossing)]
@@ -87,7 +86,7 @@ class PlanScene:
 
 @dataclass(frozen=True)
 class MeshScene:
-    """A mesh on disk, with the names of its shapes, vertices (V, 3) in scene coordinates [m] and triangles (F, 3)."""
+    """A mesh on disk; `shapes` are its shape names in face order, vertices are in scene coordinates."""
 
     xml: Path
     shapes: tuple[str, ...]
@@ -95,9 +94,10 @@ class MeshScene:
     vertices_m: Floats
     triangles: NDArray[np.int64]
     cells: Cells
+    coarse: bool = False
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
-        """Return the kinds of candidates, by the sequences of planes that rays meet."""
+        """Return the kinds of candidates: sequences of planes that rays meet."""
         settings = self.settings
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, settings.max_depth)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
@@ -105,11 +105,11 @@ class MeshScene:
         opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
         if not settings.through_walls:
             return opaque, []
-        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, min(SPLIT_RAYS, settings.samples_per_tx), gains)]
+        count = min(SPLIT_RAYS, settings.samples_per_tx)
+        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, count, gains, coarse=self.coarse)]
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:
-        """Its faces for lines through them, their planes, and the closed bodies; opaque faces are not crossed."""
         crossed = self.triangles if self.settings.through_walls else self.triangles[:0]
         planes = group_planes(self.vertices_m, self.triangles)
         tree = face_tree(self.vertices_m[crossed], planes.plane)
@@ -118,7 +118,7 @@ class MeshScene:
 
 @dataclass(frozen=True)
 class ExactFinder:
-    """Finds paths by verifying candidates."""
+    """Finder that verifies candidates."""
 
     written: PlanScene | MeshScene
     solver: SceneSolver
@@ -128,7 +128,7 @@ class ExactFinder:
     ) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m].
 
-        Weak paths are left out by their power with the transmit antenna, for which both polarisations are traced.
+        An antenna needs both polarisations; paths are left out that are weak with it.
         """
         if not len(rx_m):
             return
@@ -147,7 +147,7 @@ class ExactFinder:
 
 
 class RayFinder:
-    """Finds most paths, of any kind, by Sionna RT's public path solver."""
+    """Finder of most paths, of any kind, by Sionna RT's public path solver."""
 
     def __init__(self, written: PlanScene | MeshScene) -> None:
         self._written, self._scene = written, open_scene(written.xml, written.settings.frequency_hz)
@@ -155,7 +155,6 @@ class RayFinder:
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[Found]:
-        """Find the paths as `ExactFinder.paths` does; the antenna does not matter, as none is left out."""
         settings = self._written.settings
         set_antennas(self._scene, polarisations)
         for number, paths in enumerate(stock_paths(self._scene, settings, tx_m, rx_m), start=1):
@@ -167,9 +166,9 @@ class RayFinder:
 
 @dataclass(frozen=True)
 class MeanFinder:
-    """Finds paths between mapped and drawn walls, with powers whose sum is the mean over these geometries.
+    """Finder of paths between mapped and drawn walls, with powers whose sum is the mean over these geometries.
 
-    Links in sight between the mapped walls have the paths of these; others have no direct path.
+    A link in sight between the mapped walls has the paths of that geometry alone; others have no direct path.
     """
 
     mapped: ExactFinder | RayFinder
@@ -178,7 +177,6 @@ class MeanFinder:
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[Found]:
-        """Find the paths as `ExactFinder.paths` does, without candidates."""
         count = 1 + len(self.drawn)
         found = list(self.mapped.paths(tx_m, rx_m, polarisations, part_of(report, 0.0, 1.0 / count), antenna))
         amplitude = np.full(len(rx_m), count**-0.5)
@@ -197,9 +195,9 @@ class MeanFinder:
 def write_scene_of(
     partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings, draw: int = 0
 ) -> PlanScene | MeshScene:
-    """Write the scene of a map to an existing folder, its origin the lower-left corner of the map.
+    """Write the scene of a map to an existing folder, with the origin at the lower-left corner of the map.
 
-    Settings come from `resolved_settings`, `draw` is as of `build_scene`.
+    `settings` come from `resolved_settings`; `draw` is as in `build_scene`.
     """
     offset_m, frequency_hz = partial.origin_m, settings.frequency_hz
     xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz, draw=draw)
@@ -217,7 +215,6 @@ def write_scene_of(
 def _verified(
     solver: SceneSolver, blocks: Iterator[Block], tx_m: Floats, rx_m: Floats, report: Progress
 ) -> Iterator[Found]:
-    """Verify candidates, many blocks of one kind at once."""
     waiting: list[Block] = []
     for block in itertools.chain(blocks, [None]):
         full = sum(len(stored.candidates.rx) for stored in waiting) >= CANDIDATES_AT_ONCE

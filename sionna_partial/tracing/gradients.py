@@ -32,8 +32,7 @@ def one_transmitter(tx: ArrayLike) -> ArrayLike:
 class GainGradients(Shown):
     """Path gain from one transmitter to N receivers, and its derivatives.
 
-    The derivatives include the paths that exist, not paths that appear or vanish. They are 0 in
-    an outage, where the gain is -150 dB.
+    The derivatives do not include paths that appear or vanish. They are 0 in an outage, where the gain is -150 dB.
 
     Parameters
     ----------
@@ -45,7 +44,7 @@ class GainGradients(Shown):
     gain_db : (N,) float64 array
         Omnidirectional path gain [dB], at least -150 (paper, eq. 5).
     tx_db_per_m : (N, 3) float64 array
-        Its derivatives with respect to the transmitter's x, y and z [dB/m].
+        Derivatives with respect to the transmitter's x, y and z [dB/m].
     relative_permittivity_db : (N,) float64 array
         With respect to the real relative permittivity [dB], of all materials together where a mesh has several.
     conductivity_db_per_s_m : (N,) float64 array
@@ -54,7 +53,7 @@ class GainGradients(Shown):
         With respect to their thickness [dB/m].
     frequency_db_per_hz : (N,) float64 array
         With respect to the carrier frequency [dB/Hz]. ITU materials follow the frequency where Sionna RT loads them by
-        name, which it does for all but `vacuum`.
+        name: all except `vacuum`.
     trace_settings : TraceSettings
     scene_settings : SceneSettings
 
@@ -93,9 +92,8 @@ def gain_gradients(
 ) -> GainGradients:
     """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
 
-    The paths are as in `trace_links` with the same arguments. The power of a link is the sum of the powers of its
-    paths, without their phases. Candidates are verified first; Dr.Jit then differentiates the image method and the
-    field calculator of Sionna RT for the paths among them, in forward mode, one parameter after the other.
+    The paths are as in `trace_links`; the power of a link is the sum of the powers of its paths, without phases. Dr.Jit
+    differentiates Sionna RT's image method and field calculator in forward mode.
 
     Parameters
     ----------
@@ -106,7 +104,7 @@ def gain_gradients(
     rx : (N, 3) array-like
         Receiver positions [m]; N may be 0.
     trace_settings : TraceSettings, optional
-        Diffuse reflection must be off, and on meshes diffraction. Paths may go through walls.
+        Diffuse reflection must be off, and on meshes diffraction.
     scene_settings : SceneSettings, optional
     progress : bool or callable, optional
         As in `predict_map`.
@@ -118,19 +116,17 @@ def gain_gradients(
     Raises
     ------
     PositionError
-        For a transmitter or receiver that is not finite, outside the map or inside a wall, a receiver at the
-        transmitter, or several transmitters.
+        As `trace_links`, and for several transmitters.
     SettingsError
         For a frequency that the material does not cover, settings of another kind, or paths that only rays find.
     BackendError
-        If LLVM or Sionna RT cannot be used, or Sionna RT is another than the fast engine was made for.
+        If LLVM or Sionna RT cannot be used, or the fast engine does not support this release of Sionna RT.
     OutputError
         If no temporary file can be written.
 
     Examples
     --------
-    In free space, the gain falls with 20 log10 of the distance and of the frequency. At 2 m it rises by 20 / ln(10) / 2
-    dB for each metre that the transmitter comes nearer:
+    In free space, the gain falls with 20 log10 of distance and frequency; at 2 m by 20 / ln(10) / 2 dB per metre:
 
     >>> import numpy as np
     >>> import sionna_partial as sp
@@ -159,7 +155,7 @@ def gain_gradients(
             columns = np.concatenate(list(block.slopes(block.base, together=True).values()), axis=1)
             for total, values in zip(slopes, columns.T, strict=True):
                 total += np.bincount(block.path_rx, weights=values, minlength=len(rx_m))
-    link_state, gain_db = (each[0] for each in sums.states_and_gains())
+    link_state, gain_db = (values[0] for values in sums.states_and_gains())
     above = gain_db > GAIN_FLOOR_DB
     slopes_db = np.where(above, 10.0 / math.log(10.0) * slopes / np.where(above, sums.power, 1.0), 0.0)
     return GainGradients(

@@ -1,9 +1,7 @@
-"""The kinds of interactions of paths: who finds them, and which setting switches them on.
+"""Kinds of interactions of paths, their finders and settings.
 
-This table decides everything that depends on the kind of an interaction. One more kind is one more row. Sionna RT's
-rays then find its paths. To find every path, on a plan or a mesh, it takes candidates as well: a `Kind` of `select.py`
-in `tracing/plan` or `tracing/mesh`, which lists candidates with a bound of their power (`power.py`) and writes the
-selected ones, with the number of the kind in `Candidates.kind`. The scenes in `finder.py` return their kinds. Sionna RT
+A new kind is one row, and Sionna RT's rays find its paths. To find every path, it also needs a `Kind` of `select.py`,
+which lists candidates with a bound of their power (`power.py`), and which the scenes of `finder.py` return. Sionna RT
 verifies candidates of any kind.
 """
 
@@ -24,13 +22,13 @@ class Interaction:
     number : int
         Sionna RT's `InteractionType`.
     setting : str
-        Field of `TraceSettings` that switches it on; "" where it always is.
+        Field of `TraceSettings` that switches it on; "" if always on.
     arguments : tuple of str
-        Arguments of Sionna RT's path solver that switch it on where rays find its paths.
+        Arguments of Sionna RT's path solver that switch it on.
     exact_on : tuple
-        Kinds of maps on which candidates find every path. These paths can be differentiated; paths of rays cannot.
+        Kinds of maps on which candidates find every path. Only these paths can be differentiated.
     default : callable
-        Returns whether paths have it where the setting is None and candidates find it.
+        Returns the value in place of None where candidates find it.
     """
 
     number: int
@@ -40,7 +38,6 @@ class Interaction:
     default: Callable[[TraceSettings], bool] = lambda _: True
 
     def is_on(self, settings: TraceSettings) -> bool:
-        """Return whether settings without None ask for it."""
         return not self.setting or bool(getattr(settings, self.setting))
 
 
@@ -50,7 +47,6 @@ INTERACTIONS = (
     Interaction(4, "refraction", ("refraction",), ("plan", "mesh"), lambda settings: settings.through_walls),
     Interaction(8, "diffraction", ("diffraction", "edge_diffraction"), ("plan",)),
 )
-"""All kinds of interactions."""
 
 REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION = (kind.number for kind in INTERACTIONS)
 
@@ -63,5 +59,5 @@ def with_defaults(settings: TraceSettings, environment: EnvironmentKind) -> Trac
 
 
 def only_by_rays(settings: TraceSettings, environment: EnvironmentKind) -> list[Interaction]:
-    """Return the kinds that settings without None ask for and that only rays find on a kind of map."""
+    """Return the kinds that settings without None ask for and that only rays find."""
     return [kind for kind in INTERACTIONS if kind.is_on(settings) and environment not in kind.exact_on]

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 class TracedLinks(Shown):
     """Every traced path from one or T transmitters to N receivers.
 
-    Paths are listed one after the other, ordered by transmitter, receiver and delay; P is their number.
+    The P paths are ordered by transmitter, receiver and delay.
 
     Parameters
     ----------
@@ -38,20 +38,20 @@ class TracedLinks(Shown):
     link_state : (N,) or (T, N) uint8 array of LinkState
         255 where a link was not traced (``invalid="nan"``).
     gain_db : (N,) or (T, N) float64 array
-        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where a link was not traced.
+        Omnidirectional path gain [dB], at least -150 (paper, eq. 5); NaN where not traced.
     path_tx, path_rx : (P,) int32 arrays
-        Indices of the transmitter and the receiver that each path joins.
+        Transmitter and receiver of each path.
     transfer : (P, 2, 2) complex128 array
-        Transfer matrix of each path between isotropic antennas: [at the receiver, at the transmitter] along the
-        spherical unit vectors theta and phi of its arrival and departure, without the phase -2 pi f delay_s.
+        Transfer matrix between isotropic antennas: [at the receiver, at the transmitter] along the unit vectors theta
+        and phi of arrival and departure, without the phase -2 pi f delay_s.
     delay_s : (P,) float64 array
         Propagation delay [s].
     departure_rad, arrival_rad : (P, 2) float64 arrays
-        Zenith and azimuth of departure at the transmitter and of arrival at the receiver [rad].
+        Zenith and azimuth of departure and arrival [rad].
     interactions : (P, D) uint8 array
-        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+        Sionna RT's `InteractionType` in order from the transmitter; 0 for none.
     vertices_m : (P, D, 3) float64 array
-        Points of interaction [m]; NaN where there is none.
+        Points of interaction [m]; NaN for none.
     trace_settings : TraceSettings
         With values in place of None.
     scene_settings : SceneSettings
@@ -97,12 +97,12 @@ class TracedLinks(Shown):
 
     @property
     def valid(self) -> Bools:
-        """True for the links that were traced, (N,) or (T, N): all of them unless ``invalid="nan"`` left some out."""
+        """True for traced links, (N,) or (T, N); False only with ``invalid="nan"``."""
         return self.link_state != NO_RECEIVER
 
     @property
     def path_link(self) -> NDArray[np.int64]:
-        """Number of the link of each path (P,): transmitter by transmitter, as `gain_db` is when flattened."""
+        """Index (P,) of the link of each path in the flattened `gain_db`."""
         return self.path_tx.astype(np.int64) * len(self.rx) + self.path_rx
 
     def cir(
@@ -118,23 +118,22 @@ class TracedLinks(Shown):
     ) -> xr.Dataset:
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
-        Channels have every path. Links that were traced with the default ``TraceSettings.power_tolerance_db`` lack weak
-        ones: such links are traced once more, without a tolerance, when channels are first asked for, and a channel has
-        more paths than its link then. Trace with ``power_tolerance_db=0.0`` to have the same paths in both. A tolerance
-        that was set, as 0.1 dB, is kept, and so is the tolerance of links which were read from a folder or changed. The
-        attribute `power_tolerance_db` has the tolerance of the channels.
+        Channels have every path. Links traced with the default ``TraceSettings.power_tolerance_db`` lack weak paths:
+        they are traced again without a tolerance for the first channel, which then has more paths than its link. Trace
+        with ``power_tolerance_db=0.0`` to have the same paths in both. A tolerance that was set is kept, and so is the
+        tolerance of links that were read from a folder or changed; it is the attribute `power_tolerance_db` of the
+        result.
 
         Parameters
         ----------
         tx_array, rx_array : sionna.rt.PlanarArray, optional
             By default one isotropic, vertically polarised antenna.
         tx_orientation_rad : (3,) or (T, 3) array-like, optional
-            Angles of rotation of the transmitters about z, y and x [rad], as Sionna RT takes them.
+            Rotation angles about z, y and x [rad], as in Sionna RT.
         rx_orientation_rad : (3,) or (N, 3) array-like, optional
-            The same of the receivers.
         synthetic_array : bool
-            True: plane waves at the arrays. False: the exact length of each path between each two antennas; patterns
-            and reflection coefficients remain those between the centres.
+            True: plane waves at the arrays. False: exact path lengths between each two antennas, with patterns and
+            reflection coefficients of the centres.
         normalize_delays : bool
             Count delays from the shortest path of each link.
         memory_gb : float
@@ -145,12 +144,12 @@ class TracedLinks(Shown):
         xarray.Dataset
             `a` (link, rx_ant, tx_ant, path): complex baseband gains a exp(-j 2 pi f delay), 0 where there is no path.
             `delay_s` (link, path), or as `a` unless `synthetic_array`: NaN where there is no path. `paths` (link):
-            their number. Link ``tx * N + rx`` is from transmitter `tx` to receiver `rx`, which are coordinates.
+            number of paths. Link ``tx * N + rx`` has coordinates `tx` and `rx`.
 
         Raises
         ------
         SettingsError
-            For arrays that are none, or orientations of other shapes.
+            For an invalid array, or orientations of another shape.
         MemoryLimitError
             If the result would take more than `memory_gb`.
 
@@ -173,7 +172,7 @@ class TracedLinks(Shown):
         Parameters
         ----------
         frequencies_hz : (F,) array-like
-            Frequencies relative to the carrier [Hz], such as the frequencies of subcarriers.
+            Frequencies relative to the carrier [Hz].
         **options
             Arguments of `cir`.
 
@@ -205,7 +204,7 @@ class TracedLinks(Shown):
         bandwidth_hz : float
             Bandwidth, and sampling rate, of the sinc filter [Hz].
         l_min, l_max : int
-            First and last tap. The last is by default six after the longest delay.
+            First and last tap; by default, the last is six after the longest delay.
         **options
             Arguments of `cir`.
 
@@ -241,24 +240,23 @@ class TracedLinks(Shown):
     ) -> xr.Dataset:
         """Return the gain of every pair of beams of each link.
 
-        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, whose coefficients A are as in `cir`
-        for plane waves: the mean over a wide band, as `gain_db` is. The matrices A themselves are never formed.
+        The gain of beams w and u is the sum of ``|u^H A w|^2`` over the paths, with coefficients A as in `cir` for
+        plane waves: the mean over a wide band, as `gain_db`. The matrices A are not formed.
 
         Parameters
         ----------
         codebook : (C, tx_ant) array-like
-            Weights of the transmitting antennas, a beam in each row, such as `dft_codebook` returns.
+            Weights of the transmitting antennas, one beam in each row, as from `dft_codebook`.
         rx_codebook : (B, rx_ant) array-like, optional
-            Those of the receiving antennas. By default each antenna alone.
+            Weights of the receiving antennas. By default each antenna alone.
         tx_array, rx_array, tx_orientation_rad, rx_orientation_rad, memory_gb
             As in `cir`.
 
         Returns
         -------
         xarray.Dataset
-            `gain_db` (link, rx_beam, tx_beam), at least -150 dB; `best_rx_beam` and `best_tx_beam` (link) of the
-            strongest pair, -1 without paths; `margin_db` (link), by which it is stronger than the next, NaN without
-            paths or for a single pair.
+            `gain_db` (link, rx_beam, tx_beam), at least -150 dB; `best_rx_beam` and `best_tx_beam` (link), -1 without
+            paths; `margin_db` (link) to the next pair, NaN without paths or for a single pair.
 
         Raises
         ------
@@ -281,8 +279,8 @@ class TracedLinks(Shown):
     def to_xarray(self) -> xr.Dataset:
         """Return the links and their paths as a labelled Dataset.
 
-        Its dimensions are "rx", "tx" where there are several transmitters, "path" and "interaction". Variables have
-        `units`, and settings are attributes.
+        Dimensions are "rx", "tx" for several transmitters, "path" and "interaction"; variables have `units`, settings
+        are attributes.
 
         Returns
         -------
@@ -326,16 +324,15 @@ class TracedLinks(Shown):
     def spreads(self) -> xr.Dataset:
         """Return delay and angular spreads, K-factor and path loss of each link.
 
-        Paths are weighted by ``|a|^2``, their power between isotropic, vertically polarised antennas.
+        Weights are ``|a|^2``, the power between isotropic, vertically polarised antennas.
 
         Returns
         -------
         xarray.Dataset
-            On "rx", and "tx" where there are several. `path_loss_db`; `k_factor_db`, the power of the line of sight
-            over the power of all other paths; `delay_spread_s`, the standard deviation of the delay; and four circular
-            standard deviations `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`,
-            `zenith_arrival_spread_rad` and `azimuth_arrival_spread_rad`. NaN without paths, and K without line of
-            sight.
+            On "rx", and "tx" for several transmitters. `path_loss_db`; `k_factor_db`, the power of the line of sight
+            over the power of all other paths; `delay_spread_s`; and the circular standard deviations
+            `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`, `zenith_arrival_spread_rad` and
+            `azimuth_arrival_spread_rad`. NaN without paths, and K without line of sight.
 
         Notes
         -----
@@ -357,10 +354,10 @@ class TracedLinks(Shown):
         Parameters
         ----------
         of : {"links", "paths"}
-            Links have the numbers `tx` and `rx` and the positions [m] of their ends, `link_state`, `gain_db`,
-            `distance_m`, the number of `paths` and the shortest `delay_s` (NaN without paths). Paths have `tx`, `rx`,
-            `gain_db`, `phase_rad`, `delay_s`, angles [rad], `interactions` by Sionna RT's `InteractionType`, such as
-            "1-1-8", and the number of `walls` that they go through.
+            Columns of links: numbers `tx` and `rx`, positions [m], `link_state`, `gain_db`, `distance_m`, number of
+            `paths` and shortest `delay_s` (NaN without paths). Columns of paths: `tx`, `rx`, `gain_db`, `phase_rad`,
+            `delay_s`, angles [rad], `interactions` by Sionna RT's `InteractionType`, such as "1-1-8", and number of
+            `walls` crossed.
 
         Returns
         -------
@@ -405,7 +402,7 @@ class TracedLinks(Shown):
 
     def _path_columns(self) -> dict[str, NDArray[Any]]:
         angles = {"departure": self.departure_rad, "arrival": self.arrival_rad}
-        types = ["-".join(str(each) for each in row if each) for row in self.interactions.tolist()]
+        types = ["-".join(str(kind) for kind in row if kind) for row in self.interactions.tolist()]
         return {
             **{"tx": self.path_tx, "rx": self.path_rx},
             **{"gain_db": 20.0 * np.log10(np.abs(self.a)), "phase_rad": np.angle(self.a), "delay_s": self.delay_s},
@@ -438,10 +435,10 @@ _VARIABLES = {
 
 
 class LinkSums:
-    """The power of links (T, N), and whether each is in sight, added up over their paths, some at a time.
+    """Power of links (T, N) and line of sight, added up over blocks of paths.
 
-    `path_power` (T N, C + 1, R + 1) is the power by the number of walls that a path crosses, and by its number of
-    reflections; paths with more than C or R count with these.
+    `path_power` (T N, C + 1, R + 1) is the power by number of walls crossed and number of reflections; the last entries
+    include larger numbers.
     """
 
     def __init__(self, transmitters: int, receivers: int, walls: int = 0, reflections: int = 0) -> None:
@@ -451,7 +448,7 @@ class LinkSums:
 
     @property
     def power(self) -> Floats:
-        """Sum over the paths of each link (T N,)."""
+        """Return the power of each link (T N,)."""
         power: Floats = self.path_power.sum(axis=(1, 2))
         return power
 
@@ -474,6 +471,6 @@ class LinkSums:
 
 
 def path_gain_db(power: Floats) -> Floats:
-    """Omnidirectional path gain [dB], at least -150, of links whose paths have |a|^2 in sum (paper, eq. 5)."""
+    """Return the omnidirectional path gain [dB], at least -150, for a sum of |a|^2 (paper, eq. 5)."""
     with np.errstate(divide="ignore"):
         return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)

@@ -1,7 +1,7 @@
-"""The forward model: the paths of links as functions of the transmitters' positions, the materials and the frequency.
+"""Paths of links as functions of the transmitters' positions, the materials and the frequency.
 
 Paths are found once, by a complete trace. Sionna RT then gives their power and vertices for other values, and Dr.Jit
-the derivatives. A path that other values make invalid has no power; one that they would make possible is not found.
+the derivatives. A path that becomes invalid has no power; new paths are not found.
 """
 
 import itertools
@@ -24,7 +24,7 @@ PATHS_PER_BLOCK = 50_000
 """Number of paths that are evaluated together, which bounds the memory."""
 
 Part = tuple[Candidates, SolvedPaths]
-"""Candidates, in scene coordinates, and the paths that they are, one for one, in world coordinates."""
+"""Candidates in scene coordinates, and their paths in world coordinates, row by row."""
 
 
 @read_only
@@ -37,8 +37,8 @@ class PathParameters(Shown):
     tx_m : (3,) or (T, 3) float64 array
         Transmitter positions [m].
     relative_permittivity, conductivity_s_m, thickness_m : (M,) float64 arrays
-        Real relative permittivity, conductivity [S/m] and thickness [m] of each material. ITU materials follow the
-        frequency on top of that, as Sionna RT has them.
+        Real relative permittivity, conductivity [S/m] and thickness [m] of each material. ITU materials also follow
+        the frequency, as in Sionna RT.
     frequency_hz : () float64 array
         Carrier frequency [Hz].
     """
@@ -74,19 +74,19 @@ class PathSet:
     Attributes
     ----------
     base : PathParameters
-        For which they were found.
+        Parameters for which the paths were found.
     rx_m : (N, 3) float64 array
         Receiver positions [m].
     path_tx, path_rx : (P,) int32 arrays
         Transmitter and receiver of each path.
     power : (P,) float64 array
-        Squared magnitude |a|^2 of each, at `base`.
+        |a|^2 of each path at `base`.
     interactions : (P, D) uint8 array
-        Sionna RT's `InteractionType` of every interaction in order from the transmitter; 0 where there is none.
+        Sionna RT's `InteractionType` in order from the transmitter; 0 for none.
     is_direct : (P,) bool array
         True for the line of sight.
     vertices_m : (P, D, 3) float64 array
-        Positions of the interactions at `base` [m]; NaN where there is none.
+        Points of interaction at `base` [m]; NaN for none.
     """
 
     def __init__(self, simulation: _Simulation, tx_m: Floats, rx_m: Floats, parts: list[Part]) -> None:
@@ -94,14 +94,13 @@ class PathSet:
         self._simulation = simulation
         self._held: dict[int, HeldPaths] = {}
         ends = np.cumsum([0, *(len(candidates.rx) for candidates, _ in self._parts)]).tolist()
-        self._rows = [slice(*each) for each in itertools.pairwise(ends)]
+        self._rows = [slice(*rows) for rows in itertools.pairwise(ends)]
         paths = SolvedPaths.concatenate(self.solved, simulation.trace_settings.most_interactions)
         self.path_tx, self.path_rx, self.interactions = paths.path_tx, paths.path_rx, paths.interactions
         self.power, self.vertices_m = paths.power, paths.vertices_m
         self.is_direct = paths.is_direct
 
     def __len__(self) -> int:
-        """Return the number of paths P."""
         return len(self.path_rx)
 
     @property
@@ -113,7 +112,7 @@ class PathSet:
     def joined(cls, sets: Sequence["PathSet"]) -> "PathSet":
         """Join paths between the same transmitters and receivers; at least one set."""
         first = sets[0]
-        return cls(first._simulation, first.base.tx_m, first.rx_m, [part for each in sets for part in each._parts])
+        return cls(first._simulation, first.base.tx_m, first.rx_m, [part for paths in sets for part in paths._parts])
 
     def kept(self, mask: Bools) -> "PathSet":
         """Return the paths of a mask (P,)."""
@@ -127,10 +126,10 @@ class PathSet:
         """Return the links as `trace_links` does."""
         paths = join_paths(self.solved, self._simulation.trace_settings.most_interactions)
         sums = LinkSums(math.prod(self.base.tx_m.shape[:-1]), len(self.rx_m))
-        for each in self.solved:
-            sums.add(each)
+        for solved in self.solved:
+            sums.add(solved)
         shape = (*self.base.tx_m.shape[:-1], len(self.rx_m))
-        link_state, gain_db = (each.reshape(shape) for each in sums.states_and_gains())
+        link_state, gain_db = (values.reshape(shape) for values in sums.states_and_gains())
         return TracedLinks(
             tx=self.base.tx_m,
             rx=self.rx_m,
@@ -141,9 +140,9 @@ class PathSet:
         )
 
     def at(self, parameters: PathParameters) -> tuple[Floats, Floats]:
-        """Evaluate power (P,), 0 where a path is not valid any more, and vertices (P, D, 3) for other parameters.
+        """Evaluate power (P,), 0 for an invalid path, and vertices (P, D, 3) for other parameters.
 
-        For a frequency that a material does not cover this raises a SettingsError; so do the derivatives.
+        This and the derivatives raise a SettingsError for a frequency that a material does not cover.
         """
         if all(np.array_equal(getattr(parameters, name), getattr(self.base, name)) for name in PARAMETERS):
             return self.power.copy(), self.vertices_m.copy()
@@ -166,9 +165,9 @@ class PathSet:
     ) -> dict[str, Floats]:
         """Differentiate the power of each path with respect to the K entries of fields of `PathParameters`: (P, K).
 
-        For transmitters, these are x, y, z of the path's own; with `together` all materials change by as much.
-        Dr.Jit passes forward once for each entry. Backwards, one pass takes longer than these seven of a floor plan,
-        and its derivatives of the position differ from run to run.
+        For transmitters, these are x, y, z of the path's own; with `together` all materials change by as much. Dr.Jit
+        passes forward once for each entry: one pass backwards takes longer than seven of these, and its derivatives of
+        the position differ from run to run.
         """
         count = {name: 1 if together else len(self.base.thickness_m) for name in MATERIAL_PARAMETERS}
         power = {name: np.zeros((len(self), {**count, "tx_m": 3, "frequency_hz": 1}[name])) for name in names}
@@ -177,10 +176,7 @@ class PathSet:
         return power
 
     def transmitter_slopes(self, parameters: PathParameters) -> tuple[Floats, Floats]:
-        """Differentiate power (P, 3) and vertices (P, D, 3, 3) with respect to the x, y, z of the transmitter.
-
-        The last axis is the transmitter's; derivatives are 0 where there is no vertex.
-        """
+        """Differentiate power (P, 3) and vertices (P, D, 3, 3) with respect to the transmitter, the last axis."""
         power, vertices_m = np.zeros((len(self), 3)), np.zeros((*self.vertices_m.shape, 3))
         for rows, _, entry, (of_power, of_vertices) in self._passes(parameters, ("tx_m",)):
             power[rows, entry] = of_power.numpy()
@@ -214,11 +210,9 @@ class PathSet:
         return not np.array_equal(parameters.tx_m, self.base.tx_m)
 
     def _ends(self) -> tuple[Floats, Floats]:
-        """Transmitters (T, 3) and receivers (N, 3) at `base`, in scene coordinates [m]."""
         return self._simulation.in_scene(self.base.tx_m.reshape(-1, 3)), self._simulation.in_scene(self.rx_m)
 
     def _held_paths(self, number: int) -> HeldPaths:
-        """Return the paths of a part at `base`, which are verified once."""
         if number not in self._held:
             candidates, paths = self._parts[number]
             self._held[number] = self._simulation.solver.held(candidates, paths.path_tx, *self._ends())
@@ -227,7 +221,6 @@ class PathSet:
     def _variables(
         self, parameters: PathParameters, names: Sequence[str] = (), *, together: bool = False
     ) -> tuple[dict[str, list[Any]], Variables]:
-        """Return the variables of the derivatives, by name, and all variables for the solver."""
         import drjit as dr
         import mitsuba as mi
 
@@ -264,7 +257,7 @@ def _merged(parts: list[Part]) -> list[Part]:
             continue
         faces = max(candidates.face.shape[1] for candidates, _ in some)
         depth = max(paths.interactions.shape[1] for _, paths in some)  # further faces of one wall are no interactions
-        candidates = Candidates.concatenate([each.widened(faces) for each, _ in some])
+        candidates = Candidates.concatenate([candidates.widened(faces) for candidates, _ in some])
         paths = SolvedPaths.concatenate([solved for _, solved in some], depth)
         for start in range(0, len(paths.a), PATHS_PER_BLOCK):
             rows = np.arange(start, min(start + PATHS_PER_BLOCK, len(paths.a)))

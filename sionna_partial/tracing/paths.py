@@ -1,4 +1,4 @@
-"""Paths: candidates that the geometry allows, and those that Sionna RT has verified."""
+"""Paths: candidates, and those that Sionna RT has verified."""
 
 import math
 from collections.abc import Sequence
@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Bools, Floats, Indices
 
 SHORTEST_LEG_M = 0.0101
-"""Sionna RT drops paths with legs of 1 cm or less."""
+"""Sionna RT drops paths with legs of 1 cm or less [m]."""
 
 
 @dataclass(frozen=True)
 class SolvedPaths:
     """Verified paths in scene coordinates (fields as in `TracedLinks`; D may be less).
 
-    `transfer` is (P, 1, 1) where only the power between vertically polarised antennas is asked for.
+    `transfer` is (P, 1, 1) for vertically polarised antennas alone.
     """
 
     path_tx: NDArray[np.int32]
@@ -38,26 +38,22 @@ class SolvedPaths:
 
     @property
     def power(self) -> Floats:
-        """Squared magnitude |a|^2 of each path (P,)."""
         power: Floats = np.abs(self.a) ** 2
         return power
 
     @property
     def is_direct(self) -> Bools:
-        """Return whether each path (P,) is the line of sight."""
+        """True for the line of sight (P,)."""
         return (self.interactions == 0).all(axis=1)
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
-        """Return the paths that an index array or a mask (P,) selects."""
         return SolvedPaths(*(column[index] for column in vars(self).values()))
 
     def between(self, tx: int, rx: NDArray[np.int32]) -> "SolvedPaths":
-        """Return the paths of transmitter `tx`, with receivers numbered by `rx`."""
         return replace(self, path_tx=np.full(len(self.a), tx, np.int32), path_rx=rx[self.path_rx])
 
     @classmethod
     def concatenate(cls, parts: Sequence["SolvedPaths"], depth: int) -> "SolvedPaths":
-        """Join paths in the order given, with room for `depth` interactions."""
         parts = [join_paths([], depth), *parts]
         columns = {field.name: [getattr(part, field.name) for part in parts] for field in fields(cls)}
         for name, value in (("interactions", 0), ("vertices_m", math.nan)):
@@ -76,7 +72,7 @@ class SolvedPaths:
         tx_m: Floats,
         rx_m: Floats,
     ) -> "SolvedPaths":
-        """Make paths of one transmitter, with NaN where there is no interaction and the angles at both ends."""
+        """Make paths of one transmitter from vertices that are NaN where there is no interaction."""
         vertices_m = np.where(interactions[:, :, None] > 0, vertices_m, np.float32(math.nan))
         count = (interactions > 0).sum(axis=1)
         direct = (count == 0)[:, None]
@@ -94,10 +90,7 @@ class SolvedPaths:
 
 
 class PathColumns:
-    """All paths of a trace, in columns that grow in place: memory should not hold the millions of a dense grid twice.
-
-    A path has at most `depth` interactions, and is traced for 1 or 2 polarisations.
-    """
+    """Paths of a trace in columns that grow in place, so that memory holds a dense grid's paths once."""
 
     def __init__(self, depth: int, polarisations: int = 1) -> None:
         types = _column_types(depth, polarisations)
@@ -106,7 +99,6 @@ class PathColumns:
         }
 
     def append(self, parts: list[SolvedPaths]) -> None:
-        """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
         order = path_order(parts)
         row, start = np.empty(len(order), np.int64), len(self._columns["path_rx"])
         row[order] = start + np.arange(len(order))
@@ -121,17 +113,13 @@ class PathColumns:
                 first += len(values)
 
     def paths(self) -> SolvedPaths:
-        """Return all paths, read-only. Nothing may be added any more."""
         for column in self._columns.values():
             column.setflags(write=False)
         return SolvedPaths(**self._columns)
 
 
 class PathFiles:
-    """All paths of a trace, in a `.npy` file for each column, in an existing folder.
-
-    Not zarr's: its arrays are compressed chunks, and the columns of `TracedLinks` are memory maps of these files.
-    """
+    """Paths of a trace in an existing folder, a `.npy` file for each column, which `TracedLinks` maps into memory."""
 
     def __init__(self, depth: int, folder: Path, polarisations: int) -> None:
         self._folder, self._count, self._room = folder, 0, (depth, polarisations)
@@ -140,7 +128,6 @@ class PathFiles:
         self.close()
 
     def append(self, parts: list[SolvedPaths]) -> None:
-        """Add paths at the end, ordered among themselves by transmitter, receiver and delay."""
         joined = join_paths(parts, *self._room)
         self._count += len(joined.a)
         for name in _column_types(*self._room):
@@ -148,7 +135,7 @@ class PathFiles:
                 getattr(joined, name).tofile(stream)
 
     def close(self) -> None:
-        """Write the headers, whose length does not depend on the number of paths: the files can be read."""
+        """Write the headers, whose length does not depend on the number of paths."""
         for name, (shape, kind) in _column_types(*self._room).items():
             header = {"descr": np.dtype(kind).str, "fortran_order": False, "shape": (self._count, *shape)}
             with self._file(name).open("r+b") as stream:
@@ -159,14 +146,13 @@ class PathFiles:
 
 
 def widened(columns: NDArray[Any], depth: int, value: float) -> NDArray[Any]:
-    """Add interactions that there are not up to the depth D: (P, D, ...)."""
+    """Pad columns (P, d, ...) to the depth D: (P, D, ...)."""
     wide = np.full((len(columns), depth, *columns.shape[2:]), value, dtype=columns.dtype)
     wide[:, : columns.shape[1]] = columns
     return wide
 
 
 def _column_types(depth: int, polarisations: int) -> dict[str, tuple[tuple[int, ...], type]]:
-    """Shape of an entry, and type, of each column of paths with at most `depth` interactions."""
     shape = {"interactions": (depth,), "vertices_m": (depth, 3), "departure_rad": (2,), "arrival_rad": (2,)}
     shape["transfer"] = (polarisations, polarisations)
     kind = {"path_tx": np.int32, "path_rx": np.int32, "transfer": np.complex128, "interactions": np.uint8}
@@ -174,7 +160,6 @@ def _column_types(depth: int, polarisations: int) -> dict[str, tuple[tuple[int, 
 
 
 def path_bytes(depth: int, polarisations: int) -> int:
-    """Return the size of a path with room for `depth` interactions [bytes]."""
     types = _column_types(depth, polarisations).values()
     return sum(math.prod(shape) * np.dtype(kind).itemsize for shape, kind in types)
 
@@ -187,7 +172,7 @@ def join_paths(parts: list[SolvedPaths], max_depth: int, polarisations: int = 1)
 
 
 def path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
-    """Order of all paths by transmitter, receiver and delay; Sionna RT's delays have single precision."""
+    """Return the order of paths by transmitter, receiver and delay; Sionna RT's delays have single precision."""
     if not parts:
         return np.zeros(0, np.int64)
     tx, rx, delay_s = (
@@ -198,7 +183,6 @@ def path_order(parts: list[SolvedPaths]) -> NDArray[np.int64]:
 
 
 def zenith_azimuth(direction: Floats) -> Floats:
-    """Return zenith and azimuth [rad] (P, 2) of direction vectors (P, 3)."""
     x, y, z = direction.T
     return np.stack([np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)], axis=1)
 
@@ -207,13 +191,13 @@ def zenith_azimuth(direction: Floats) -> Floats:
 class Wedges:
     """W vertical edges, each with the two faces that bound the room around it.
 
-    Around an edge, walls bound sectors. Only a sector wider than a half-plane holds directions that the walls hide from
-    each other, so an edge diffracts in one sector at most, and where three or more walls meet mostly in none. A free
-    end of a wall has both of its sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
+    Walls bound sectors around an edge. Only a sector wider than a half-plane holds directions that the walls hide from
+    each other, so an edge diffracts in one sector at most; where three or more walls meet, mostly in none. A free end
+    of a wall has both sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
 
-    `edge_m` (W, 2) are the edges in the plan, which rise from 0 to `height_m` (W,) [m]; `face` (2 W, 2) the 0-face and
-    the n-face of the scene, where the sector of wedge i < W ends counterclockwise; `normal` (2 W, 2, 2) their unit
-    normals, which point into the sector.
+    `edge_m` (W, 2) are positions in the plan; edges rise from 0 to `height_m` (W,) [m]. `face` (2 W, 2) are 0-face and
+    n-face, where the sector of wedge i < W ends counterclockwise; `normal` (2 W, 2, 2) are their unit normals into the
+    sector.
     """
 
     edge_m: Floats
@@ -226,12 +210,11 @@ class Wedges:
 class Candidates:
     """C geometrically possible paths, to be verified.
 
-    `rx` (C,) is the receiver of each. `kind` (C, D) is Sionna RT's `InteractionType` of every interaction in order from
-    the transmitter, 0 where there is none. `face` (C, D) is the face of the scene there, counted through its shapes:
-    any of the faces in one plane stands for all, the 0-face for an edge, and -1 for none. `vertices_m` (C, D, 3) are
-    the points of interaction [m]. If all candidates are diffracted, `wedge` (C,) are their numbers in `wedges`.
-    If any candidate goes through walls, `same_wall` (C, D) is True for refractions at further faces of a wall that
-    has been crossed: they cost nothing.
+    `rx` (C,) are receivers, `kind` (C, D) Sionna RT's `InteractionType` in order from the transmitter, 0 for none,
+    `vertices_m` (C, D, 3) points [m]. `face` (C, D) counts through the scene's shapes, -1 for none: any face of a plane
+    represents all, the 0-face an edge. `wedge` (C,) are numbers in `wedges`, if all candidates are diffracted.
+    `same_wall` (C, D), if any goes through walls, is True for refractions at further faces of a wall that has been
+    crossed: they cost nothing.
     """
 
     rx: NDArray[np.int32]
@@ -243,26 +226,23 @@ class Candidates:
     same_wall: Bools | None = None
 
     def is_like(self, other: "Candidates") -> bool:
-        """Return whether both can be verified together."""
         same = self.face.shape[1] == other.face.shape[1] and self.wedges is other.wedges
         return same and (self.same_wall is None) == (other.same_wall is None)
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The arrays that it has, by name, each with a row for every candidate."""
+        """The arrays that are not None, by name, each with C rows."""
         arrays = {name: value for name, value in vars(self).items() if name != "wedges"}
         return {name: array for name, array in arrays.items() if array is not None}
 
     @classmethod
     def concatenate(cls, parts: list["Candidates"]) -> "Candidates":
-        """Join candidates that can be verified together; at least one part."""
         joined: dict[str, Any] = {
             name: np.concatenate([part.columns[name] for part in parts]) for name in parts[0].columns
         }
         return replace(parts[0], **joined)
 
     def widened(self, depth: int) -> "Candidates":
-        """Return them with room for `depth` interactions."""
         nothing = {"kind": 0, "face": -1, "vertices_m": 0.0, "same_wall": 0}
         wide: dict[str, Any] = {
             name: widened(array, depth, nothing[name]) for name, array in self.columns.items() if name in nothing
@@ -270,10 +250,8 @@ class Candidates:
         return replace(self, **wide)
 
     def narrowed(self) -> "Candidates":
-        """Return them without the last columns, which none of them uses."""
         used = max(1, int((self.kind > 0).sum(axis=1).max(initial=0)))
         return replace(self, **{name: array[:, :used] for name, array in self.columns.items() if array.ndim > 1})
 
     def rows(self, index: Indices) -> "Candidates":
-        """Pick some of the candidates."""
         return replace(self, **{name: array[index] for name, array in self.columns.items()})

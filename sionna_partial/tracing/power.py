@@ -1,9 +1,8 @@
-"""The power of paths by their geometry, before Sionna RT has verified them.
+"""Power of paths by their geometry, before Sionna RT verifies them.
 
-Slabs reflect and transmit as Sionna RT has it (ITU-R P.2040-3, eq. 31, 37 and 38); an edge follows the uniform theory
-of diffraction (UTD). Paths between opaque walls have an upper bound of their power between vertically polarised
-antennas: the horizontal component that a slanting path has for a while is added up by magnitude. Paths through walls
-have the power of their Jones vector.
+Slabs follow ITU-R P.2040-3, eq. 31, 37 and 38, edges the uniform theory of diffraction (UTD). Paths between opaque
+walls have an upper bound of their power between vertically polarised antennas, with horizontal components added by
+magnitude; paths through walls have the power of their Jones vector.
 """
 
 import math
@@ -23,13 +22,13 @@ from sionna_partial.settings import Material
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 
 Polarisation = Literal["te", "tm"]
-"""Electric field perpendicular to the plane of incidence ("te"), as of vertical antennas at walls, or in it ("tm")."""
+"""Electric field perpendicular to the plane of incidence ("te", as of vertical antennas at walls) or in it ("tm")."""
 
 MOST_LOSS_DB = 60.0
-"""Loss of a wall from which on it counts as opaque [dB]."""
+"""Loss from which a wall counts as opaque [dB]."""
 
 _ANGLES_DEG = np.arange(0.0, 61.0, 10.0)
-"""Angles of incidence over which a wall is averaged: the loss at normal incidence has deep interference fringes."""
+"""Angles of incidence for the mean loss: at normal incidence alone, interference fringes are deep."""
 
 VACUUM_F_M = 8.8541878128e-12
 """Permittivity of the vacuum [F/m]."""
@@ -38,13 +37,13 @@ COSINES = 2048
 """Steps of the tables over the cosine of the angle of incidence."""
 
 _ANGLES, _MARGIN = 1024, 1.01
-"""Steps of the table of largest coefficients, and factor by which it is enlarged."""
+"""Steps of the table of largest coefficients, and factor that enlarges them."""
 
 _CANCELLED = 0.02
-"""Fraction of the terms of a diffraction that single precision may leave where they cancel each other."""
+"""Fraction of the terms of a diffraction that single precision may leave where they cancel."""
 
 _STEPS, _ASYMPTOTIC = 128, 3.0
-"""Entries of the table of the UTD transition function per unit, and where its asymptotic series takes over."""
+"""Entries of the table of the UTD transition function per unit, and the start of its asymptotic series."""
 
 
 def reflection_loss_db(
@@ -55,10 +54,10 @@ def reflection_loss_db(
     angle_deg: ArrayLike,
     polarisation: Polarisation = "te",
 ) -> Floats:
-    """Return the loss [dB] of a wave that is reflected off a slab, with all reflections inside it.
+    """Return the reflection loss [dB] of a slab, internal reflections included; infinite if nothing is reflected.
 
-    All arrays are broadcast together; angles of incidence are from the normal, 0 to 90 degrees. The loss is at least 0
-    and infinite where nothing is reflected. Another polarisation or angle raises a SettingsError.
+    Arrays are broadcast; angles are from the normal, 0 to 90 degrees. Another angle or polarisation raises a
+    SettingsError.
     """
     require(polarisation in ("te", "tm"), "polarisation", polarisation, "choose 'te' or 'tm'.")
     angle = np.asarray(angle_deg, dtype=np.float64)
@@ -73,7 +72,7 @@ def reflection_loss_db(
 def _refracted(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], Floats, NDArray[np.complex128]]:
-    """Return the complex permittivity, the cosines as an array, and the index of refraction times those inside."""
+    """Return the complex permittivity, the cosines as an array, and index of refraction times cosine inside."""
     loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
     eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
     return eta, cosine, np.sqrt(eta - (1.0 - cosine**2))
@@ -82,7 +81,7 @@ def _refracted(
 def reflection_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the reflection coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
+    """Return the reflection coefficients of a slab, TE and TM, by the cosine of the angle of incidence."""
     eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
@@ -93,7 +92,7 @@ def reflection_coefficients(
 def transmission_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the transmission coefficients of a slab, TE and TM, at angles of incidence with these cosines."""
+    """Return the transmission coefficients of a slab, TE and TM, by the cosine of the angle of incidence."""
     eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     once = np.exp(-2j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
@@ -102,7 +101,7 @@ def transmission_coefficients(
 
 
 def wall_loss_db(material: Material, frequency_hz: float) -> float:
-    """Return the mean loss [dB] of going through a wall at angles of incidence up to 60 degrees."""
+    """Return the transmission loss [dB] of a wall, averaged over angles of incidence up to 60 degrees."""
     permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     cosine = np.cos(np.radians(_ANGLES_DEG))
     te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
@@ -110,14 +109,13 @@ def wall_loss_db(material: Material, frequency_hz: float) -> float:
 
 
 class Materials(NamedTuple):
-    """Coefficients of the slabs of M materials, TE and TM, and of edges.
+    """Coefficients of M slabs, TE and TM, and of edges.
 
-    `reflection` and `transmission` (M, K + 1, 2) are the coefficients where the cosine of the angle of incidence is
-    k / K. `most_reflected` (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted`
-    (M, K + 1) the largest |T|^2 at this cosine or a smaller one. `largest` (M, L, 4) are the largest reflected |TE|,
-    |TM| and |TE + TM| where the cosine is l / L to (l + 1) / L, and the largest of the first two where it is l / L or
-    more.
-    `transition` is F(y^2) / y of the UTD transition function F.
+    `reflection` and `transmission` (M, K + 1, 2) are by k / K, the cosine of the angle of incidence. `most_reflected`
+    (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted` the largest |T|^2 at this cosine
+    or a smaller one. `largest` (M, L, 4) are the largest |TE|, |TM| and |TE + TM| reflected at cosines from l / L to
+    (l + 1) / L, and the largest of the first two from l / L on. `transition` is F(y^2) / y of the UTD transition
+    function F.
     """
 
     wavelength_m: float
@@ -130,9 +128,10 @@ class Materials(NamedTuple):
 
 
 class Gains(NamedTuple):
-    """Upper bounds of the gain of the transmit antenna: by degrees of zenith and azimuth, by azimuth, and of all.
+    """Upper bounds of the gain of the transmit antenna.
 
-    `table` is (181, 360), and (1, 1) for an isotropic antenna; `by_azimuth` (360,) is the largest of any zenith.
+    `table` (181, 360) is by degrees of zenith and azimuth, (1, 1) if isotropic; `by_azimuth` (360,) is the largest of
+    any zenith.
     """
 
     table: NDArray[np.float64]
@@ -144,8 +143,7 @@ ISOTROPIC = Gains(np.ones((1, 1)), np.ones(1), 1.0)
 
 
 @njit(cache=True)
-def gain_towards(gains, x, y, z):  # type: ignore[no-untyped-def]
-    """Return the gain in a direction."""
+def gain_towards(gains, x, y, z):
     if len(gains.table) == 1:
         return 1.0
     zenith, azimuth = math.degrees(math.atan2(math.hypot(x, y), z)), math.degrees(math.atan2(y, x))
@@ -153,16 +151,15 @@ def gain_towards(gains, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def gain_at_azimuth(gains, x, y):  # type: ignore[no-untyped-def]
-    """Return the largest gain in a horizontal direction, at any zenith."""
+def gain_at_azimuth(gains, x, y):
     if len(gains.by_azimuth) == 1:
         return 1.0
     return gains.by_azimuth[int(math.degrees(math.atan2(y, x)) + 360.5) % 360]
 
 
 @njit(cache=True)
-def gain_between(gains, first, second):  # type: ignore[no-untyped-def]
-    """Return the largest gain from one horizontal direction counterclockwise to another, less than half a turn."""
+def gain_between(gains, first, second):
+    """Return the largest gain between two horizontal directions, counterclockwise, less than half a turn apart."""
     if len(gains.by_azimuth) == 1:
         return 1.0
     start = math.degrees(math.atan2(first[1], first[0]))
@@ -201,7 +198,7 @@ def materials_of(constants: Iterable[ArrayLike], frequency_hz: float) -> Materia
 
 
 def _transition_table() -> NDArray[np.complex128]:
-    """F(y^2) / y (Kouyoumjian and Pathak 1974) for y = k / _STEPS."""
+    """Return F(y^2) / y (Kouyoumjian and Pathak 1974) for y = k / _STEPS."""
     y = np.arange(_STEPS * _ASYMPTOTIC + 2) / _STEPS
     sine, cosine = fresnel(math.sqrt(2.0 / math.pi) * y)
     table: NDArray[np.complex128] = np.exp(1j * y**2) * (1.0 + 1j - 2j * (cosine - 1j * sine))
@@ -209,23 +206,22 @@ def _transition_table() -> NDArray[np.complex128]:
 
 
 @njit(cache=True)
-def reflected_power(largest, cosine):  # type: ignore[no-untyped-def]
-    """Largest fraction of the power that a reflection by one of the materials leaves, however polarised."""
+def reflected_power(largest, cosine):
+    """Return the largest fraction of power reflected, for any material and polarisation."""
     at = min(int(abs(cosine) * _ANGLES), _ANGLES - 1)
     return max(largest[at, 0], largest[at, 1]) ** 2
 
 
 @njit(cache=True)
-def power_near(table, material, cosine):  # type: ignore[no-untyped-def]
-    """Return the fraction of the power, of the better polarisation, that one slab reflects or lets through."""
+def power_near(table, material, cosine):
+    """Return the power that a slab reflects or transmits, for the better polarisation."""
     at = min(int(cosine * COSINES + 0.5), COSINES)
     te, tm = table[material, at, 0], table[material, at, 1]
     return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
 
 
 @njit(cache=True)
-def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
-    """Interpolate the coefficients TE and TM of a slab."""
+def _coefficients(table, material, cosine):
     at = cosine * COSINES
     low = min(int(at), COSINES - 1)
     part, te, tm = at - low, table[material, low, 0], table[material, low, 1]
@@ -233,17 +229,16 @@ def _coefficients(table, material, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def most_at_wall(largest, material, cosine):  # type: ignore[no-untyped-def]
-    """Return the largest factor of a field at a reflection, for this cosine of incidence or a larger one."""
+def most_at_wall(largest, material, cosine):
     return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
 
 
 @njit(cache=True)
-def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-untyped-def]
-    """Return bounds of a field after a reflection at a wall: vertical, horizontal, and the part that is never turned.
+def at_wall(largest, material, cosine, sine, slope, field):
+    """Return bounds of a reflected field: vertical, horizontal, and the part that is never turned.
 
-    `cosine` is the cosine of the angle of incidence seen from above; `sine` and `slope` are the horizontal and the
-    vertical part of the direction of the path.
+    `cosine` is for the angle of incidence seen from above; `sine` and `slope` are the horizontal and vertical part of
+    the path's direction.
     """
     cosine = min(abs(cosine), 1.0)
     at = min(int(cosine * sine * _ANGLES), _ANGLES - 1)
@@ -255,11 +250,11 @@ def at_wall(largest, material, cosine, sine, slope, field):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # type: ignore[no-untyped-def]
-    """Return bounds of a field after a diffraction, without the spread of the wave, as `at_wall` does.
+def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
+    """Return bounds of a diffracted field as `at_wall` does, without the spread of the wave.
 
-    `tables` are `reflection` and `transition` of `Materials`, `boundary` is sqrt(2 k L), and `cosines` are the
-    cosines of the angles of incidence at both faces.
+    `tables` are `reflection` and `transition` of `Materials`, `boundary` is sqrt(2 k L), `cosines` are for incidence
+    at both faces.
     """
     (faces, transition), (cosine_0, cosine_n) = tables, cosines
     by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
@@ -274,8 +269,8 @@ def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):  # 
 
 
 @njit(cache=True)
-def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-def]
-    """Rough upper bound of a field after a diffraction, from what both faces reflect at most."""
+def most_at_edge(terms, boundary, face_0, face_n):
+    """Return a rough bound of a diffracted field, from the largest reflections of both faces."""
     size = 0.0
     for k, other, face in ((0, 3, face_0), (1, 2, face_n)):
         first, second = terms[k, 0], terms[other, 0]
@@ -288,8 +283,8 @@ def most_at_edge(terms, boundary, face_0, face_n):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyped-def]
-    """Bound of a vertical field after reflections off floor and ceiling, wherever they are in the path."""
+def at_flats(largest, material, slope, bounces, field):
+    """Return a bound of a vertical field after reflections off floor and ceiling, anywhere in the path."""
     at = min(int(slope * _ANGLES), _ANGLES - 1)
     te, tm = largest[material, at, 0], largest[material, at, 1]
     vertical, _, pure = field
@@ -297,19 +292,19 @@ def at_flats(largest, material, slope, bounces, field):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def _te_part(along, sine, slope):  # type: ignore[no-untyped-def]
-    """Part of a vertical field's power that is perpendicular to the plane of incidence at a wall.
+def _te_part(along, sine, slope):
+    """Return the fraction of a vertical field's power perpendicular to the plane of incidence at a wall.
 
-    `along` is the square of the cosine of the angle between path and wall, seen from above.
+    `along` is the squared cosine of the angle between path and wall, seen from above.
     """
     return min(along / (slope * slope + sine * sine * along), 1.0) if slope * slope > 1e-12 else 1.0
 
 
 @njit(cache=True)
-def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-def]
-    """Coefficient of a vertical field at a face of a wedge, and sizes of the others.
+def _at_face(faces, material, cosine, sine, slope):
+    """Return the coefficient of a vertical field at a face of a wedge, and magnitudes of the others.
 
-    A face in the shadow, where the cosine is negative, is a perfect mirror to Sionna RT.
+    To Sionna RT, a face in the shadow (negative cosine) is a perfect mirror.
     """
     if cosine < 0.0:
         return 1.0 + 0.0j, 0.0, 1.0
@@ -322,32 +317,32 @@ def _at_face(faces, material, cosine, sine, slope):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True)
-def _size(number):  # type: ignore[no-untyped-def]
-    """Magnitude of a complex number; `abs` is slower, as it cannot overflow."""
+def _size(number):
+    """Return the magnitude of a complex number; `abs` is slower, as it guards against overflow."""
     return math.sqrt(number.real * number.real + number.imag * number.imag)
 
 
 @njit(cache=True)
-def wedge_angle(angle, exterior):  # type: ignore[no-untyped-def]
-    """Sine and cosine of an angle / 2 n, and of half of it, for `utd_terms`; n is the exterior angle / pi."""
+def wedge_angle(angle, exterior):
+    """Return sine and cosine of an angle / 2 n, and of half of it, for `utd_terms`; n is the exterior angle / pi."""
     scaled = angle * 0.5 * math.pi / exterior
     return math.sin(scaled), math.cos(scaled), math.sin(0.5 * angle), math.cos(0.5 * angle)
 
 
 def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (W, 5) of wedges for `utd_terms`: sine and cosine of pi / 2 n and of n pi, and 1 / 2 n."""
+    """Return (W, 5) for `utd_terms`: sine and cosine of pi / 2 n and of n pi, and 1 / 2 n."""
     half = 0.5 * math.pi**2 / exterior_rad
     parts = np.sin(half), np.cos(half), np.sin(exterior_rad), np.cos(exterior_rad), half / math.pi
     return np.stack(parts, axis=1)
 
 
 @njit(cache=True)
-def utd_terms(wedge, arrival, departure, terms):  # type: ignore[no-untyped-def]
+def utd_terms(wedge, arrival, departure, terms):
     """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
 
-    Written are cot(psi) / 2 n, y = sqrt(a / 2), the sine of n times the angle from psi to the nearest pole of the
-    cotangent, and 1 / y^2 (4, 3). Directions count from the 0-face; they are given by
-    `wedge_angle`, and `wedge` by `wedge_constants`.
+    `terms` (4, 3) receives cot(psi) / 2 n, with y = sqrt(a / 2) the sine of n times the angle from psi to the nearest
+    pole of the cotangent, and 1 / y^2. `wedge` is from `wedge_constants`, directions from the 0-face are from
+    `wedge_angle`.
     """
     for k in range(4):
         sign, turn = -1.0 if k < 2 else 1.0, 1.0 if k % 2 == 0 else -1.0
@@ -364,8 +359,7 @@ def utd_terms(wedge, arrival, departure, terms):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def utd_term(transition, terms, k, boundary):  # type: ignore[no-untyped-def]
-    """Return one of the terms of `utd_terms` for sqrt(2 k L)."""
+def utd_term(transition, terms, k, boundary):
     y = boundary * terms[k, 1]
     if y < _ASYMPTOTIC:
         at = int(y * _STEPS)
@@ -375,23 +369,22 @@ def utd_term(transition, terms, k, boundary):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def vertical_field(k):  # type: ignore[no-untyped-def]
-    """Field of a vertical antenna in a direction: the unit vector along theta of spherical coordinates."""
+def vertical_field(k):
+    """Return the field of a vertical antenna: the unit vector along theta of spherical coordinates."""
     flat = max(np.hypot(k[0], k[1]), 1e-12)
     return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
 
 
 @njit(cache=True)
-def received_power(k, e):  # type: ignore[no-untyped-def]
-    """Return the fraction of the power that a vertical antenna receives from a field with some direction."""
+def received_power(k, e):
     vertical = vertical_field(k)
     field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
     return field.real**2 + field.imag**2
 
 
 @njit(cache=True)
-def at_slab(k, e, n, materials, material, kind):  # type: ignore[no-untyped-def]
-    """Direction and field of a path after a reflection at a slab with the unit normal `n`, or a refraction."""
+def at_slab(k, e, n, materials, material, kind):
+    """Return direction and field after a reflection at a slab with unit normal `n`, or a refraction."""
     along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]
     sx, sy, sz = k[1] * n[2] - k[2] * n[1], k[2] * n[0] - k[0] * n[2], k[0] * n[1] - k[1] * n[0]
     norm = np.sqrt(sx * sx + sy * sy + sz * sz)

@@ -1,6 +1,5 @@
-"""Selection of the candidates that Sionna RT verifies: a link can do without those that are weak by their bounds.
+"""Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
 
-Kinds of interactions list candidates with an upper bound of their power, and write out only those that are selected.
 The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out as long as their sum does not
 exceed the power that the link may lack.
 """
@@ -26,13 +25,13 @@ LEVELS = 96
 """Number of levels. Level 0 has the direct path alone, the last level all candidates too weak for the others."""
 
 _STRONGEST = -25
-"""Level of a power of 0 dB; there are two levels for a factor of 2."""
+"""Level of a power of 0 dB; two levels are a factor of 2."""
 
 _FOUND = 0.8
-"""Fraction of the sum of all bounds that the verified paths of a link are expected to have."""
+"""Expected power of the verified paths of a link, as a fraction of the sum of all bounds."""
 
 _WRITTEN_AT_ONCE = 100_000
-"""Number of candidates that are written together, which limits the memory."""
+"""Number of candidates written together, which bounds the memory."""
 
 _USUAL_REFLECTIONS = 3
 """Reflections of a path through walls beyond which its power is discounted."""
@@ -52,7 +51,7 @@ class Listed(NamedTuple):
     write : callable
         Returns the candidates of some rows (K,).
     done : float
-        Fraction of the work of this kind that is done with this part.
+        Fraction of this kind's work that ends with this part.
     unlisted : (N,) float64 array or 0
         Sum of the bounds of negligible candidates, which are not listed.
     at_once : int
@@ -67,7 +66,6 @@ class Listed(NamedTuple):
     at_once: int = _WRITTEN_AT_ONCE
 
     def blocks(self, rows: Indices) -> Iterator[Candidates]:
-        """Write some rows, some at a time."""
         for start in range(0, len(rows), self.at_once):
             yield self.write(rows[start : start + self.at_once])
 
@@ -86,11 +84,11 @@ class Kind(Protocol):
 
 
 Part = tuple[str, Listed, NDArray[np.uint8]]
-"""Name of a kind, a part of its candidates without their bounds, and their levels (C,)."""
+"""Name of a kind, a part of its candidates without bounds, and their levels (C,)."""
 
 
 class Block(NamedTuple):
-    """Written candidates, the fraction of the whole work that is done with them, and the message."""
+    """Written candidates, the fraction of the work that ends with them, and the message."""
 
     candidates: Candidates
     done: float
@@ -99,37 +97,32 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """All candidates of some kinds, each part with the levels (C,) of its candidates, and the sums of their bounds.
-
-    `power` (N, LEVELS) are the sums for each receiver and level.
-    """
+    """Candidates of some kinds with their levels; `power` (N, LEVELS) are the sums of bounds by receiver and level."""
 
     parts: list[Part]
     power: Floats
 
     @classmethod
     def of(cls, kinds: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress) -> "Selection":
-        """List the candidates of all kinds."""
         parts: list[Part] = []
         power = np.zeros((receivers, LEVELS))
         for number, kind in enumerate(kinds):
             before = power[:, 1:].sum(axis=1)
             own, sums = _levels(kind, before, len(kinds), number, report)
             exceeded = sums[:, -1] > missing_power(expected_power(power + sums), tolerance_db)
-            if exceeded.any() and before.any():  # too many are negligible
+            if exceeded.any() and before.any():
                 own, sums = _levels(kind, np.where(exceeded, 0.0, before), len(kinds), number, report)
             parts, power = [*parts, *own], power + sums
         return cls(parts, power)
 
     def needed(self, found: Floats, tolerance_db: float) -> NDArray[np.int64]:
-        """Return below which level (N,) links need candidates if their indirect paths have the power `found` (N,)."""
+        """Return the level (N,) below which links need candidates, if their paths have the power `found` (N,)."""
         count = LEVELS - 1
         start = np.arange(len(found) + 1) * count
         first = _first_needed(start, self.power[:, :0:-1].ravel(), missing_power(found, tolerance_db))
         return LEVELS - (first - start[:-1])
 
     def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
-        """Write the candidates whose level is at least `first` (N,) and below `last` (N,)."""
         for number, (name, part, level) in enumerate(self.parts, start=1):
             rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
             for candidates in part.blocks(rows):
@@ -137,7 +130,7 @@ class Selection:
 
 
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:
-    """List a kind, one of several: its parts with their levels, and the sums of the bounds (N, LEVELS)."""
+    """List a kind; return its parts with their levels, and the sums of the bounds (N, LEVELS)."""
     parts, power = [], np.zeros((len(before), LEVELS))
     for part in kind.listed(before):
         level = levels_of(part.bound)
@@ -152,10 +145,10 @@ def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progres
 def rounds(
     opaque: Sequence[Kind], through_walls: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress
 ) -> Iterator[Callable[[Floats], Iterator[Block]]]:
-    """Yield functions that select candidates, one after the other, by the power (N,) of the paths found so far.
+    """Yield functions that select candidates by the power (N,) of the paths found so far.
 
-    First, the candidates of opaque walls are verified that links need if the strongest are as strong as their bounds.
-    If Sionna RT finds less, more of them follow. Paths through walls follow last, kind after kind.
+    The first selects candidates of opaque walls as if the strongest were as strong as their bounds; if Sionna RT finds
+    less power, more follow. Paths through walls come last, kind after kind.
     """
     low = 0.6 if through_walls else 1.0
     if tolerance_db == 0.0:
@@ -172,7 +165,6 @@ def rounds(
 
 
 def _every_block(kinds: Sequence[Kind], receivers: int, high: float) -> Iterator[Block]:
-    """Write all candidates of all kinds."""
     for number, kind in enumerate(kinds):
         for part in kind.listed(np.zeros(receivers)):
             for candidates in part.blocks(np.arange(len(part.rx))):
@@ -180,14 +172,13 @@ def _every_block(kinds: Sequence[Kind], receivers: int, high: float) -> Iterator
 
 
 def _strongest_blocks(kind: Kind, tolerance_db: float, high: float, found: Floats) -> Iterator[Block]:
-    """Write the candidates of a kind, whose bounds are their powers, that links need."""
     for part in kind.listed(found):
         for candidates in part.blocks(strongest(part, found, tolerance_db)):
             yield Block(candidates, high, f"verifying {kind.name}")
 
 
 def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:
-    """Return the rows of candidates, whose bound is their power, that links need in addition to `found` (N,)."""
+    """Return the rows of candidates with exact bounds that links need in addition to `found` (N,)."""
     order = np.lexsort((part.bound, part.rx))
     order = order[part.bound[order] > 0.0]
     rx, power = part.rx[order], part.bound[order]
@@ -199,10 +190,10 @@ def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:
 
 
 class Limits(NamedTuple):
-    """Limits of paths through walls: most reflections, most of them at walls, and most walls to go through.
+    """Largest numbers of reflections, of reflections at walls, and of walls crossed.
 
-    `discount` multiplies the power of beams for each reflection at a wall beyond the third. Paths need not be listed
-    whose power is less than `weakest`, relative to their link.
+    `discount` multiplies the power for each reflection at a wall beyond the third. Paths weaker than `weakest`,
+    relative to their link, need not be listed.
     """
 
     depth: int
@@ -212,31 +203,33 @@ class Limits(NamedTuple):
     weakest: float
 
     @classmethod
-    def of(cls, settings: TraceSettings, walls: int, *, directed: bool) -> "Limits":
-        """Return the limits for at most so many walls; a directed antenna can make long paths the strongest."""
+    def of(cls, settings: TraceSettings, walls: int, *, directed: bool, coarse: bool = False) -> "Limits":
+        """Return the limits for at most so many walls; with a directed antenna, long paths can be the strongest.
+
+        With `coarse`, fewer paths are listed: where the material of walls is unknown, its spread is much larger.
+        """
         depth = settings.max_depth
         if settings.tolerance_db == 0.0:
             return cls(depth, depth, walls, 1.0, 1e-6)
         if directed:
             return cls(depth, depth, walls, 0.1, 1e-4)
-        return cls(depth, min(depth, 4), walls, 0.03, 5e-4)
+        reflections, weakest = (3, 2.5e-3) if coarse else (4, 5e-4)
+        return cls(depth, min(depth, reflections), walls, 0.03, weakest)
 
     def min_power(self, found: Floats) -> Floats:
-        """Return the smallest power (N,) of paths to list where the others have the power `found` (N,)."""
         return self.weakest * np.maximum(found, _NO_POWER)
 
 
 @njit(cache=True)
-def discount_after(limits, reflections):  # type: ignore[no-untyped-def]
-    """Return the factor that the power of beams with so many reflections at walls counts with."""
+def discount_after(limits, reflections):
     return limits.discount ** max(0, reflections - _USUAL_REFLECTIONS)
 
 
 class NeedsByDistance(NamedTuple):
-    """The power that a ray must have to matter to receivers (N,), sorted by their distance from the transmitter.
+    """Smallest power that matters, relative to free space, by distance from the transmitter.
 
-    `relative` is the smallest power that matters, relative to free space, to any receiver at least that far away,
-    `near` the smallest to any at most that far away, times (4 pi / wavelength)^2.
+    `relative` is the smallest for any receiver at least as far away, `near` the smallest for any at most as far away,
+    times (4 pi / wavelength)^2.
     """
 
     distance_m: Floats
@@ -245,7 +238,6 @@ class NeedsByDistance(NamedTuple):
 
 
 def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: float) -> NeedsByDistance:
-    """Sort the smallest power (N,) that matters to each receiver by distance."""
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
     order = np.argsort(distance_m, kind="stable")
     distance_m, power = distance_m[order], power[order] * (4.0 * np.pi / wavelength_m) ** 2
@@ -254,7 +246,7 @@ def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: f
 
 
 @njit(cache=True)
-def matters(fraction, near, needed):  # type: ignore[no-untyped-def]
+def matters(fraction, near, needed):
     """Return whether a ray with a fraction of its power left, at least `near` long, may matter to any receiver."""
     at = np.searchsorted(needed.distance_m, near)
     if at < len(needed.distance_m) and fraction >= needed.relative[at]:
@@ -263,10 +255,10 @@ def matters(fraction, near, needed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _first_needed(start, power, allowed):  # type: ignore[no-untyped-def]
-    """Return the first of the powers of each receiver (N,), the weakest first, that may not be left out.
+def _first_needed(start, power, allowed):
+    """Return the first power of each receiver (N,), the weakest first, that may not be left out.
 
-    Receiver k has the powers from `start[k]` to `start[k + 1]`, and those left out add up to `allowed[k]` at most.
+    Receiver k has the powers `start[k]` to `start[k + 1]` and may lack `allowed[k]` in all.
     """
     first = np.empty(len(allowed), np.int64)
     for k in range(len(allowed)):
@@ -280,7 +272,6 @@ def _first_needed(start, power, allowed):  # type: ignore[no-untyped-def]
 
 
 def levels_of(bound: Floats) -> NDArray[np.uint8]:
-    """Return the levels (C,) of upper bounds of power (C,)."""
     mantissa, exponent = np.frexp(bound)
     level = np.clip(_STRONGEST - 2 * exponent + (mantissa < math.sqrt(0.5)), 1, LEVELS - 1)
     level = np.where(bound > 0.0, level, LEVELS - 1)
@@ -288,14 +279,13 @@ def levels_of(bound: Floats) -> NDArray[np.uint8]:
 
 
 def expected_power(power: Floats) -> Floats:
-    """Return the power (N,) that indirect paths are expected to have by the sums of their bounds (N, LEVELS)."""
     return np.asarray(_FOUND * power[:, 1:].sum(axis=1))
 
 
 def missing_power(found: Floats, tolerance_db: float) -> Floats:
     """Return the power (N,) that links may lack whose indirect paths have the power `found` (N,).
 
-    It changes that power by `tolerance_db` at most; a link without paths may lack power that no receiver notices.
+    The gain changes by `tolerance_db` at most; links without paths may lack power that no receiver notices.
     """
     fraction = 10.0 ** (tolerance_db / 10.0) - 1.0
     return np.maximum(fraction * found, _NO_POWER - found)

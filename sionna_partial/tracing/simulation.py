@@ -49,32 +49,31 @@ DRAWN_TOLERANCE_DB = 0.5
 """Tolerance of powers between drawn walls [dB]."""
 
 InvalidLinks = Literal["raise", "nan"]
-"""Treatment of links that cannot be traced."""
 
 _log = logging.getLogger(__name__)
 
 SHORTEST_M = 0.011
-"""Shortest distance of a link [m]. Sionna RT drops every leg of a path of 1 cm or less."""
+"""Shortest distance of a link [m]. Sionna RT drops paths with a leg of 1 cm or less."""
 
 LARGE_JOB = 8_000
-"""Number of links from which the memory that their paths take is estimated first."""
+"""Number of links from which the memory of their paths is estimated first."""
 
 SAMPLE = 100
-"""Number of receivers from which the number of all paths is estimated."""
+"""Number of receivers for this estimate."""
 
 
 class ResolvedSettings(NamedTuple):
-    """Settings on one map: defaults of the kind of map instead of None, and the map's own material, if it has one."""
+    """Settings on one map: its defaults instead of None, and its own material, if it has one."""
 
     trace_settings: TraceSettings
     scene_settings: SceneSettings
 
 
 class Simulation:
-    """The paths of any links in one map, found by Sionna RT: the forward model.
+    """Forward model: the paths of any links in one map, found by Sionna RT.
 
-    It loads the scene when the first paths are asked for, and keeps it, and all that Dr.Jit compiles for it, for later
-    calls: a second call takes a part of the time of the first. What takes a map and traces takes a simulation, too.
+    The scene is loaded for the first paths and kept with all compiled kernels, so that later calls are faster. Every
+    function that traces a map accepts a Simulation.
 
     Parameters
     ----------
@@ -87,12 +86,11 @@ class Simulation:
     ----------
     partial : PartialMap
     trace_settings : TraceSettings
-        As given; what they mean on this map is in `resolved`.
+        As given; `resolved` has the values on this map.
     scene_settings : SceneSettings
-        As given, likewise.
     resolved : ResolvedSettings
     material_unknown : bool
-        True where paths go through walls of which neither settings nor map give the material.
+        True where paths go through walls of a material that neither settings nor map give.
 
     Raises
     ------
@@ -151,11 +149,11 @@ class Simulation:
         tx : (3,) or (T, 3) array-like
             Transmitter positions [m].
         rx : (N, 3) array-like
-            Receiver positions [m]; N may be 0.
+            Receiver positions [m].
         polarisations : {2, 1}
-            1 traces vertical polarisation alone, which takes a quarter of the memory for `TracedLinks.transfer`.
+            1 traces vertical polarisation alone, with a quarter of the memory for `TracedLinks.transfer`.
         folder, memory_gb, invalid, progress
-            As of `trace_links`.
+            As in `trace_links`.
 
         Returns
         -------
@@ -206,7 +204,7 @@ class Simulation:
         SettingsError
             For paths that only rays find.
         BackendError
-            If LLVM or Sionna RT cannot be used, or Sionna RT is another than the fast engine was made for.
+            If LLVM or Sionna RT cannot be used, or the fast engine does not support this release of Sionna RT.
         """
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.trace_settings.frequency_hz)
         tx_m, rx_m = tx_m.reshape(np.shape(tx)).copy(), rx_m.copy()
@@ -218,22 +216,23 @@ class Simulation:
     def blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[SolvedPaths]:
-        """Find all paths from a transmitter (3,) to receivers (N, 3) that have been checked, some at a time.
+        """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, some at a time.
 
-        With an antenna, both polarisations are traced, and paths are left out that are weak with it.
+        An antenna needs both polarisations; paths are left out that are weak with it. Limits are coarse where the
+        material of walls is unknown.
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
-        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, averaged=True):
+        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=self._coarse_finder):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
     def path_blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, rx_of_tx: Iterable[Indices] | None = None
     ) -> Iterator[PathSet]:
-        """Find the paths of `paths` some at a time, for positions that have been checked.
+        """Find the paths of `paths` some at a time, for checked positions.
 
-        `rx_of_tx` selects the receivers of each transmitter, in place of all of them.
+        `rx_of_tx` selects the receivers of each transmitter; None: all.
         """
         sources_m = tx_m.reshape(-1, 3)
         chosen = [np.arange(len(rx_m))] * len(sources_m) if rx_of_tx is None else rx_of_tx
@@ -244,7 +243,7 @@ class Simulation:
 
     @property
     def solver(self) -> SceneSolver:
-        """The solver of candidates in scene coordinates; raises what `require_exact` does."""
+        """The solver of candidates in scene coordinates; raises as `require_exact`."""
         self.require_exact()
         assert isinstance(self._finder, ExactFinder)
         return self._finder.solver
@@ -271,7 +270,7 @@ class Simulation:
         resolved_settings(self.partial, settings, self.scene_settings)
 
     def require_exact(self) -> None:
-        """Raise a SettingsError for paths that only rays find, and a BackendError where they must find all."""
+        """Raise a SettingsError for paths that only rays find, and a BackendError for an unsupported Sionna RT."""
         for kind in self._only_by_rays:
             remedy = "paths that are found by shooting rays have no gradients: give False"
             require(False, kind.setting, True, f"{remedy}, and trace_links for the gain alone.")
@@ -279,11 +278,11 @@ class Simulation:
             raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
 
     def in_scene(self, points_m: Floats) -> Floats:
-        """Return points (..., 3) [m] of the world in coordinates of the scene, whose origin the map's corner is."""
+        """Return world points (..., 3) [m] in scene coordinates, with the origin at the map's corner."""
         return points_m - self._origin_m
 
     def in_world(self, points_m: Floats) -> Floats:
-        """Return points of the scene in coordinates of the world."""
+        """Return scene points (..., 3) [m] in world coordinates."""
         return points_m + self._origin_m
 
     @property
@@ -292,14 +291,21 @@ class Simulation:
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
-        """Return the finder of the paths, with the scene in memory; a warning is logged where only rays do."""
+        """Return the finder of paths, with its scene in memory; a warning is logged where only rays find them."""
         return self._finder_of(0)
 
     @cached_property
     def _mean_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Return the finder of the paths whose powers are averaged over geometries."""
         draws = range(1, self.resolved.scene_settings.geometries or 1)
         return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
+
+    @cached_property
+    def _coarse_finder(self) -> ExactFinder | RayFinder | MeanFinder:
+        """Return the finder of the paths that predictions need."""
+        finder = self._mean_finder
+        if not self.material_unknown or not isinstance(finder, ExactFinder):
+            return finder
+        return replace(finder, written=replace(finder.written, coarse=True))
 
     def _finder_of(self, draw: int) -> ExactFinder | RayFinder:
         if self._only_by_rays:
@@ -324,10 +330,10 @@ class Simulation:
         polarisations: int = 1,
         antenna: Antenna | None = None,
         *,
-        averaged: bool = False,
+        finder: ExactFinder | RayFinder | MeanFinder | None = None,
     ) -> Iterator[Iterator[Found]]:
-        """Find the paths from transmitters (T, 3) to some receivers each, for so many receivers at once as fit."""
-        finder = self._mean_finder if averaged else self._finder
+        """Find the paths from transmitters (T, 3) to the receivers of each, in blocks of bounded memory."""
+        finder = finder or self._finder
         at_once = self.partial.environment.receivers_at_once
         groups = [
             (tx, chosen[start : start + at_once].astype(np.int32))
@@ -340,7 +346,6 @@ class Simulation:
             yield self._in_world(tx, chosen, finder.paths(*ends, polarisations, part, antenna))
 
     def _in_world(self, tx: int, chosen: NDArray[np.int32], found: Iterator[Found]) -> Iterator[Found]:
-        """Return paths in coordinates of the world, with the numbers of their transmitter and receivers."""
         for candidates, paths in found:
             if len(paths.a):
                 world = replace(paths, vertices_m=self.in_world(paths.vertices_m))
@@ -357,8 +362,9 @@ class Simulation:
     ) -> dict[str, Any]:
         """Trace the links of a mask (T, N) into columns of paths; return their states and gains [dB]."""
         sums = LinkSums(*valid.shape)
-        rx_of_tx, averaged = map(np.flatnonzero, valid), isinstance(columns, PathColumns)
-        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, averaged=averaged):
+        rx_of_tx = map(np.flatnonzero, valid)
+        finder = self._mean_finder if isinstance(columns, PathColumns) else self._finder
+        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, finder=finder):
             parts = [paths for _, paths in group]
             columns.append(parts)
             for paths in parts:
@@ -371,16 +377,15 @@ class Simulation:
     def _require_memory(
         self, tx_m: Floats, rx_m: Floats, memory_gb: float | None, valid: Bools, bytes_each: int
     ) -> None:
-        """Log how much memory the paths of a large job take, estimated from some of its receivers.
-
-        Raises a MemoryLimitError if that is more than `memory_gb`.
-        """
+        """Log the memory of the paths of a large job; raise a MemoryLimitError above `memory_gb`."""
         if valid.sum() <= LARGE_JOB:
             return
         source = int(valid.sum(axis=1).argmax())
         all_m = rx_m[valid[source]]
         some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
-        found = sum(len(paths.a) for paths in self.blocks(tx_m[source], some, no_progress))
+        every = [np.arange(len(some))]
+        groups = self._groups(tx_m[source][None], some, every, no_progress, finder=self._mean_finder)
+        found = sum(len(paths.a) for group in groups for _, paths in group)
         count = round(found / len(some) * valid.sum())
         size_gb = 2 * count * bytes_each / 1e9
         _log.info("about %d paths, which take %.1f GB", count, size_gb)
@@ -392,7 +397,7 @@ class Simulation:
 
 
 def _shaped(ends: dict[str, Any]) -> dict[str, Any]:
-    """Give what belongs to links (T, N) the shape (N,) if there is one transmitter (3,)."""
+    """Reshape link values (T, N) to (N,) for one transmitter (3,)."""
     shape = (*ends["tx"].shape[:-1], len(ends["rx"]))
     return {name: each if name in ("tx", "rx") else each.reshape(shape) for name, each in ends.items()}
 
@@ -432,18 +437,17 @@ def trace_links(
 ) -> TracedLinks:
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
-    On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge of the walls
-    (corners, door jambs) and at most two reflections around it are complete, but for legs of 1 cm or less, which Sionna
-    RT drops: candidates come from exact beams and are verified by Sionna RT's image method. On a mesh, rays determine
-    the sequences of planes; line of sight and nearly all specular reflections are found. Paths through walls are found
-    in the same way. With diffuse reflection or, on a mesh, diffraction switched on, Sionna RT's public path solver
-    shoots rays instead, receiver by receiver, which is slow and finds most paths, not all. It also does with another
-    release of Sionna RT than 2.2. The answer for a receiver does not depend on the other receivers.
+    On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge and at most
+    two reflections are complete, except paths with a leg of 1 cm or less, which Sionna RT drops: exact beams give
+    candidates, and Sionna RT's image method verifies them. On a mesh, rays find the sequences of planes; line of sight
+    and nearly all reflections are found. Both include paths through walls. With diffuse reflection, diffraction on a
+    mesh, or a release of Sionna RT other than 2.2, Sionna RT's public path solver shoots rays for one receiver at a
+    time: slow, and it finds most paths, not all. The result of a receiver does not depend on the other receivers.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        Map of the building; unknown space is free (paper, Section III-B). A simulation stays warm.
+        Map of the building; unknown space is free (paper, Section III-B). A simulation is not loaded again.
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].
     rx : (N, 3) array-like
@@ -451,14 +455,13 @@ def trace_links(
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     folder : path, optional
-        Folder to which the paths are written while they are traced, an `.npy` file for each array. The arrays of the
-        result are then read from there when they are needed, and `memory_gb` does not limit them.
+        Folder for the paths, an `.npy` file for each array, written while they are traced. The arrays of the result are
+        read from there on demand, without the limit `memory_gb`.
     memory_gb : float
-        Largest memory of the paths [GB]. Their size is estimated first, from some of the receivers.
+        Largest memory of the paths [GB], compared with an estimate from some receivers.
     invalid : {"raise", "nan"}
-        Treatment of links whose receiver can stand nowhere (it is not finite, outside the map, in a wall, not
-        between floor and ceiling) or is at the transmitter: an error, or a link without paths, of link state 255 and
-        gain NaN.
+        Treatment of receivers that are not finite, outside the map, in a wall, not between floor and ceiling, or at the
+        transmitter: an error, or a link without paths, with link state 255 and gain NaN.
     progress : bool or callable, optional
         As in `predict_map`.
 
@@ -471,8 +474,8 @@ def trace_links(
     MemoryLimitError
         If the paths would take more than `memory_gb`.
     PositionError
-        For a transmitter or receiver that is not finite, outside the map or inside a wall, or a receiver within 1.1 cm
-        of a transmitter (at low frequencies, where Friis' formula is above 0 dB); with "nan" for a transmitter only.
+        For an invalid transmitter or (with "raise") receiver, such as one within 1.1 cm of a transmitter (more at low
+        frequencies, where Friis' formula is above 0 dB).
     SettingsError
         For a frequency that a material does not cover, settings of another kind, or another value of `invalid`.
     BackendError
@@ -508,7 +511,6 @@ def resolved_settings(
 
 
 def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> int:
-    """Return the number of geometries over which powers are averaged."""
     if not partial.environment.is_extruded or trace_settings.power_tolerance_db is not None:
         return 1
     if scene_settings.geometries is not None:
@@ -519,7 +521,7 @@ def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settin
 
 
 def nearest_m(frequency_hz: float) -> float:
-    """Shortest distance of a link [m]: Sionna RT takes none of 1 cm, and Friis' formula is above 0 dB nearer by."""
+    """Return the shortest distance of a link [m], for Sionna RT and where Friis' formula is below 0 dB."""
     return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
 
 
@@ -532,7 +534,7 @@ def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
 
 
 def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
-    """Check the positions and give the transmitters as (T, 3), the receivers as (N, 3)."""
+    """Check the positions; return transmitters (T, 3) and receivers (N, 3)."""
     tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
     partial.require_positions("rx", rx_m, least=0)
     limit_m = nearest_m(frequency_hz)
@@ -548,7 +550,7 @@ def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequen
 
 
 def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
-    """Return transmitters (T, 3) and receivers (N, 3) [m], and whether `checked_positions` takes each link (T, N)."""
+    """Return transmitters (T, 3), receivers (N, 3) [m], and whether `checked_positions` accepts each link (T, N)."""
     tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
     far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
     return tx_m, rx_m, far & partial.radios_can_stand(rx_m)

@@ -1,4 +1,4 @@
-"""Paths and radio maps by Sionna RT's public solvers, which shoot rays and find most paths of any kind, not all."""
+"""Paths and radio maps by Sionna RT's public solvers, which shoot rays and find most paths of any kind."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ from sionna_partial.tracing.paths import SolvedPaths, Wedges
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS
 
 TABLE_SIZE = 3_000_000
-"""Entries of the hash table, at least: more lose fewer paths where refraction makes many, and take more memory."""
+"""Smallest size of the hash table: larger ones lose fewer paths with refraction, and take more memory."""
 
 SAME_POINT_M = 0.03
 """Paths of the same interactions at points closer than this are one path [m]."""
@@ -36,12 +36,10 @@ _MARKER_M = 0.15
 def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats) -> Iterator[SolvedPaths]:
     """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
 
-    `scene` comes from `open_scene`; positions and paths are in its coordinates. Most paths are found, not all: the more
-    rays, the more. Sionna RT counts the sequences of surfaces that rays meet in a hash table which all receivers of a
-    call share, where a collision drops a path: each receiver has a call of its own, and its paths do not depend on the
-    others. Sionna RT 2.2 takes paths that are reflected after a diffraction, and have fewer than `max_depth`
-    interactions, for longer than they are, and some dB too weak. Raises a BackendError if LLVM or Sionna RT cannot be
-    used.
+    `scene` comes from `open_scene`; positions and paths are in its coordinates. Sionna RT counts sequences of surfaces
+    in a hash table shared by the receivers of a call, where a collision drops a path: each receiver has its own call.
+    Sionna RT 2.2 computes paths that are reflected after a diffraction, with fewer than `max_depth` interactions, too
+    long and some dB too weak.
     """
     if len(rx_m) == 0:
         return
@@ -63,14 +61,13 @@ def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats)
 
 
 def _point(position_m: Floats) -> Any:
-    """Position as an array on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
+    """Return a position on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
     import mitsuba as mi
 
     return mi.Point3f(*(mi.Float([float(value)]) for value in position_m))
 
 
 def _options(settings: TraceSettings) -> dict[str, Any]:
-    """Arguments of Sionna RT's path solver."""
     rays = settings.samples_per_tx
     every_ray = 1 + rays * settings.max_depth if settings.diffuse_reflection else 0
     return {
@@ -88,7 +85,6 @@ def _switches(settings: TraceSettings) -> dict[str, bool]:
 
 
 def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) -> SolvedPaths:
-    """Copy the valid paths of one receiver out of Dr.Jit, each once."""
     real, imaginary = (np.transpose(part.numpy()[0, :, 0], (2, 0, 1)) for part in found.a)
     transfer = real + 1j * imaginary
     valid = np.flatnonzero(found.valid.numpy().ravel() & (transfer[:, 0, 0] != 0.0))
@@ -107,10 +103,10 @@ def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) 
 
 
 def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -> Bools:
-    """Find the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
+    """Mark the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
 
     Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
-    a diffuse reflection are samples of a rough surface, however close, and never repeats.
+    a diffuse reflection are samples of a rough surface and never repeats.
     """
     repeated = np.zeros(len(interactions), dtype=bool)
     exact = np.flatnonzero((interactions != DIFFUSE).all(axis=1))
@@ -123,10 +119,10 @@ def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -
 
 
 def diffracted_as_exact(wedges: Wedges, paths: SolvedPaths, walls_a_side: int) -> Bools:
-    """Return whether each path (P,) is diffracted as exact candidates are, if it is at all.
+    """Return whether each path (P,) is a candidate of a plan, if it is diffracted at all.
 
-    Sionna RT's rays are diffracted at the rims of floor and ceiling and at junctions of walls as well, and with any
-    number of reflections around it.
+    Sionna RT's rays are also diffracted at the rims of floor and ceiling and at junctions of walls, with any number of
+    reflections.
     """
     diffracted = (paths.interactions == DIFFRACTION).any(axis=1)
     kept = ~diffracted

@@ -1,11 +1,11 @@
-"""Rules for the faces along a line that count as one wall, for floor plans, obstacles and meshes.
+"""Rules for the faces along a line that are one wall, for floor plans, obstacles and meshes.
 
-Two faces that follow each other along a line are one wall if they are at most `depth_m` apart, measured across them,
-and no free cell of the map lies between them. In meshes they are also one wall where the line enters a closed body and
-leaves it again. One face of a wall has its loss, and none reflects a path that came through another.
+Consecutive faces are one wall if they are at most `depth_m` apart, measured across them, and no free cell of the map is
+between them. In meshes they are also one wall where the line enters and leaves a closed body. One face of a wall has
+its loss, and none reflects a path that came through another.
 
-Plans and meshes group faces in two functions: a mesh counts from the near end of the line, where its cells are
-sampled, too, and a common function would change which of two close faces is first.
+Plans and meshes group faces in two functions: a mesh counts from the near end of the line, where its cells are also
+sampled, and a common function would change the order of close faces.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
 from sionna_partial.scene.outlines import Plan
 from sionna_partial.tracing.interactions import REFRACTION
@@ -24,21 +24,28 @@ from sionna_partial.tracing.power import Materials
 
 
 class Interior(NamedTuple):
-    """The space between walls: cells (ny, nx) of the plan that are free, those with a floor, and their edge [m].
+    """Space between walls: cells (ny, nx) that are free or have a floor, their edge and the largest wall depth [m].
 
-    `solid` (P, 2) is whether the wall continues on the left and on the right of its pieces.
-    `depth_m` is how deep one wall may be.
+    `free_before` (ny + 1, nx + 1) is the number of free cells in smaller rows and columns. `solid` (P, 2) is True where
+    the wall continues on the left or right of its pieces.
     """
 
     free: Bools
+    free_before: Indices
     floor: Bools
     solid: Bools
     cell_m: float
     depth_m: float
 
+    @classmethod
+    def of(cls, free: Bools, floor: Bools, solid: Bools, cell_m: float, depth_m: float) -> "Interior":
+        """Count the free cells."""
+        before = np.pad(free.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
+        return cls(free, before, floor, solid, cell_m, depth_m)
+
 
 def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
-    """Return whether pieces (P,) of walls have only wall cells a cell away on their left and on their right (P, 2)."""
+    """Return whether pieces (P,) of walls have only wall cells a cell away on their left and right (P, 2)."""
     start, along = plan.pieces_m[:, 0], plan.pieces_m[:, 1] - plan.pieces_m[:, 0]
     length = np.hypot(*along.T)
     count = np.maximum(1, np.ceil(length / cell_m)).astype(np.int64)
@@ -107,8 +114,8 @@ def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
 class MetFaces(NamedTuple):
     """Scratch of one path: the faces that it meets, in order from the transmitter.
 
-    `face` are faces, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a further face of a
-    wall that has been crossed, which costs nothing; `cosine` is the cosine of incidence there, `point_m` the points.
+    `kind` is Sionna RT's number of each interaction, `same_wall` marks further faces of a wall that has been crossed,
+    which cost nothing, `cosine` is for the angle of incidence, `point_m` are the points.
     """
 
     face: NDArray[np.int64]
@@ -119,8 +126,7 @@ class MetFaces(NamedTuple):
 
 
 @njit(cache=True)
-def met_faces(size):  # type: ignore[no-untyped-def]
-    """Make room for a path that meets so many faces."""
+def met_faces(size):
     return MetFaces(
         np.empty(size, np.int64),
         np.empty(size, np.uint8),
@@ -131,16 +137,15 @@ def met_faces(size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def cosine_at(planes, face, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Cosine of the angle of incidence of a direction at a face."""
+def cosine_at(planes, face, dx, dy, dz):
     p = planes.plane[face]
     normal = planes.normal
     return min(abs(normal[p, 0] * dx + normal[p, 1] * dy + normal[p, 2] * dz), 1.0)
 
 
 @njit(cache=True)
-def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
-    """Return whether no free cell lies between two faces, met in turn at two fractions of a line from a to b."""
+def is_one_wall(mesh, first, second, a, b, begin, end):
+    """Return whether no free cell is between two faces, met in turn at fractions of a line from a to b."""
     body, outward = mesh.bodies.body, mesh.bodies.outward
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     if body[first] >= 0 and body[first] == body[second]:
@@ -152,8 +157,8 @@ def is_one_wall(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped-def]
-    """Return whether two faces, met at two fractions of a line from a to b, enclose the inside of one wall.
+def is_inside(mesh, first, second, a, b, begin, end):
+    """Return whether two faces, met at fractions of a line from a to b, enclose the inside of one wall.
 
     Faces that are across each other are a wall and the floor below it, or two walls at a corner.
     """
@@ -170,10 +175,10 @@ def is_inside(mesh, first, second, a, b, begin, end):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyped-def]
-    """Write the faces that a line from a to b meets as entries of a trail from number `begin`; the number of walls.
+def mark_walls(mesh, a, b, count, met, entries, begin):
+    """Write the faces on a line from a to b as trail entries from number `begin`; return the number of walls.
 
-    Walls are counted from the end whose coordinates are smaller, so that a link is the same in both directions.
+    Walls are counted from the end with smaller coordinates, so that links are reciprocal.
     """
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -203,12 +208,11 @@ def mark_walls(mesh, a, b, count, met, entries, begin):  # type: ignore[no-untyp
 
 
 @njit(cache=True)
-def group_faces(interior, start, end, found, cosine, same_wall):  # type: ignore[no-untyped-def]
-    """Write which faces on a leg are further faces of a wall (n,); return the number of walls.
+def group_faces(interior, start, end, found, cosine, same_wall):
+    """Mark further faces of a wall on a leg (n,); return the number of walls.
 
-    `found` (n,) are the fractions of the leg at which it meets them, in order, `cosine` (n,) the cosines of
-    incidence. Walls are counted from the end whose coordinates are smaller, so that a link is the same in both
-    directions.
+    `found` (n,) are ordered fractions of the leg, `cosine` (n,) the cosines of incidence. Walls are counted from the
+    end with smaller coordinates, so that links are reciprocal.
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
@@ -227,10 +231,10 @@ def group_faces(interior, start, end, found, cosine, same_wall):  # type: ignore
 
 
 @njit(cache=True)
-def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-untyped-def]
-    """Let the face of a wall with the median angle have its loss, as outlines may be ragged.
+def choose_face(cosine, same_wall, begin, end, backwards):
+    """Give the loss of a wall to its face with the median angle, as outlines may be ragged.
 
-    The wall has the faces from `begin` to `end`, which are counted from the last one if `backwards`.
+    The faces are `begin` to `end`, counted from the last one if `backwards`.
     """
     last = len(cosine) - 1
     for j in range(begin, end):
@@ -242,8 +246,8 @@ def choose_face(cosine, same_wall, begin, end, backwards):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-def]
-    """Return whether a leg meets a free cell between two fractions of it, except cells that the faces there cut."""
+def is_free_between(cells, start, end, first, last):
+    """Return whether a leg meets a free cell between two fractions, except cells that the faces there cut."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
     s, high = first * length + cells.cell_m, last * length - cells.cell_m
@@ -253,3 +257,26 @@ def is_free_between(cells, start, end, first, last):  # type: ignore[no-untyped-
             return True
         s += 0.5 * cells.cell_m
     return False
+
+
+@njit(cache=True)
+def are_in_wall(interior, x, y, rays):  # type: ignore[no-untyped-def]
+    """Return whether all rays between two from a point stay in one wall from a face to the next, by `is_free_between`.
+
+    Each of the two rays is (direction x, y, cosine of incidence at the next face, distances of the two faces).
+    """
+    left = low = np.inf
+    right = high = -np.inf
+    for along_x, along_y, cosine, near, far in rays:
+        if far < near or (far - near) * cosine > interior.depth_m:
+            return False
+        for s in (near + interior.cell_m, far - interior.cell_m):
+            left, right = min(left, x + s * along_x), max(right, x + s * along_x)
+            low, high = min(low, y + s * along_y), max(high, y + s * along_y)
+    rows, columns = interior.free.shape
+    begin, end = max(int(left / interior.cell_m), 0), min(int(right / interior.cell_m) + 1, columns)
+    bottom, top = max(int(low / interior.cell_m), 0), min(int(high / interior.cell_m) + 1, rows)
+    if begin >= end or bottom >= top:
+        return True
+    before = interior.free_before
+    return before[top, end] - before[bottom, end] - before[top, begin] + before[bottom, begin] == 0

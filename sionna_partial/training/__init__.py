@@ -1,1 +1,1 @@
-"""Train and fit what predicts: networks on data sets, the path model, walls that were not seen."""
+"""Training of networks, the path model, and unseen walls."""

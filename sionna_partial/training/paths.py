@@ -1,4 +1,4 @@
-"""Training of the `PathModel`: paths on partial maps held against those in the whole of a home."""
+"""Training of the `PathModel`: paths on partial maps compared with paths in the complete home."""
 
 import math
 import sys
@@ -25,14 +25,14 @@ ANALOGUES_OF_STATE = 3_000
 """Number of links with LOS, and of links without, whose paths are kept."""
 
 RANGE_DB, MOST_PATHS = 25.0, 24
-"""Paths of an analogue are at most so much weaker than its strongest [dB], and at most so many."""
+"""Limits for the paths of an analogue: power below the strongest path [dB], and number."""
 
 LENGTH_M, DIRECTION, GAIN_DB = 0.3, 0.09, 4.0
-"""Largest differences of two paths that count as one: length [m], unit vectors at both ends [1], gain [dB]."""
+"""Tolerances for equal paths: length [m], unit vectors at both ends [1], gain [dB]."""
 
 HOME_STEPS, FLOOR_STEPS = (0, 50, 120, 250), (0, 200, 500)
 TRANSMITTERS, RECEIVERS, NEAREST_M = 3, 50, 0.15
-"""Steps after which homes and floors are taken, numbers of random ends, and their smallest distance [m]."""
+"""Exploration steps of homes and floors, numbers of random ends, and their smallest distance [m]."""
 
 _UNITS, _PASSES, _BATCH = 20, 8, 512
 
@@ -41,7 +41,7 @@ _UNITS, _PASSES, _BATCH = 20, 8, 512
 class Example:
     """Links of one partial map: inputs and truth of survival, and analogues by state, each a key and its paths (K, 6).
 
-    Paths are rows of fraction of power, delay after the direct line [ns], zenith and azimuth at both ends [rad].
+    The columns of paths are the fraction of power, the excess delay [ns], zenith and azimuth at both ends [rad].
     """
 
     inputs: Floats
@@ -50,7 +50,7 @@ class Example:
 
 
 def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -> Example:
-    """Trace links between transmitters (T, 3) and receivers (N, 3) [m] on a partial map and in its home."""
+    """Trace links between (T, 3) and (N, 3) [m] on a partial map and in its home."""
     known, true = (trace_links(each, tx_m, rx_m, progress=False) for each in (partial, home))
     ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
     geometry = LinkGeometry.of(partial, *ends, known.trace_settings.frequency_hz)
@@ -69,7 +69,7 @@ def example(partial: PartialMap, home: PartialMap, tx_m: Floats, rx_m: Floats) -
 
 
 def _same(known: TracedLinks, link: Indices, true: TracedLinks, true_link: Indices) -> Indices:
-    """For each path on the partial map the path in the home that it is, -1 if there is none."""
+    """Return the index of the same path in the home for each path on the partial map, or -1."""
 
     def points(links: TracedLinks, link: Indices) -> Floats:
         toward = [directions(angles_rad)[0] / DIRECTION for angles_rad in (links.departure_rad, links.arrival_rad)]
@@ -85,7 +85,6 @@ def _same(known: TracedLinks, link: Indices, true: TracedLinks, true_link: Indic
 def _analogues(
     true: TracedLinks, link: Indices, new: Bools, geometry: LinkGeometry, state: LinkState
 ) -> list[tuple[Floats, Floats]]:
-    """Key and new paths of each link of one state."""
     power, count = np.abs(true.a) ** 2, len(geometry.distance_m)
     indirect = (true.interactions > 0).any(axis=1)
     survivors = np.bincount(link, weights=power * (~new & indirect), minlength=count).astype(np.float64)
@@ -104,7 +103,7 @@ def _analogues(
 
 
 def fit_path_model(examples: Iterable[Example], seed: int = 0) -> PathModel:
-    """Train on examples; the same examples and seed give the same model."""
+    """Train on examples; equal examples and seed give an equal model."""
     inputs, exists = [], []
     banks: tuple[list[tuple[Floats, Floats]], ...] = tuple([] for _ in STATES)
     for each in examples:
@@ -133,7 +132,7 @@ def _spread_ns(paths: Floats) -> float:
 
 
 def _fit_survival(inputs: Floats, exists: Bools, seed: int) -> tuple[Floats, ...]:
-    """Train by cross-entropy; scaling of the inputs is part of the first layer."""
+    """Train by cross-entropy; the first layer includes the scaling of the inputs."""
     keras = import_keras()
     keras.utils.set_random_seed(seed)
     mean, std = inputs.mean(axis=0), inputs.std(axis=0) + 1e-9
@@ -146,7 +145,7 @@ def _fit_survival(inputs: Floats, exists: Bools, seed: int) -> tuple[Floats, ...
 
 
 def made_examples(homes: int = 60, floors: int = 10, first_seed: int = 320_000) -> Iterator[Example]:
-    """Examples of homes and office floors of `make_home`, as a robot has seen them after several numbers of steps."""
+    """Yield examples of homes and office floors of `make_home` after several numbers of exploration steps."""
     for number in range(homes + floors):
         seed, is_home = first_seed + number, number < homes
         home = make_home(seed) if is_home else make_home(seed, kind="floor")
@@ -158,7 +157,6 @@ def made_examples(homes: int = 60, floors: int = 10, first_seed: int = 320_000) 
 
 
 def _points(home: PartialMap, count: int, rng: np.random.Generator) -> Floats:
-    """Points (count, 3) in free cells, off their borders [m]."""
     row, column = rng.permutation(np.argwhere(home.state == CellState.FREE))[:count].T
     cell = np.stack([column, row], axis=1) + rng.uniform(0.25, 0.75, (len(row), 2))
     return np.column_stack([home.origin_m + cell * home.resolution_m, np.full(len(row), DEFAULT_HEIGHT_M)])

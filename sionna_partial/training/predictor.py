@@ -1,4 +1,4 @@
-"""Train a predictor on some homes of a data set and measure it on the others: data set -> TrainingRun."""
+"""Train a predictor on some homes of a data set and evaluate it on the others."""
 
 import json
 import warnings
@@ -27,10 +27,7 @@ FEW_HOMES = 20
 
 @dataclass(frozen=True, eq=False)
 class TrainingRun(Shown):
-    """Result of `train`: a predictor, baselines fitted to the same links, and the evaluation on test homes, if any.
-
-    The predictor's card has the figures of the test homes.
-    """
+    """Result of `train`: a predictor with test figures in its card, baselines, and the evaluation on test homes."""
 
     predictor: Predictor
     baselines: Baselines
@@ -40,7 +37,7 @@ class TrainingRun(Shown):
     evaluation: Evaluation | None
 
     def save(self, folder: str | Path) -> list[Path]:
-        """Write predictor, baselines, their cards and `split.json` into a folder, all or none; return the files."""
+        """Write predictor, baselines, their cards and `split.json`, all or none; return the files."""
         split = {
             "test_fraction": self.test_fraction,
             "seed": self.predictor.settings.seed,
@@ -57,11 +54,10 @@ class TrainingRun(Shown):
 
 
 def split_homes(homes: list[str], test_fraction: float, seed: int) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Split homes at random into sorted names of training and test homes, so that no home has links on both sides.
+    """Split homes at random into sorted training and test homes.
 
-    The names are sorted, then shuffled with the seed; the first of them, `test_fraction` of all but at least one and
-    not all, are test homes. The same names give the same split, in whatever order they come. A fraction of 0 keeps
-    none.
+    The sorted names are shuffled by the seed; the first `test_fraction` of them, at least one and not all, are test
+    homes. A fraction of 0 keeps none. The order of `homes` does not matter.
     """
     require_number("test_fraction", test_fraction, 0.0, 0.99)
     if len(homes) < (2 if test_fraction else 1):
@@ -81,36 +77,36 @@ def train(
     settings: PredictorSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> TrainingRun:
-    """Train a predictor and the fitted baselines on some homes, and measure them on the others.
+    """Train a predictor and baselines on some homes, and evaluate them on the others.
 
-    Homes are split at random (see `split_homes`), links of one home never are. Link state and gain are learned from
-    links with receivers drawn indoors; P(indoor) from receivers drawn anywhere on the map that are not in an observed
-    cell, as one that is there is indoors for certain. The same links and settings give the same files.
+    Homes are split at random; all links of a home are on one side. Link state and gain are learned from receivers drawn
+    indoors, P(indoor) from receivers drawn anywhere but not in observed cells. Equal links and settings give equal
+    files.
 
     Parameters
     ----------
     dataset : LinkTable, path, or sequence of paths
-        Links, or folders that `sionna-partial dataset` wrote; a home may be in several, explored anew in each.
+        Links, or folders of `sionna-partial dataset`; a home may be in several.
     test_fraction : float
-        Fraction of the homes that is kept for testing, in [0, 1).
+        Fraction of test homes, in [0, 1).
     settings : PredictorSettings, optional
-        Networks "map" by default, with a `PredictorWarning` on fewer than 20 homes. Frequency, diffraction and paths
-        through walls must equal the settings of the data set, and do by default; the seed splits the homes, too.
+        By default networks "map", with a `PredictorWarning` for fewer than 20 homes, and the frequency, diffraction and
+        paths through walls of the data set, which must be equal. The seed also splits the homes.
     progress : bool or callable, optional
         As in `predict_map`.
 
     Returns
     -------
     TrainingRun
-        With `predictor`, `baselines`, `train_homes`, `test_homes` and `evaluation`; `save(folder)` writes them.
+        `save(folder)` writes it.
 
     Raises
     ------
     SettingsError
         For a fraction out of range.
     PredictorError
-        If the data set cannot be read, was traced otherwise than in the settings, or has too few homes or links; or if
-        the training diverges.
+        If the data set cannot be read, was traced with other settings, or has too few homes or links; or if the
+        training diverges.
 
     Examples
     --------
@@ -153,7 +149,7 @@ def train(
 
 
 def _card_metrics(evaluation: Evaluation) -> dict[str, Any]:
-    """Return the figures of test homes for the card, by stage and predictor, receivers indoors and anywhere.
+    """Return the figures of test homes for the card, by receivers, stage and predictor.
 
     The shipped paper's predictor is left out, so that a card does not depend on the shipped predictors.
     """

@@ -1,4 +1,4 @@
-"""Training of `UnseenWalls`: the walls on lines through procedural buildings, beyond those that a robot has seen."""
+"""Training of `UnseenWalls`: walls on lines through procedural buildings that a robot has not seen."""
 
 import sys
 from collections.abc import Iterator
@@ -26,21 +26,21 @@ from sionna_partial.tracing.simulation import Simulation, nearest_m
 from sionna_partial.worlds.homes import make_home
 
 CAMERA, ROBOTS, LARGE = (500_000, 350), (530_000, 200), (520_000, 60)
-"""First seeds and numbers of homes explored by a camera, of homes explored by robots, and of floors and halls."""
+"""First seeds and numbers of homes explored by a camera, homes explored by robots, and floors and halls."""
 
 STEPS, FRACTIONS = (10, 30, 60, 100, 200), (0, 0.1, 0.25, 0.5, 0.75)
-"""When the map is taken: after steps of the camera, and with these fractions of the area seen by robots."""
+"""Stages of exploration: steps of the camera, and area fractions observed by robots."""
 
 TRANSMITTERS, RECEIVERS, MARGIN_M = 10, 80, 1.5
-"""Numbers of ends of lines in a building, and the unknown space around it [m]."""
+"""Numbers of ends of lines in a building, and the unknown margin around it [m]."""
 
 LEAST_UNSEEN_M, LEAST_M, FEWEST_LINES = 0.05, 0.3, 30
-"""Unobserved and whole length from which a line counts [m], and number of lines from which a map does."""
+"""Smallest unobserved and whole length of a line [m], and smallest number of lines of a map."""
 
 STEPS_OF_TRAINING = 1_400
 
 IMAGE_CELLS, IMAGES, LINES = 96, 16, 100
-"""Edge of the part of a map that is read [cells], number of them in a gradient step, and of lines in each."""
+"""Edge of the part of a map that is read [cells], and numbers of parts per gradient step and of lines per part."""
 
 _TRIALS, _FEWEST_IN_IMAGE = 20, 20
 _TRACE = (
@@ -50,7 +50,7 @@ _TRACE = (
 
 
 class Lines(NamedTuple):
-    """Lines (N,) on a partial map: its image, ends (N, 2) [cells], walls that are unseen and known, lengths [m]."""
+    """Lines (N,) on a partial map: its image, ends (N, 2) [cells], unseen and known walls, lengths [m]."""
 
     image: NDArray[np.uint8]
     start: NDArray[np.float32]
@@ -61,14 +61,14 @@ class Lines(NamedTuple):
     known: NDArray[np.float32]
 
     def taken(self, rows: NDArray[np.intp]) -> "Lines":
-        """Return some lines of the map."""
+        """Select lines of the map."""
         return Lines(self.image, *(column[rows] for column in self[1:]))
 
 
 def lines_of(seed: int, kind: HomeKind | None, robot: bool) -> list[Lines]:
-    """Make a building, explore it, and count the walls of the lines between random points on every map.
+    """Make a building, explore it, and count the walls of lines between random points on every map.
 
-    There are none where two of the points are too near to be traced.
+    Return no lines if two of the points are too near to be traced.
     """
     home = map_area(make_home(seed, kind), MARGIN_M)
     settings = DatasetSettings(sensor="mixed") if robot else DatasetSettings()
@@ -96,7 +96,7 @@ def lines_of(seed: int, kind: HomeKind | None, robot: bool) -> list[Lines]:
 
 
 def _walls(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:
-    """Return the number of walls of a map on each direct line (T N,); NaN beyond the most that are traced."""
+    """Return the number of walls on each direct line (T N,); NaN beyond the largest traced number."""
     links = Simulation(partial, *_TRACE).links(tx_m, rx_m, polarisations=1, progress=False)
     count = np.full(links.gain_db.shape, np.nan)
     count[links.path_tx, links.path_rx] = np.count_nonzero(links.interactions, axis=1)
@@ -104,7 +104,7 @@ def _walls(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:
 
 
 def all_lines() -> Iterator[list[Lines]]:
-    """Yield the lines of each building of the training, made by as many processes as there are cores."""
+    """Yield the lines of each training building, made on all cores."""
     kinds: tuple[HomeKind, ...] = ("floor", "floor", "hall")
     jobs: list[tuple[int, HomeKind | None, bool]] = [(CAMERA[0] + number, None, False) for number in range(CAMERA[1])]
     jobs += [(ROBOTS[0] + number, None, True) for number in range(ROBOTS[1])]
@@ -114,7 +114,7 @@ def all_lines() -> Iterator[list[Lines]]:
 
 
 def fit_unseen_walls(maps: list[Lines], steps: int = STEPS_OF_TRAINING, seed: int = 0) -> UnseenWalls:
-    """Train by the likelihood of Poisson distributions; the same lines and seed give the same weights."""
+    """Train by Poisson likelihood; equal lines and seed give equal weights."""
     networks = UnseenWalls.untrained(seed)
     weights = [weight for network in networks for weight in network.trainable_variables]
     optimizer = adam_w(weights, steps)
@@ -144,7 +144,6 @@ def _batches(maps: list[Lines], steps: int, rng: np.random.Generator) -> Iterato
 
 
 def _part(lines: Lines, rng: np.random.Generator) -> Lines | None:
-    """Cut a square out of a map at random, with lines in it, in one of eight orientations; None without enough."""
     for _ in range(_TRIALS):
         spare = [count - IMAGE_CELLS for count in lines.image.shape[1::-1]]
         corner = np.array([rng.integers(min(0, most), max(0, most) + 1) for most in spare])

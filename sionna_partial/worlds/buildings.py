@@ -11,7 +11,7 @@ from shapely import LineString, MultiPolygon, Polygon, affinity, box
 from shapely.ops import split
 
 GRID_M = 1e-5
-"""Grid on which shapes are joined and cut [m]: almost equal corners cannot break it."""
+"""Grid on which shapes are joined and cut [m], against almost equal corners."""
 
 NEAR_M = 0.01
 """Distance within which shapes touch [m]."""
@@ -45,22 +45,19 @@ _BAY_M = 2.4
 _FAR_M = 1e3
 
 Fill = Callable[[Rng, Polygon], Iterator[Polygon]]
-"""Draws the objects in a hall."""
 
 
 def union_of(shapes: Iterable[shapely.Geometry]) -> shapely.Geometry:
-    """Union of shapes on a grid of `GRID_M`."""
     return shapely.union_all(list(shapes), grid_size=GRID_M)
 
 
 def parts_of(shape: shapely.Geometry) -> list[Polygon]:
-    """Polygons of a shape, the largest first."""
+    """Return the polygons of a shape, the largest first."""
     polygons = [part for part in shapely.get_parts(shape) if part.geom_type == "Polygon"]
     return sorted(polygons, key=lambda part: -part.area)
 
 
 def log_uniform(rng: Rng, between: tuple[float, float]) -> float:
-    """Draw a number whose logarithm is uniform."""
     return float(np.exp(rng.uniform(*np.log(between))))
 
 
@@ -74,11 +71,10 @@ def furnish(
     clutter: float,
     pillars: float,
 ) -> Iterator[Polygon]:
-    """Yield furniture and pillars (they may overlap each other and the walls) that leave a room and its doors passable.
+    """Yield furniture and pillars (they may overlap) that leave a room and its doors passable.
 
-    `room` is the outline through the middle of its walls, `walls` includes door leaves; `openings` are openings of the
-    whole home. `clutter` is the mean number of things that are tried for every 4 m2, `pillars` the probability that
-    a large room has some.
+    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number of
+    trials for every 4 m2, `pillars` the probability of pillars in a large room.
     """
     near = [opening for opening in openings if opening.distance(room) < NEAR_M]
     doorsteps = union_of([opening.buffer(walk_m, cap_style="flat") for opening in near])
@@ -98,7 +94,6 @@ def furnish(
 
 
 def _furniture(rng: Rng, room: Polygon) -> Polygon:
-    """Piece of furniture: along a wall, in a corner, or in the middle of a room."""
     make, at_wall = _KINDS[int(rng.choice(len(_KINDS), p=_FREQUENCIES))]
     thing = make(rng)
     if rng.random() < 0.3:
@@ -117,13 +112,11 @@ def _furniture(rng: Rng, room: Polygon) -> Polygon:
 
 
 def _place(rng: Rng, room: Polygon, thing: Polygon) -> Polygon:
-    """Put a thing somewhere into the bounds of a room."""
     x0, y0, x1, y1 = room.bounds
     return affinity.translate(thing, rng.uniform(x0, x1), rng.uniform(y0, y1))
 
 
 def _block(rng: Rng, half_width: tuple[float, float], depth: tuple[float, float]) -> Polygon:
-    """Rectangle whose middle is on a wall, deep enough on both sides of it; some have an arm."""
     half_width_m, depth_m = rng.uniform(*half_width), rng.uniform(*depth)
     thing = box(-half_width_m, -depth_m, half_width_m, depth_m)
     if rng.random() < 0.25:
@@ -135,7 +128,7 @@ def _block(rng: Rng, half_width: tuple[float, float], depth: tuple[float, float]
 
 
 def _heap(rng: Rng) -> Polygon:
-    """Irregular block: a star of random radii, as scans make of plants, chairs and piles."""
+    """Irregular block: a star of random radii, as plants, chairs and piles in scans."""
     count = int(rng.integers(5, 9))
     angle = np.sort(rng.uniform(0, 1 / count, count) + np.arange(count) / count) * 2 * math.pi
     radius = rng.uniform(0.2, 0.5) * rng.uniform(0.6, 1.8, count)
@@ -149,7 +142,7 @@ _KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
     (lambda rng: affinity.scale(shapely.Point(0, 0).buffer(1.0, quad_segs=4), *rng.uniform(0.25, 0.8, 2)), 0.3),
     (_heap, 0.6),
 )
-"""Drawing function of each kind, and the probability that it is placed at a wall."""
+"""Drawing functions, and the probability of a place at a wall."""
 
 
 class Layout(NamedTuple):
@@ -164,7 +157,7 @@ LayoutMaker = Callable[[Rng, float, float], Layout]
 
 
 def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
-    """Office floor: rows of rooms along one corridor, or along two or more with large rooms and services between."""
+    """Draw an office floor: rows of rooms along one corridor, or along several, with large rooms and services."""
     length_m, width_m = _sides(rng, area_m2, (1.4, 4.0))
     outline = _notched(rng, box(0, 0, length_m, width_m))
     across, services = _corridors(rng, length_m, width_m)
@@ -189,7 +182,6 @@ def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
 def _hall_layout(
     rng: Rng, area_m2: float, room_m2: float, *, hall_fraction: tuple[float, float], fill: Fill, columned: float
 ) -> Layout:
-    """One or a few large rooms with columns and what fills them; most have a row of offices."""
     length_m, width_m = _sides(rng, area_m2, (1.0, 3.0))
     halls, offices = _hall_and_offices(rng, _notched(rng, box(0, 0, length_m, width_m)), room_m2)
     halls = [room for hall in halls for room in _halved(rng, hall, area_m2 * log_uniform(rng, hall_fraction))]
@@ -198,13 +190,11 @@ def _hall_layout(
 
 
 def _sides(rng: Rng, area_m2: float, aspect: tuple[float, float]) -> tuple[float, float]:
-    """Length and width [m] of about the wanted area."""
     length_m = min(LARGEST_M[0], math.sqrt(area_m2 * log_uniform(rng, aspect)))
     return length_m, min(LARGEST_M[1], area_m2 / length_m)
 
 
 def _notched(rng: Rng, outline: Polygon) -> Polygon:
-    """Outline of a building, some with one or two corners cut out."""
     _, _, x1, y1 = outline.bounds
     for x, y in rng.permutation([(0, 0), (x1, 0), (x1, y1), (0, y1)])[: rng.choice(3, p=[0.6, 0.3, 0.1])]:
         across_m, along_m = rng.uniform(0.1, 0.4, 2) * (x1, y1)
@@ -213,7 +203,6 @@ def _notched(rng: Rng, outline: Polygon) -> Polygon:
 
 
 def _corridors(rng: Rng, length_m: float, width_m: float) -> tuple[list[Polygon], list[Polygon]]:
-    """Corridors along and across a floor, and the blocks of services beside those across."""
     wide_m = log_uniform(rng, _CORRIDOR_M)
     ends = [rng.choice([0.0, rng.uniform(3.0, 8.0)]) for _ in range(2)]
     if width_m > 2 * (_BAND_M[0] + wide_m) + _BROAD_M:
@@ -235,7 +224,6 @@ def _corridors(rng: Rng, length_m: float, width_m: float) -> tuple[list[Polygon]
 
 
 def _sections(rng: Rng, corridor: shapely.Geometry) -> list[Polygon]:
-    """Parts of the corridors, some of which have doors across."""
     x0, y0, x1, y1 = corridor.bounds
     for x in rng.uniform(x0, x1, rng.choice(3, p=[0.6, 0.25, 0.15])):
         cut = LineString([(x, y0 - 1), (x, y1 + 1)])
@@ -272,7 +260,6 @@ def _halved(rng: Rng, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
 
 
 def _hall_and_offices(rng: Rng, outline: Polygon, room_m2: float) -> tuple[list[Polygon], list[Polygon]]:
-    """Split off a row of offices along one side of a hall, for most halls."""
     x0, y0, x1, y1 = outline.bounds
     if rng.random() < 0.3:
         return [outline], []
@@ -284,7 +271,6 @@ def _hall_and_offices(rng: Rng, outline: Polygon, room_m2: float) -> tuple[list[
 
 
 def _columns(rng: Rng, rooms: list[Polygon], probability: float) -> list[Polygon]:
-    """Columns on a grid in the large rooms, for some buildings."""
     if rng.random() >= probability:
         return []
     large = union_of([room.buffer(-1.0) for room in rooms if room.area > _COLUMNED_ROOM_M2])
@@ -295,7 +281,6 @@ def _columns(rng: Rng, rooms: list[Polygon], probability: float) -> list[Polygon
 
 
 def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
-    """Machines, tanks and stacks that stand free of each other, or against the wall of a hall."""
     clear_m = rng.uniform(0.9, 2.5)
     placed: list[Polygon] = []
     x0, y0, x1, y1 = hall.bounds
@@ -315,7 +300,7 @@ def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
 
 
 def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
-    """Blocks of shelves with aisles between; in some, only legs and goods on the floor are as low as a robot."""
+    """Yield blocks of shelves with aisles between; for some, only legs and goods on the floor are as low as a robot."""
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
     if inner.is_empty:
         return
@@ -334,7 +319,6 @@ def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
 
 
 def _legs(rng: Rng, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
-    """Legs along both sides of a shelf, and pallets below it."""
     x0, y0, x1, y1 = block.bounds
     xs, ys = (np.linspace(low, high, max(2, round((high - low) / _BAY_M) + 1)) for low, high in ((x0, x1), (y0, y1)))
     for x in xs:
@@ -345,7 +329,5 @@ def _legs(rng: Rng, block: Polygon, half_leg_m: float) -> Iterator[Polygon]:
 
 
 hall_layout = partial(_hall_layout, hall_fraction=(0.15, 3.0), fill=_machines, columned=0.7)
-"""Production hall, with machines."""
 
 warehouse_layout = partial(_hall_layout, hall_fraction=(0.5, 3.0), fill=_shelves, columned=0.4)
-"""Warehouse: aisles between shelves."""

@@ -1,4 +1,4 @@
-"""The robot's camera: range readings of the walls, their errors, and the map that they add up to."""
+"""Camera of a robot: range readings of walls, their errors, and the resulting map."""
 
 import math
 from typing import NamedTuple
@@ -14,33 +14,23 @@ from sionna_partial.process import njit
 from sionna_partial.settings import SensorSettings
 
 MISSED_PATCH_M = 0.5
-"""Edge of the squares [m] whose walls are missed together, as a pane or a mirror is."""
+"""Edge of the squares whose walls are missed together, like a pane or a mirror [m]."""
 
 GRAZING_DEG = 5.0
-"""Angle between a ray and the face of a wall below which a sensor with errors gets no return [degree]."""
+"""Angle to the face of a wall below which a sensor with errors gets no return [degree]."""
 
 
 RAY_DEG = 0.5
-"""Angle between rays of a sensor with errors, at least [degree]: lidars of robots have 0.25 to 1."""
+"""Least angle between rays of a sensor with errors [degree]; lidars of robots have 0.25 to 1."""
 
 
 class Fusion(NamedTuple):
-    """Rule of a mapper that makes states of cells from the rays that end in them (hits) and cross them (passes).
+    """Rule of a mapper that classifies cells by rays that end in them (hits) and cross them (passes).
 
-    Parameters
-    ----------
-    by_scan : bool
-        Whether each picture counts once in a cell, as a hit if any of its rays ends there.
-    passes_of_hit : int
-        Number of passes that a hit counts as, too.
-    min_passes : int
-        Number of passes from which on a cell is known.
-    max_free : float
-        Ratio of hits to passes above which a cell is wall.
-    travel_m, turn_deg : float
-        Distance and turn since the last picture, either of which makes it take another [m], [degree].
-    cleared_m : float
-        Largest range up to which rays without a wall in range mark free cells [m].
+    `by_scan` counts each picture once in a cell, as a hit if any of its rays ends there. A hit adds `passes_of_hit`
+    passes. From `min_passes` a cell is known, and wall if hits / passes exceeds `max_free`. A distance of `travel_m`
+    [m] or a turn of `turn_deg` [degree] triggers the next picture. Rays without a wall in range clear up to `cleared_m`
+    [m].
     """
 
     by_scan: bool
@@ -70,17 +60,15 @@ FUSIONS = {
 """Rules of mappers, with their default parameters.
 
 - slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from more
-  than two passes. A ray adds a pass to its last cell, and one more with its hit. `minimum_travel_distance` and
-  `minimum_travel_heading` are 0.5.
+  than two passes; a hit adds two passes. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
 - gmapping (`slam_gmapping.cpp`): wall where hits / (hits + passes) > `occ_thresh`, 0.25. `linearUpdate` is 1 m,
   `angularUpdate` 0.5.
-- Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55 and `miss_probability` 0.49 for each picture; wall
-  where the log odds are positive, here without their limits. `motion_filter` takes 0.2 m and 1 degree. Returns from
-  beyond the range clear `missing_data_ray_length`, 5 m.
-- vacuum: as gmapping, and walls are thinned (`Camera.map`). The rules of firmware are not published.
+- Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55, `miss_probability` 0.49; wall where the log odds
+  are positive, here without limits. `motion_filter` has 0.2 m and 1 degree, `missing_data_ray_length` is 5 m.
+- vacuum: as gmapping, with thinned walls (`Camera.map`). The rules of firmware are not published.
 
-Rays that return from beyond the range clear it, as with `max_laser_range` and `maxUrange` below the limit of the
-sensor. Rays without a return are dropped, as these mappers and their ROS drivers do.
+Rays that return from beyond the range clear it, as with `max_laser_range` and `maxUrange` below the sensor's limit.
+Rays without a return are dropped, as in these mappers and their ROS drivers.
 """
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
@@ -88,7 +76,7 @@ _NO_ECHO, _WALL_ECHO, _FAR = 0, 1, 2
 
 
 class Camera:
-    """Sees a home (ny, nx), with unknown cells all around, from where the robot is; maps it where it believes to be.
+    """Camera in a home (ny, nx) with unknown cells all around; it maps with the believed pose.
 
     The map is `seen` (ny, nx). Positions are in cells, x along columns and y along rows.
     """
@@ -107,7 +95,7 @@ class Camera:
 
     @property
     def map(self) -> States:
-        """The map that is handed out: a vacuum robot thins its walls, whose other cells become free or unknown."""
+        """The map of the robot; a vacuum robot thins its walls."""
         if self._sensor.is_exact or self._sensor.fusion != "vacuum":
             return self.seen
         wall = self.seen == _WALL
@@ -116,9 +104,9 @@ class Camera:
         return np.where(wall & ~kept, np.where(beside, _FREE, _UNKNOWN), self.seen).astype(np.uint8)
 
     def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: Indices) -> None:
-        """Add one picture to the map, taken at x, y but believed to be taken `shift` from there.
+        """Add a picture taken at x, y, with the believed position `shift` from there.
 
-        The cells `under` the robot (N, 2), rows and columns where it believes to be, are free.
+        The cells `under` the robot (N, 2), rows and columns at the believed position, are free.
         """
         rays = self._rays(x, y, heading_deg, shift)
         middle = np.array([y + shift[1], x + shift[0]])
@@ -136,7 +124,6 @@ class Camera:
         self._passes[part][rows, columns] += fusion.min_passes
 
     def _rays(self, x: float, y: float, heading_deg: float, shift: tuple[float, float]) -> "_Rays":
-        """Draw the errors of the rays of one picture."""
         sensor, rng = self._sensor, self._rng
         apart_deg = 0.0 if sensor.is_exact else RAY_DEG
         angles = _ray_angles(heading_deg, self._view_deg, self._range_cells, apart_deg)
@@ -154,7 +141,7 @@ class Camera:
 def unknown_in_view(
     state: States, cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
 ) -> list[Indices]:
-    """Unknown cells (N, 2) that a picture taken in a cell would show if none of them were walls, for each heading."""
+    """Return the unknown cells (N, 2) in view from a cell if none were walls, for each heading."""
     range_cells = sensor.range_m / cell_m
     low = np.maximum(cell - math.ceil(range_cells) - 2, 0)
     window = state[tuple(slice(start, end + math.ceil(range_cells) + 3) for start, end in zip(low, cell, strict=True))]
@@ -183,7 +170,7 @@ def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Fl
 
 
 def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_deg: float = 0.0) -> Floats:
-    """Directions of the rays [radian], at most half a cell apart where they end, but at least `apart_deg`."""
+    """Return directions of rays [radian], at most half a cell apart at their ends, but at least `apart_deg`."""
     rays = int(2 * math.radians(view_deg) * range_cells) + 2
     if apart_deg > 0.0:
         rays = min(rays, int(view_deg / apart_deg) + 2)
@@ -191,11 +178,10 @@ def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_d
 
 
 class _Rays(NamedTuple):
-    """Rays of one picture: start, where the robot believes to be less start, and angles [radian].
+    """Rays of one picture: start, believed minus true position, and angles [radian].
 
-    `noise` is the error of each reading, NaN where there is none, `range_cells` and `cleared_cells` are the ranges of
-    readings and of rays that meet no wall [cells], `turn` is the error of the heading [radian], and `grazing` the sine
-    of the angle to a face below which there is no reading.
+    `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall [cells],
+    `turn` is the error of the heading [radian], `grazing` the sine of the smallest angle to a face with a reading.
     """
 
     start: tuple[float, float]
@@ -209,10 +195,10 @@ class _Rays(NamedTuple):
 
 
 class _Walk(NamedTuple):
-    """A ray in one of the cells along it, and where it enters and leaves the cell [cells].
+    """A ray in one of its cells, and where it enters and leaves the cell [cells].
 
-    A ray through a corner crosses one of the two cells beside it, so that it never slips between two walls. It is
-    at least a billionth of a cell long in each cell, so that a distance belongs to one cell.
+    A ray through a corner crosses one of the two cells beside it, so that it never passes between two walls. Its part
+    of each cell is at least 1e-9 cells long, so that a distance belongs to one cell.
     """
 
     row: int
@@ -228,8 +214,8 @@ class _Walk(NamedTuple):
 
 
 @njit(cache=True)
-def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-untyped-def]
-    """Count the rays of one picture that end in walls, and those that cross cells, from the cell `corner` on."""
+def _cast_rays(truth, missed, hits, passes, corner, rays):
+    """Count the rays of one picture that end in walls and that cross cells, from the cell `corner` on."""
     (x, y), shift, angles, noise, range_cells, cleared_cells, turn, grazing = rays
     for ray in range(len(angles)):
         echo, reading = _read(truth, missed, x, y, angles[ray], range_cells, grazing)
@@ -250,8 +236,7 @@ def _cast_rays(truth, missed, hits, passes, corner, rays):  # type: ignore[no-un
 
 
 @njit(cache=True)
-def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-untyped-def]
-    """Add the counts of one picture to those of all, and update the states (ny, nx) that a mapper makes of them."""
+def _fuse(all_hits, all_passes, hits, passes, fusion, seen):
     for row in range(seen.shape[0]):
         for column in range(seen.shape[1]):
             hit, passed = hits[row, column], passes[row, column]
@@ -267,8 +252,7 @@ def _fuse(all_hits, all_passes, hits, passes, fusion, seen):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
-    """Length of each ray [cells]."""
+def _ranges(truth, x, y, angles, range_cells):
     missed, ranges = np.zeros(truth.shape, np.bool_), np.empty(len(angles))
     for ray in range(len(angles)):
         ranges[ray] = _read(truth, missed, x, y, angles[ray], range_cells, 0.0)[1]
@@ -276,8 +260,8 @@ def _ranges(truth, x, y, angles, range_cells):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-untyped-def]
-    """Return the end of a ray (a wall, an unknown cell, or nothing), and a distance within that cell.
+def _read(truth, missed, x, y, angle, range_cells, grazing):
+    """Return what ends a ray (wall, unknown cell, nothing), and a distance within that cell.
 
     The distance is NaN where a wall is missed, or met at a sine of less than `grazing` to its face.
     """
@@ -295,8 +279,7 @@ def _read(truth, missed, x, y, angle, range_cells, grazing):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _start(x, y, angle):  # type: ignore[no-untyped-def]
-    """Return a ray in the cell where it starts."""
+def _start(x, y, angle):
     along_x, along_y = math.cos(angle), math.sin(angle)
     column, row = math.floor(x), math.floor(y)
     step_x, step_y = (1 if along_x > 0 else -1), (1 if along_y > 0 else -1)
@@ -308,8 +291,7 @@ def _start(x, y, angle):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next(walk):  # type: ignore[no-untyped-def]
-    """Return the ray in the next cell."""
+def _next(walk):
     row, column, next_x, next_y = walk.row, walk.column, walk.next_x, walk.next_y
     if next_x < next_y:
         column, next_x = column + walk.step_x, next_x + walk.pace_x

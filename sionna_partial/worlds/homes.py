@@ -1,9 +1,8 @@
 """Procedural homes: complete floor plans from a seed.
 
-A plan is drawn as polygons in metres: an outline, rooms, openings along a spanning tree of the rooms (so that every
-room can be reached) and a few more, and furniture that leaves room to walk. Then it is turned and put onto cells, where
-walls and furniture swell a little, as on maps of robots and scanners.
-`docs/researchers.md` compares them with real homes.
+A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
+furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
+robots. `docs/researchers.md` compares the plans with real homes.
 """
 
 import math
@@ -40,36 +39,30 @@ from sionna_partial.worlds.buildings import (
 )
 
 RESOLUTION_M = 0.05
-"""Edge of a cell of the other kinds where none is given [m]."""
 
 LARGE_RESOLUTION_M = 0.1
-"""Edge of a cell of the large kinds (floor, hall, warehouse) where none is given [m].
-
-The real floors of `docs/results.md` have it; a building of 100 x 60 m has four times as many cells of 0.05 m."""
 
 WALK_M = 0.5
 """Width that walls and furniture leave to walk through [m]."""
 
 DOOR_M = (0.8, 1.0)
-"""Width of doors [m]."""
 
 WIDE_M = (1.2, 2.5)
-"""Width of wide openings [m]."""
 
 LOCKED_FRACTION = 0.25
-"""Fraction of the rooms at dead ends that stay locked, on average."""
+"""Mean fraction of dead-end rooms that are locked."""
 
 SHUT_FRACTION = 0.9
-"""Fraction of the homes in which locked rooms are free all the same, without a door, as on scans of real homes."""
+"""Fraction of the homes in which locked rooms are free, without a door, as on scans of real homes."""
 
 SHUT_AREA = 0.2
-"""Largest area of all such rooms of a home, as a fraction of the area that can be reached."""
+"""Largest area of locked free rooms, relative to the reachable area."""
 
 LEAF_FRACTION = 0.2
-"""Fraction of the doors whose leaf stands open into a room."""
+"""Fraction of the doors whose leaf is open into a room."""
 
 CLOSED_DOORS = (0.3, 0.5, 0.2)
-"""Fractions of the office floors with no door closed, with some, and with all, as on plans of real floors."""
+"""Fractions of the office floors with no, some, and all doors closed, as on plans of real floors."""
 
 _MARGIN_M = 0.3
 _JAMB_M = 0.05
@@ -85,7 +78,7 @@ _WAVE_PER_M = 0.5
 
 @dataclass(frozen=True)
 class _Style:
-    """Ranges and probabilities of a kind of home, or what one home has; lengths in metres, areas in square metres."""
+    """Ranges and probabilities of a kind of home, or values of one home; lengths in metres, areas in square metres."""
 
     frequency: float
     area: tuple[float, float]
@@ -106,7 +99,6 @@ class _Style:
 
     @property
     def walk(self) -> float:
-        """Width of passages before walls and furniture swell."""
         return WALK_M + 2 * self.swelling
 
 
@@ -122,7 +114,7 @@ STYLES: dict[str, _Style] = {
     "hall": _Style(0, (200, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.02, layout=hall_layout),
     "warehouse": _Style(0, (300, 6000), (12, 40), 0, 0, _AISLE_M, 0.2, 0.3, 0, 0.1, 0.1, 0.01, layout=warehouse_layout),
 }
-"""The kinds of homes that can be made; areas are areas of the outline. `frequency` is how often kind=None draws one."""
+"""Kinds of homes; areas are areas of the outline. `frequency` is the probability with kind=None."""
 
 
 def make_home(
@@ -135,25 +127,23 @@ def make_home(
     seed : int
         Seed, at least 0. Equal seeds give equal homes.
     kind : {"apartment", "house", "office", "floor", "hall", "warehouse"} or None
-        Kind of home; None draws an apartment, a house or a small office. The last three are large, up to 100 x 60 m:
-        an office floor with corridors, a production hall with machines, a warehouse with shelves.
+        Kind of home; None draws one of the first three. The others are large, up to 100 x 60 m: an office floor with
+        corridors, a production hall with machines, a warehouse with shelves.
     resolution_m : float or None
-        Edge of a cell [m], 0.01 to 0.2; None is 0.05, and `LARGE_RESOLUTION_M` for the large kinds.
+        Edge of a cell [m], 0.01 to 0.2; by default 0.05, or 0.1 for the large kinds.
     locked_rooms : bool
-        True if the home may have free rooms that cannot be reached, also behind closed doors; the other rooms do not
-        depend on it.
+        True if the home may have free rooms that cannot be reached, also behind closed doors.
 
     Returns
     -------
     PartialMap
-        Free inside, walls one or more cells thick around everything free, unknown elsewhere, and inside furniture.
-        Nothing is missing (`is_complete`). Free cells are connected, except in locked rooms and in rooms behind
-        closed doors, which some homes and many office floors have. Walls meet at least at the corners of cells.
+        Complete (`is_complete`): free inside, with walls around everything free, unknown outside and in furniture. Free
+        cells are connected, except in locked rooms. Walls are one or more cells thick and meet at least at corners.
 
     Raises
     ------
     SettingsError
-        For a seed, kind or resolution that is not allowed.
+        For another kind, or a seed or resolution out of range.
 
     Examples
     --------
@@ -169,7 +159,7 @@ def make_home(
     if resolution_m is not None:
         require_number("resolution_m", resolution_m, 0.01, 0.2)
     rng = np.random.default_rng(seed)
-    style = STYLES[kind or str(rng.choice(list(STYLES), p=[each.frequency for each in STYLES.values()]))]
+    style = STYLES[kind or str(rng.choice(list(STYLES), p=[style.frequency for style in STYLES.values()]))]
     resolution_m = resolution_m or (LARGE_RESOLUTION_M if style.layout else RESOLUTION_M)
     while (plan := _draw(rng, style, locked_rooms=locked_rooms)) is None:
         pass
@@ -185,7 +175,7 @@ def make_home(
 
 @dataclass(frozen=True)
 class _Plan:
-    """One home: free area, locked rooms, wall lines, closed doors; how far walls and furniture swell [m], and waves."""
+    """One home: free area, locked rooms, wall lines, closed doors, swelling of walls and furniture [m], and waves."""
 
     free: Polygon
     shut: shapely.GeometryCollection
@@ -197,7 +187,6 @@ class _Plan:
 
 
 def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
-    """Draw one home; None if too much of it cannot be reached."""
     style = _varied(rng, kind)
     area_m2 = log_uniform(rng, style.area)
     fixtures: list[Polygon] = []
@@ -235,13 +224,11 @@ def _draw(rng: Rng, kind: _Style, *, locked_rooms: bool) -> _Plan | None:
 
 
 def _closed(rng: Rng, openings: list[LineString]) -> list[LineString]:
-    """Doors that are closed."""
     fraction = rng.choice([0.0, rng.random(), 1.0], p=CLOSED_DOORS)
     return [opening for opening in openings if opening.length <= DOOR_M[1] and rng.random() < fraction]
 
 
 def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.GeometryCollection:
-    """Locked rooms that are free all the same: the smallest ones, as many as may be."""
     apart = free.buffer(wall_m, join_style="mitre")
     parts = [part for room in locked for part in parts_of(room.difference(apart, grid_size=GRID_M))]
     parts.sort(key=shapely.area)
@@ -250,7 +237,6 @@ def _shut(locked: list[Polygon], free: Polygon, wall_m: float) -> shapely.Geomet
 
 
 def _varied(rng: Rng, style: _Style) -> _Style:
-    """Style of one home: how it differs from the mean of its kind."""
     scale = log_uniform(rng, (0.45, 3.5))
     return replace(
         style,
@@ -293,7 +279,6 @@ def _outline(rng: Rng, area: float) -> Polygon:
 
 
 def _rooms(rng: Rng, outline: Polygon, style: _Style) -> Iterator[Polygon]:
-    """Divide the outline into rooms, often along a corridor, which comes first."""
     rest: shapely.Geometry = outline
     if rng.random() < style.corridor:
         x0, y0, x1, y1 = outline.bounds
@@ -334,16 +319,15 @@ def _divide(rng: Rng, part: Polygon, style: _Style) -> Iterator[Polygon]:
 
 
 def _cores(piece: Polygon) -> list[Polygon]:
-    """Parts of a piece that are wide enough for a room; the rest is solid."""
     half_m = DOOR_M[0] / 2
     wide = piece.buffer(-half_m, join_style="mitre").buffer(half_m, join_style="mitre")
     return [core for core in parts_of(wide.intersection(piece)) if core.area >= _SMALLEST_ROOM_M2]
 
 
 def _connected(rng: Rng, rooms: list[Polygon], style: _Style) -> tuple[list[Polygon], list[LineString], list[Polygon]]:
-    """Rooms that can be reached, their openings, and locked rooms.
+    """Return connected rooms, their openings, and locked rooms.
 
-    Openings follow a random spanning tree, which goes through corridors where it can, with some additional ones.
+    Openings follow a random spanning tree, preferably through corridors, with some more.
     """
     jamb_m = _JAMB_M + style.wall / 2
     pairs = [(i, j) for i in range(len(rooms)) for j in range(i)]
@@ -365,7 +349,6 @@ def _connected(rng: Rng, rooms: list[Polygon], style: _Style) -> tuple[list[Poly
 
 
 def _common_wall(room: Polygon, other: Polygon) -> LineString:
-    """Longest straight wall between two rooms; empty if there is none."""
     if room.distance(other) > NEAR_M:
         return LineString()
     shared = shapely.line_merge(room.boundary.intersection(other.buffer(NEAR_M)))
@@ -375,7 +358,6 @@ def _common_wall(room: Polygon, other: Polygon) -> LineString:
 
 
 def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineString:
-    """Part of a wall that is a door, a wide opening, or all of it."""
     room = wall.length - 2 * jamb_m
     if rng.random() < style.openness and room > WIDE_M[0]:
         width = room if rng.random() < 0.4 else rng.uniform(WIDE_M[0], min(room, WIDE_M[1]))
@@ -386,7 +368,7 @@ def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineSt
 
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> States:
-    """Put a plan onto cells: free where their centres are in the free area and no wall line touches them."""
+    """Rasterise a plan: a cell is free if its centre is in the free area and no wall line touches it."""
     with optional_packages():
         from rasterio.features import rasterize
         from rasterio.transform import Affine
@@ -410,7 +392,6 @@ def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> 
 
 
 def _swollen(inside: Bools, resolution_m: float, plan: _Plan) -> Bools:
-    """Cells that walls and furniture take by swelling: as far everywhere, or farther here than there."""
     y, x = np.indices(inside.shape) * resolution_m
     wave = np.zeros(inside.shape)
     for per_x, per_y, turns in plan.waves:

@@ -1,8 +1,7 @@
-"""The exploring robot: frontiers, goals and routes, and what stops it.
+"""The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-It follows Active Neural SLAM (Chaplot et al., ICLR 2020): one action a step, a quarter of a metre forward or ten
-degrees of turn, and a long-term goal every 25 steps. Its learnt policies are replaced by frontiers between seen and
-unseen cells, drawn at random as Active Neural SLAM draws its goals, and by shortest paths over the seen cells.
+Each action is a quarter of a metre forward or a turn of ten degrees, with a long-term goal every 25 steps. Frontiers
+drawn at random and shortest paths over seen cells replace the learnt policies.
 """
 
 import math
@@ -32,22 +31,21 @@ TURN_DEG = 10
 """Angle of a turn [degree] (Active Neural SLAM, Section 4)."""
 
 ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
-"""Radii of the robot [m]: it takes the largest with which it gets around in the home."""
+"""Possible radii of the robot [m]; it has the largest that fits the home."""
 
 ROAMED_FRACTION = 0.95
-"""Fraction of the free area that the robot must be able to cover to get around."""
+"""Fraction of the free area that the robot must reach."""
 
 GOAL_RANGES = 2.0
-"""Ranges of the sensor that the robot may go before it chooses its goal anew [1].
+"""Sensor ranges that the robot drives before it chooses a new goal [1].
 
-25 actions with the camera of Active Neural SLAM (Section 4), which sees 3.2 m; more where one look shows more.
+25 actions with the 3.2 m camera of Active Neural SLAM (Section 4).
 """
 
 GOAL_SHARPNESS = 3.0
-"""Power of a frontier's promise in its odds to become the goal [1].
+"""Exponent of a frontier's promise in its odds to become the goal [1].
 
-Active Neural SLAM's global policy draws its goals from a distribution. The best frontier every time would see more
-than the robot of the paper; with this power the mean observed fractions on real homes are the paper's.
+Fitted to the mean observed fractions of the paper on real homes; the best frontier every time would see more.
 """
 
 _AHEAD_M = 0.3
@@ -70,23 +68,22 @@ _TIGHT_COST = 15.0
 
 
 class Frontier(NamedTuple):
-    """Free cells (n, 2) beside unseen ones, and the route (m, 2) to the one in their middle, rows and columns."""
+    """Free cells (n, 2) beside unseen ones, and the route (m, 2) to their middle cell, rows and columns."""
 
     cells: Indices
     route: Indices
     cost_m: float
-    """Length of the route [m], where cells beside walls are longer."""
+    """Length of the route [m], weighted beside walls."""
 
 
 Choice = Callable[["Robot", list[Frontier]], int]
-"""Choice of the frontier that a robot drives to."""
 
 
 class Robot:
-    """Pose, map and plan of a robot in a home (ny, nx) that has some free cells, and unknown cells all around.
+    """Pose, map and plan of a robot in a home (ny, nx) with free cells, and unknown cells all around.
 
-    Lengths are in cells; x runs along columns, y along rows. It is at `position`, and plans where it believes to be
-    (`believed_position`), on the map that it has made (`seen`).
+    Lengths are in cells; x runs along columns, y along rows. The robot is at `position` and plans with
+    `believed_position` on its map `seen`.
     """
 
     def __init__(
@@ -116,12 +113,10 @@ class Robot:
 
     @property
     def seen(self) -> States:
-        """The map (ny, nx) that it plans on."""
         return self._camera.seen
 
     @property
     def map(self) -> States:
-        """The map (ny, nx) that is handed out: see `Camera.map`."""
         return self._camera.map
 
     @property
@@ -130,7 +125,7 @@ class Robot:
         return self.position[0] + self._shift[0], self.position[1] + self._shift[1]
 
     def act(self) -> None:
-        """Do one action towards a frontier, and look; do nothing once no frontier can be reached."""
+        """Do one action towards a frontier, and look; do nothing if no frontier can be reached."""
         if self.is_finished:
             return
         route = self._route
@@ -156,7 +151,6 @@ class Robot:
         self._look()
 
     def _look(self) -> None:
-        """Take a picture, if the mapper wants another one here."""
         (x, y), heading_deg = self._pictured
         turned_deg = abs((self.heading_deg - heading_deg + 180.0) % 360.0 - 180.0)
         moved_m = math.hypot(self.position[0] - x, self.position[1] - y) * self._cell_m
@@ -168,27 +162,23 @@ class Robot:
         self._camera.look(*self.position, self.heading_deg, self._shift, under[inside])
 
     def _cell(self) -> tuple[int, int]:
-        """Cell of the map, row and column, where the robot believes to be."""
         (x, y), (ny, nx) = self.believed_position, self.seen.shape
         return min(max(int(y), 0), ny - 1), min(max(int(x), 0), nx - 1)
 
     def _turn_to(self, cell: Indices) -> float:
-        """Turn that would make the robot face a cell [degree], from -180 to 180."""
+        """Return the turn that faces a cell [degree], from -180 to 180."""
         x, y = self.believed_position
         bearing_deg = math.degrees(math.atan2(int(cell[0]) + 0.5 - y, int(cell[1]) + 0.5 - x))
         return (bearing_deg - self.heading_deg + 180.0) % 360.0 - 180.0
 
     def frontiers(self) -> list[Frontier]:
-        """Find the frontiers that can be reached."""
         return find_frontiers(self.seen, self._cell(), self._cell_m, self._radius, self._bumps, self._given_up)
 
     def steps_to(self, frontier: Frontier) -> float:
-        """About the number of actions that it takes to drive to a frontier."""
         return frontier.cost_m / FORWARD_M + abs(self._turn_to(frontier.route[-1])) / TURN_DEG
 
     def _draw(self, frontiers: list[Frontier]) -> int:
-        """Draw a frontier with a probability that grows with its promise for each step."""
-        promises = [math.sqrt(len(each.cells)) / (self.steps_to(each) + _DECISION_STEPS) for each in frontiers]
+        promises = [math.sqrt(len(goal.cells)) / (self.steps_to(goal) + _DECISION_STEPS) for goal in frontiers]
         odds = np.array(promises) ** GOAL_SHARPNESS
         return int(self._rng.choice(len(frontiers), p=odds / odds.sum()))
 
@@ -221,13 +211,12 @@ class Robot:
         return made >= length / 2
 
     def _has_room(self, x: float, y: float, cell: tuple[int, int]) -> bool:
-        """Return whether the robot fits at x, y, and gets there from a cell; walls that meet at a corner block it."""
+        """Return whether the robot fits at x, y and gets there from a cell; walls that meet at a corner block it."""
         row, column = int(y), int(x)
         beside = self._roomy[row, cell[1]] or self._roomy[cell[0], column]
         return bool(self._roomy[row, column] and beside)
 
     def _bump(self, goal: Indices) -> None:
-        """Avoid what stopped the robot; take no frontier any more at a goal that is too near to be approached."""
         apart = _BUMP_M / self._cell_m
         angle, (x, y) = math.radians(self.heading_deg), self.believed_position
         x, y = x + math.cos(angle) * apart / 2, y + math.sin(angle) * apart / 2
@@ -239,7 +228,6 @@ class Robot:
         self._route = None
 
     def _cells_around(self, row: float, column: float, apart: float) -> tuple[Indices, Indices]:
-        """Rows (n, 1) and columns (1, m) of the cells of the map that are at most so far in either direction."""
         ny, nx = self.seen.shape
         rows = np.arange(max(0, int(row - apart)), max(0, min(ny, int(row + apart) + 2)))
         columns = np.arange(max(0, int(column - apart)), max(0, min(nx, int(column + apart) + 2)))
@@ -247,7 +235,7 @@ class Robot:
 
 
 def _fitting_radius(free: Bools, resolution_m: float) -> tuple[float, Bools]:
-    """Largest radius [cells] of a robot that gets around, and the cells where its centre can be."""
+    """Return the largest radius [cells] of a robot that gets around, and the possible cells of its centre."""
     distance = ndimage.distance_transform_edt(free) - 0.5
     part = largest_part(free)
     for radius in np.array(ROBOT_RADII_M) / resolution_m:
@@ -263,7 +251,7 @@ def find_frontiers(
 ) -> list[Frontier]:
     """Find the frontiers of a map (ny, nx) that a robot of some radius [cells] can reach.
 
-    It gets badly through `tight` cells; those that are `left_out` belong to no frontier.
+    `tight` cells are hard to cross; `left_out` cells belong to no frontier.
     """
     known = state != _UNKNOWN
     known[start] = True
@@ -287,17 +275,16 @@ def find_frontiers(
 
 
 def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
-    """Return the frontiers of at least a robot's width, or all if none is."""
-    return [each for each in frontiers if len(each.cells) * cell_m >= WIDE_M] or frontiers
+    return [frontier for frontier in frontiers if len(frontier.cells) * cell_m >= WIDE_M] or frontiers
 
 
 def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:
-    """Part of a map from one row and column up to, and without, others; it ends where the map does."""
+    """Return a part of a map from one row and column up to others, clipped to the map."""
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
 def _travel_cost(state: States, cell_m: float, radius: float, tight: Bools) -> Floats:
-    """Cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
+    """Return the cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
     distance = ndimage.distance_transform_edt(state != _WALL) - 0.5
     nearness = np.clip(1.0 - distance * cell_m / _COMFORT_M, 0.0, 1.0)
     cost = 1.0 + _COMFORT_COST * nearness
@@ -307,7 +294,7 @@ def _travel_cost(state: States, cell_m: float, radius: float, tight: Bools) -> F
 
 
 class _Router:
-    """Shortest paths from one cell to all others, in eight directions, where a cell costs more than 0 to cross."""
+    """Shortest paths from one cell to all others, in eight directions; cells of cost 0 are blocked."""
 
     def __init__(self, cost: Floats, start: tuple[int, ...]) -> None:
         self._cells = np.argwhere(cost > 0)
@@ -321,7 +308,6 @@ class _Router:
         self.costs[tuple(self._cells.T)] = cheapest
 
     def path_to(self, cell: Indices) -> Indices:
-        """Cells (n, 2) from the start to `cell`."""
         path = [self._index[tuple(cell)]]
         while self._before[path[-1]] >= 0:
             path.append(self._before[path[-1]])

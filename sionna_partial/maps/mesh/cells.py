@@ -23,26 +23,26 @@ from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
-"""Height above the lowest point of a mesh in which surfaces are walls [m]: above tables, below the lintels of doors."""
+"""Height band of walls above the lowest point of a mesh [m]: above tables, below lintels of doors."""
 
 DEFAULT_RESOLUTION_M = 0.05
-"""Edge of the cells of a mesh's map [m], as robots have them."""
 
 SMALLEST_M, HIGHEST_M = 0.1, 100.0
-"""Extent along x or y below which, and height above which, a mesh is in another unit than metres [m]."""
+"""Smallest extent along x or y, and largest height, of a mesh in metres [m]."""
 
 LOWEST_CEILING_M, HIGHEST_ROOM_M, FLOORS_RATIO = 2.2, 6.0, 1.5
 """Heights of the lowest rooms and of usual storeys [m]; ratio of floors to walls from which y of a taller scan points
 up."""
 
 FEET_STOREY, FOOT_M, WIDE_RATIO = (7.0, 11.0), 0.3048, 2.0
-"""Height of a storey in feet, length of a foot [m], and ratio of width to height from which it is no tall hall."""
+"""Height of a storey in feet, length of a foot [m], and ratio of width to height above that of tall halls."""
 
 LEVEL_M, LEVEL_FRACTION = 0.1, 0.3
-"""Height of a level in which flat surfaces are counted [m], and fraction of the largest level of a floor or ceiling."""
+"""Height of a level in which flat surfaces are counted [m]; least fraction of the largest level for floor or
+ceiling."""
 
 RIM_M = 0.3
-"""Free areas beside unknown ones that are nowhere this wide [m] are unknown: rims of a floor beyond the walls."""
+"""Largest width of free rims beyond walls, beside unknown cells, that become unknown [m]."""
 
 
 UNIT_REMEDY = "give unit_m, the length of its unit in metres"
@@ -50,7 +50,7 @@ UNIT_REMEDY = "give unit_m, the length of its unit in metres"
 
 @dataclass(frozen=True)
 class MeshReading:
-    """Conversion of a mesh to a map; None is the default. See `load_map`."""
+    """Options for the conversion of a mesh to a map; None is the default. See `load_map`."""
 
     height_band_m: tuple[float, float] | None = None
     observed: ArrayLike | PartialMap | None = None
@@ -64,26 +64,24 @@ class MeshReading:
         require_unit(self.unit_m)
 
     def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
-        """Return the notes of a file that is read."""
         return ImportNotes(file, self.unit_m or 1.0, unit_source if self.unit_m is None else "unit_m")
 
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
-        """Return a map with its report; its extent is checked where all of the file is observed."""
+        """Return a map with its report; the extent is checked if all of the file is observed."""
         return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.")
 
 
 def require_unit(unit_m: object) -> None:
-    """Raise a MapError unless a length of a unit [m] is None or a plausible number."""
     if unit_m is not None and not 1e-6 <= number_of(unit_m) <= 1e6:
         remedy = "give the length of a unit in metres, such as 0.3048 for feet or 0.001 for millimetres."
         raise MapError(f"unit_m = {shown(unit_m)} is not allowed: {remedy}")
 
 
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
-    """Turn a mesh into a map that carries the mesh, cut to its known cells.
+    """Convert a mesh to a map that carries it, cut to its known cells.
 
-    Known cells with a surface in the height band are walls. Walls that run along lattice lines are in the cells above
-    or to the right of them, or on the other side if those are unknown.
+    Known cells with a surface in the height band are walls. Walls along lattice lines are in the cells above or to the
+    right, or on the other side if those are unknown.
     """
     if reading.unit_m is not None:
         mesh = replace(mesh, vertices_m=mesh.vertices_m * reading.unit_m, height_range_m=None)
@@ -106,7 +104,6 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
 
 
 def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
-    """Raise a MapError for lowest and highest x, y, z (2, 3) that seem to be in another unit."""
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
@@ -116,7 +113,7 @@ def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
 
 
 def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshReading) -> None:
-    """Warn of a wide storey whose height is usual in feet; a narrow one may be a tall hall, and a unit is believed."""
+    """Warn of a wide storey whose height is usual in feet, unless a unit is given."""
     x, y, _ = np.ptp(bounds_m, axis=0)
     if reading.unit_m is None and FEET_STOREY[0] <= storey_m <= FEET_STOREY[1] and min(x, y) >= WIDE_RATIO * storey_m:
         size = f"{what} spans {x:.3g} x {y:.3g} m, with a storey of {storey_m:.3g} m, as if it were in feet"
@@ -124,7 +121,7 @@ def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshRead
 
 
 def _storey_m(mesh: SceneMesh) -> float:
-    """Return the height between the lowest floor and the surface above it, or of the mesh where there is none [m]."""
+    """Return the height from the lowest floor to the surface above it, or of the mesh if there is none [m]."""
     corners = mesh.corners_m
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(area, axis=1)
@@ -138,14 +135,14 @@ def _storey_m(mesh: SceneMesh) -> float:
 
 
 def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
-    """Return whether a scan is lowest along y, yet as high as a room, and has most area, as of floors, across y."""
+    """Return whether a scan is lowest along y, as high as a room, and has most area across y."""
     x, y, z = extent_m
     ratio = 1.0 if y <= HIGHEST_ROOM_M else FLOORS_RATIO
     return bool(LOWEST_CEILING_M <= y < min(x, z) and across_y > ratio * across_z)
 
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
-    """Cut the mesh of a map, if it has one, to its known cells, so that nothing unobserved is left."""
+    """Cut the mesh of a map, if any, to its known cells."""
     if partial.mesh is None:
         return partial
     row, start, end = row_runs(partial.state != CellState.UNKNOWN)
@@ -160,7 +157,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
 
 
 def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bools:
-    """Find the cells (ny, nx) of free areas that are nowhere so wide."""
+    """Return the cells (ny, nx) of free areas that are narrower than a width everywhere."""
     area, count = ndimage.label(np.pad(free, 1))
     to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
     widest_m = 2.0 * largest_by_area(to_border_m, area, count)
@@ -169,7 +166,6 @@ def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bo
 
 
 def _rims(state: States, resolution_m: float) -> Bools:
-    """Find the cells (ny, nx) of narrow free areas beside unknown cells."""
     free = state == CellState.FREE
     unknown = np.pad(state == CellState.UNKNOWN, 1)
     area, count = ndimage.label(free)
@@ -179,7 +175,7 @@ def _rims(state: States, resolution_m: float) -> Bools:
 
 
 def fitted_grid(bounds_m: Floats, resolution_m: float) -> PartialMap:
-    """Map of unknown cells around the lowest and highest x and y, on multiples of the resolution, with a margin."""
+    """Return a map of unknown cells around the lowest and highest x and y, on multiples of the resolution."""
     one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
     cell = one.resolution_m
     first = np.floor(bounds_m[0, :2] / cell).astype(int) - 1
@@ -205,7 +201,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
 
 
 def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools:
-    """Cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
+    """Return the cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
     (ny, nx), cell = empty.shape, empty.resolution_m
     x = empty.origin_m[0] + cell * (np.arange(nx) + 0.5)
     y = empty.origin_m[1] + cell * (np.arange(ny) + 0.5)
@@ -229,7 +225,7 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
 
 
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
-    """Cells (ny, nx) in which the mesh has a surface between two heights; touching borders does not count."""
+    """Return the cells (ny, nx) with a surface of the mesh between two heights; touching borders does not count."""
     corners = mesh.corners_m
     z = corners[..., 2]
     low, high = band_m
@@ -251,10 +247,10 @@ def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools
 
 
 @njit(cache=True)
-def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untyped-def]
+def mark_cells(polygons, sizes, cells, margin, upper):
     """Mark the cells whose inside convex polygons (F, 5, 2) [cells] reach by more than a margin.
 
-    A surface along a lattice line within the margin is in the cells above (or to the right of) it, or below it.
+    A surface within the margin of a lattice line is in the cells above (or right of) it, or below it.
     """
     ny, nx = cells.shape
     for index in range(len(polygons)):
@@ -274,7 +270,7 @@ def mark_cells(polygons, sizes, cells, margin, upper):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _reached(low, high, margin, upper):  # type: ignore[no-untyped-def]
+def _reached(low, high, margin, upper):
     first, last = int(np.floor(low + margin)), int(np.ceil(high - margin)) - 1
     if last < first:
         return (first, first) if upper else (last, last)

@@ -13,27 +13,24 @@ from sionna_partial.arrays import Bools, Floats, Indices, cross
 from sionna_partial.process import njit
 
 BORDER_M = 1e-5
-"""Distance within which a surface lies on a border, and stays [m]: float32 files round that much."""
+"""Distance within which a surface is on a border and stays [m]: the rounding of float32 files."""
 
 UPRIGHT_M = 1e-4
-"""Triangles that look narrower than this from above are cut as upright walls [m]."""
+"""Triangles narrower than this, seen from above, are cut as upright walls [m]."""
 
 MERGE_M = 1e-6
-"""Distance within which two points are one [m]."""
 
 SEAM_M = 1e-4
-"""Distance within which a cut point lies on a vertex or an edge beside it [m]: `UPRIGHT_M` moves it that far."""
+"""Distance within which a cut point is on a vertex or an edge [m]: `UPRIGHT_M` moves it that far."""
 
 Triangles = Floats
-"""Corners (F, 3, 3) of triangles [m]."""
 
 
 def cut_triangles(corners_m: Triangles, area: Any) -> tuple[Bools, Triangles, Indices]:
     """Cut triangles at the border of an area (shapely, world x and y [m]) seen from above.
 
-    Returns a mask (F,) of the triangles that lie in the area or on its border (within `BORDER_M`), the pieces in the
-    area of those that lie across its border (P, 3, 3) [m], with their winding, and the triangle that each piece
-    comes from (P,), in rising order.
+    Returns a mask (F,) of the triangles in the area or on its border (within `BORDER_M`), the pieces inside of
+    triangles across the border (P, 3, 3) [m], with their winding, and the triangle of each piece (P,), rising.
     """
     whole = np.zeros(len(corners_m), dtype=bool)
     if not len(corners_m) or area.is_empty:
@@ -57,8 +54,8 @@ def cut_triangles(corners_m: Triangles, area: Any) -> tuple[Bools, Triangles, In
 
 
 @njit(cache=True)
-def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
-    """Clip triangles to where a linear function with `values` (F, 3) at their corners lies between two limits (F,).
+def clip_slab(corners_m, values, low, high):
+    """Clip triangles to the slab in which a linear function with `values` (F, 3) at the corners is within limits (F,).
 
     Returns polygons (F, 5, 3) [m] with the winding of the triangles, and their numbers of corners (F,), 0 for none.
     """
@@ -84,7 +81,7 @@ def clip_slab(corners_m, values, low, high):  # type: ignore[no-untyped-def]
 
 
 def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
-    """Index (V,) of the first point that each point is one with: its own where there is none before it."""
+    """Return the index (V,) of the first point within the distance of each point."""
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
     if not len(unique):
         return np.zeros(0, np.intp)
@@ -97,10 +94,10 @@ def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
 
 
 def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple[Indices, Indices]:
-    """Split triangles at the vertices from `first_new` on that lie on their open edges, so that neighbours share edges.
+    """Split triangles at vertices from `first_new` on that are on their open edges, so that neighbours share edges.
 
     An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
-    triangles (G, 3), and the triangle that each comes from (G,), in rising order.
+    triangles (G, 3), and the source triangle of each (G,), rising.
     """
     source = np.arange(len(triangles))
     while True:
@@ -128,7 +125,7 @@ def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple
 def _points_on_edges(
     vertices_m: Floats, triangles: Indices, first_new: int
 ) -> tuple[Indices, Indices, Indices, Floats]:
-    """Triangle, corner at which its open edge starts, new vertex on that edge, and where on it (fraction of length)."""
+    """Return triangle, corner at which its open edge starts, new vertex on that edge, and fraction of its length."""
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     open_edges = np.nonzero((counts[index.ravel()] == 1) & (edges[:, 0] != edges[:, 1]))[0]
@@ -150,7 +147,6 @@ def _points_on_edges(
 
 
 def _seen_from_above(flat_m: Floats) -> tuple[Floats, Bools]:
-    """Longest edge (F, 2, 2) of triangles (F, 3, 2), and whether they are upright."""
     edges = np.stack([flat_m, np.roll(flat_m, -1, axis=1)], axis=2)
     lengths = np.linalg.norm(edges[:, :, 1] - edges[:, :, 0], axis=2)
     longest = np.argmax(lengths, axis=1)
@@ -163,7 +159,7 @@ def _doubled_area(flat_m: Floats) -> Floats:
 
 
 def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Indices]:
-    """Cut triangles that have a width seen from above; new corners are in the plane of their triangle."""
+    """Cut triangles with a width seen from above; new corners are in the plane of their triangle."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
     pieces, index = shapely.get_parts(shapely.constrained_delaunay_triangles(parts[wide]), return_index=True)
@@ -193,7 +189,7 @@ def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Trian
 
 
 def _spans_inside(ends_m: Floats, area: Any) -> tuple[Indices, Floats, Floats]:
-    """Line, start and end (fractions of its length) of every stretch of lines (L, 2, 2) in an area or on its border."""
+    """Return line, start and end (fractions of length) of the parts of lines (L, 2, 2) in an area or on its border."""
     lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
     line, fraction = _border_stops(ends_m, area)
     line = np.concatenate([np.repeat(np.arange(len(ends_m)), 2), line])
@@ -215,7 +211,7 @@ def _spans_inside(ends_m: Floats, area: Any) -> tuple[Indices, Floats, Floats]:
 
 
 def _border_stops(ends_m: Floats, area: Any) -> tuple[Indices, Floats]:
-    """Line, and fraction of its length, where lines (L, 2, 2) cross the border of an area or touch its corners."""
+    """Return line and fraction of its length where lines (L, 2, 2) cross the border of an area or touch its corners."""
     rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
     edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]
     tree = shapely.STRtree(shapely.linestrings(edges))

@@ -1,7 +1,7 @@
 """Scanned and modelled meshes: mesh files through trimesh, and Mitsuba scene files, read without Mitsuba.
 
-Mitsuba would follow includes and paths out of the scene's folder, aborts on indices out of range, and is imported in
-`tracing` alone: an XML of others is parsed here (defusedxml), and its meshes are checked before Mitsuba sees them.
+Mitsuba would follow includes and paths out of the scene's folder, and abort on indices out of range. XML of others is
+parsed here (defusedxml), and meshes are checked before Mitsuba reads them.
 """
 
 import io
@@ -34,23 +34,21 @@ from sionna_partial.settings import Material
 CUT = "cut or simplify the mesh."
 
 MAX_XML_BYTES = 100_000_000
-"""Largest scene file that is read [bytes]."""
 
 Y_UP_KINDS = ("glb", "gltf")
 """Formats whose y points up: glTF 2.0, section 3.4."""
 
 DEFAULT_THICKNESS_M = 0.1
-"""Thickness of a radio material where none is given [m] (Sionna RT)."""
+"""Default thickness of a radio material in Sionna RT [m]."""
 
 SHAPE_TYPES = ("ply", "obj", "rectangle", "cube")
-"""Types of shapes of a Mitsuba scene that are read."""
 
 SHAPE_PROPERTIES = ("filename", "to_world", "face_normals", "flip_normals", "flip_tex_coords")
 MATERIAL_PROPERTIES = (
     *("type", "thickness", "relative_permittivity", "conductivity", "scattering_coefficient", "xpd_coefficient"),
     *("scattering_pattern", "alpha_r", "alpha_i", "lambda_", "color"),
 )
-"""Properties of shapes and radio materials that change nothing else than is read of them."""
+"""Properties of shapes and radio materials that are read or have no effect here."""
 
 _CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 _SIDES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
@@ -58,17 +56,16 @@ _SHAPES = {
     "rectangle": (_CORNERS[[0, 1, 3, 2]] * (1.0, 1.0, 0.0), np.array([[0, 1, 2], [0, 2, 3]])),
     "cube": (_CORNERS, _SIDES[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)),
 }
-"""Corners and triangles of the shapes that need no file, as Mitsuba has them."""
+"""Corners and triangles of the shapes without a file, as in Mitsuba."""
 
 Triangles = tuple[Floats, NDArray[np.int64]]
-"""Vertices (V, 3) [m], and triangles (F, 3) of indices into them."""
+"""Vertices (V, 3) [m], and indices (F, 3) into them."""
 
 
 class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
-    """Gives the buffers of a .gltf that lie in its folder, and nothing else."""
+    """Resolver that returns only buffers of a .gltf in its folder."""
 
     def get(self, name: str) -> bytes:
-        """Return the content of a file."""
         path = confined_path(Path(self.parent), name, f"'{self.file_path}' asks for the file")
         return read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
 
@@ -76,7 +73,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = None) -> SceneMesh:
     """Read a mesh file, without colours and textures.
 
-    `up` is the axis of the file that points up: by default y of glTF, as its specification says, and z of other files.
+    `up` is the axis of the file that points up: by default y of glTF, as its specification says, and z of others.
     """
     notes = notes or ImportNotes(path)
     kind = path.suffix.lower().removeprefix(".")
@@ -94,7 +91,7 @@ def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = Non
 
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
-    """Return the path of a file that another one names, or raise a MapError (`what` ...) if it is not in the folder."""
+    """Return the path of a file that another one names; a MapError (`what` ...) if it is not in the folder."""
     if not lies_in(folder, name):
         raise MapError(f"{what} {name!r}, which is not allowed: put it into '{folder}' and give its relative path.")
     if not (folder / name).is_file():
@@ -103,7 +100,6 @@ def confined_path(folder: Path, name: str, what: str) -> Path:
 
 
 def _read_triangles(path: Path, kind: str, notes: ImportNotes) -> Triangles:
-    """Read the triangles of a mesh file in the axes of the file; nodes of a scene are placed by their transforms."""
     content = read_bytes(path, "path", MapError, MAX_MESH_BYTES, CUT)
     with decoding(path, f"no {kind.upper()} mesh", MapError):
         if kind == "gltf":
@@ -140,7 +136,6 @@ def _require_whole(kind: str, content: bytes, triangles: int) -> None:
 
 
 def _placed_parts(path: Path, scene: Any, notes: ImportNotes) -> Iterator[Triangles]:
-    """Yield the triangles of every node of a trimesh scene, in the axes of the scene."""
     for node in scene.graph.nodes_geometry:
         transform, name = scene.graph[node]
         part = scene.geometry[name]
@@ -164,7 +159,6 @@ def _concatenated(parts: list[Triangles]) -> Triangles:
 def _joined(
     path: Path, parts: list[Triangles], index: list[int], materials: tuple[Material | None, ...], notes: ImportNotes
 ) -> SceneMesh:
-    """Build the mesh of a file of parts with an index into the materials each; raise a MapError that names the file."""
     material = np.repeat(index, [len(triangles) for _, triangles in parts])
     try:
         mesh = merged_mesh(*_concatenated(parts), material, materials)
@@ -178,7 +172,6 @@ def _joined(
 
 
 def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
-    """Return whether y points up in the mesh; see `looks_y_up`."""
     corners = vertices_m[triangles]
     if not np.isfinite(corners).all() or not len(corners):
         return False
@@ -189,10 +182,10 @@ def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
 
 
 def read_mitsuba_scene(path: Path, notes: ImportNotes | None = None) -> SceneMesh:
-    """Read the meshes of a Mitsuba scene file, which lie in its folder or below, with their radio materials.
+    """Read the meshes of a Mitsuba scene file, in its folder or below, with their radio materials.
 
-    Materials are those that Sionna RT takes (`radio-material`, `itu-radio-material`, and names such as
-    `mat-itu_concrete`); any other is None, with a warning.
+    Materials are read as in Sionna RT (`radio-material`, `itu-radio-material`, and names such as `mat-itu_concrete`);
+    any other is None, with a warning.
     """
     notes = notes or ImportNotes(path)
     root, shapes = _read_shapes(path, notes)
@@ -205,13 +198,13 @@ def read_mitsuba_scene(path: Path, notes: ImportNotes | None = None) -> SceneMes
 
 
 def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object) -> SceneMesh:
-    """Read the mesh of an exported scene: `record` and `offset_m` are the "mesh" and "scene_offset" of its map.yaml.
+    """Read the mesh of an exported scene from "mesh" (`record`) and "scene_offset" of its map.yaml.
 
-    The shape `part0` of the scene has the triangles of the first material of the record, and so on.
+    The shape `part0` has the triangles of the first material of the record, and so on.
     """
     path = folder / "scene.xml"
     try:
-        materials = tuple(None if each is None else Material(**each) for each in record["materials"])
+        materials = tuple(None if fields is None else Material(**fields) for fields in record["materials"])
         low, high = (float(value) for value in record["height_range"])
         shift = np.array(offset_m, dtype=np.float64).reshape(3)
     except (KeyError, TypeError, ValueError) as error:
@@ -232,7 +225,7 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
 
 
 def _read_shapes(path: Path, notes: ImportNotes) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
-    """Read a scene file and its shapes; a document type, which entities need, and other files are refused."""
+    """Read a scene file and its shapes; DOCTYPE (entities) and references to other files are refused."""
     content = read_bytes(path, "path", MapError, MAX_XML_BYTES, "split the scene.")
     try:
         root: ET.Element = defusedxml.ElementTree.fromstring(content, forbid_dtd=True)
@@ -254,7 +247,6 @@ def _read_shapes(path: Path, notes: ImportNotes) -> tuple[ET.Element, list[tuple
 
 
 def _shape_triangles(path: Path, shape: ET.Element, notes: ImportNotes) -> Triangles:
-    """Triangles of a shape, with its to_world: each step of that acts on the outcome of those before it."""
     kind, matrix = str(shape.get("type")), np.eye(4)
     _require_known(path, shape, SHAPE_PROPERTIES)
     if kind in _SHAPES:
@@ -286,7 +278,6 @@ def _affine(matrix: Floats) -> Floats:
 
 
 def _step(step: ET.Element) -> Floats:
-    """Matrix (4, 4) of one step of a to_world."""
     if not {*step.attrib} <= {"value", "x", "y", "z", "angle"}:
         raise ValueError(step.attrib)
     value = np.array([float(word) for word in step.get("value", "").replace(",", " ").split()])
@@ -313,15 +304,14 @@ def _property(element: ET.Element, name: str) -> str | None:
 
 
 def _require_known(path: Path, element: ET.Element, names: Collection[str]) -> None:
-    """Raise a MapError for a property by another name than Mitsuba 3 and Sionna RT have, such as toWorld."""
-    for each in element:
-        if each.tag not in ("bsdf", "ref", "emitter") and each.get("name") not in names:
-            what = f"<{element.tag}> {_name(element)!r} has the property {each.get('name')!r}, which is not read"
+    """Raise a MapError for a property that Mitsuba 3 and Sionna RT do not have, such as toWorld."""
+    for part in element:
+        if part.tag not in ("bsdf", "ref", "emitter") and part.get("name") not in names:
+            what = f"<{element.tag}> {_name(element)!r} has the property {part.get('name')!r}, which is not read"
             raise MapError(f"path = '{path}': {what}: give the names of Mitsuba 3 ({', '.join(names)}).")
 
 
 def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Material | None]) -> Material | None:
-    """Material of a shape: its own bsdf, or a named one of the scene."""
     for bsdf in shape.findall("bsdf"):
         return _material(path, bsdf)
     for ref in shape.findall("ref"):
@@ -334,7 +324,7 @@ def _material_of(path: Path, shape: ET.Element, named: Mapping[str | None, Mater
 
 
 def _material(path: Path, bsdf: ET.Element) -> Material | None:
-    """Radio material of a bsdf, as Sionna RT understands it (scene_utils.process_xml)."""
+    """Return the radio material of a bsdf as Sionna RT reads it (scene_utils.process_xml)."""
     name = str(bsdf.get("id", "")).removeprefix("mat-")
     kind, itu = bsdf.get("type"), _property(bsdf, "type")
     if name.startswith(("itu_", "itu-")):

@@ -40,7 +40,7 @@ from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.process import njit
 
 MAX_CLOUD_BYTES = 20_000_000_000
-"""Largest point cloud that is read [bytes]; of PCD and PLY, which are read whole, `MAX_WHOLE_BYTES`."""
+"""Largest point cloud [bytes]; `MAX_WHOLE_BYTES` for PCD and PLY, which are read as a whole."""
 
 MAX_WHOLE_BYTES = 2_000_000_000
 
@@ -48,38 +48,37 @@ PART, PART_BYTES = 1_000_000, 32_000_000
 """Points, and bytes of text, that are read at a time."""
 
 MAX_FIELDS, MAX_SENSOR_M = 1000, 200.0
-"""Number of values of a point of a PCD at most, and distance of a sensor from the map [m]."""
+"""Most values of a point of a PCD, and largest distance of a sensor from the map [m]."""
 
 MAX_HEADER_LINES = 100
-"""Lines of a PCD in which its header must end."""
 
 LAYER_M = 0.05
 """Height of a voxel [m]."""
 
 FLOOR_FRACTION = 0.3
-"""Layers with this fraction of the most occupied one's cells, or more, are floors and ceilings."""
+"""Least fraction of the cells of the fullest layer in a floor or ceiling."""
 
 SLAB_M = 0.5
-"""Height up to which consecutive full layers are a floor or ceiling, not a cloud of walls alone [m]."""
+"""Largest height of consecutive full layers of a floor or ceiling; more is a cloud of walls [m]."""
 
 LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
-"""Height from which a layer may be the ceiling; heights below the floor and above the ceiling that count [m]."""
+"""Least height of a ceiling; depth below the floor and height above the ceiling that count [m]."""
 
 WALL_FRACTION = 0.25
-"""Fraction of the layers of the height band that makes a wall, relative to the layers of fuller cells (90 %)."""
+"""Least fraction of the layers of the height band in a wall, relative to fuller cells (90 %)."""
 
 THIN_FRACTION = 0.5
-"""Cells with certainly less than this fraction of the points of a cell beside them hold the noise of its wall."""
+"""Cells with certainly less than this fraction of a neighbour's points are noise of its wall."""
 
 WINDOW_M, STRAY_FRACTION = 0.35, 0.2
-"""Edge of the squares in which floor cells are counted [m]; fraction of the usual number up to which they stray."""
+"""Edge of the squares in which floor cells are counted [m]; fraction of the usual count below which they are strays."""
 
 GAP_M, HOLE_M2 = 0.15, 1.0
-"""Half the width of gaps, and size of holes, in a scanned floor that are closed unless walls bound them; size of areas
-of their own that are not free."""
+"""Half the width of gaps, and area of holes, in a scanned floor that are closed unless walls bound them; smallest free
+area."""
 
 POSE_M = 0.25
-"""Sensor positions closer to one another than this are one [m]."""
+"""Sensor positions closer than this are merged [m]."""
 
 _HALF, _BITS = 1 << 20, 21
 
@@ -95,32 +94,24 @@ def map_from_points(
     unit_m: float | None = None,
     wall_height_m: float | None = None,
 ) -> PartialMap:
-    """Make a map of a point cloud.
+    """Make a map from a point cloud.
 
-    Floor and ceiling are the layers in which most cells have points. Cells with points in the height band are walls,
-    other cells with points between floor and ceiling are free, and so are small gaps between them. Heights of the map
-    count from the floor that was found, wherever that is in the cloud. Files are read in parts: memory grows with the
-    building, not with the number of points (of PCD and PLY files, with the file).
+    Floor and ceiling are the layers with points in most cells. Cells with points in the height band are walls, other
+    cells with points between floor and ceiling are free, and so are small gaps. Heights of the map start at the floor.
+    Files are read in parts, except PCD and PLY: memory grows with the building, not with the number of points.
 
     Parameters
     ----------
     points : (N, 3) array-like or path-like
-        x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are left out.
+        x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are skipped.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
-        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free as well.
+        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free.
     height_band_m : (float, float) or None
-        z of the cloud between which points are walls [m], which also selects a storey. By default `DEFAULT_BAND_M`
-        above the lowest floor.
-    observed : (M, 2) array-like, PartialMap or None
-        The observed area, as for the meshes of `load_map`. By default the cells that are free or wall as above.
-    resolution_m : float or None
-        Edge of the cells [m], 0.05 by default.
-    up : {"z", "y"} or None
-        Axis of the cloud that points up, z by default.
-    unit_m : float or None
-        Length of a unit of the cloud [m], 0.3048 for feet; 1 by default. All other arguments are in metres.
+        z of the cloud between which points are walls [m], which also selects a storey.
+    observed, resolution_m, up, unit_m
+        As in `load_map`. By default the free and wall cells are observed. All other arguments are in metres.
     wall_height_m : float or None
-        Height of walls and ceiling [m]; by default the height of the ceiling that was found, or 3.
+        Height of walls and ceiling [m]; by default the height of the ceiling of the cloud, or 3.
 
     Returns
     -------
@@ -129,7 +120,7 @@ def map_from_points(
     Raises
     ------
     MapError
-        For a file that is damaged, of another kind or too large, a cloud in another unit than metres, or other values.
+        For a file that is damaged, too large or of another kind, a cloud in another unit, or other values.
 
     Examples
     --------
@@ -167,7 +158,6 @@ def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None
 
 
 def is_cloud(path: Path) -> bool:
-    """Return whether a PLY file has no faces."""
     with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
         header, end, _ = stream.read(100_000).partition(b"end_header")
     return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
@@ -188,7 +178,7 @@ def _las(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _require_records(stream: IO[bytes]) -> None:
-    """Raise a ValueError for a LAS that announces more variable length records than it has room for."""
+    """Raise a ValueError for a LAS with more announced variable length records than space."""
     header, size = stream.read(247).ljust(247, b"\0"), os.fstat(stream.fileno()).st_size
     points_at, records = struct.unpack_from("<II", header, 96)
     extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
@@ -198,7 +188,7 @@ def _require_records(stream: IO[bytes]) -> None:
 
 
 def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
-    """Raise a ValueError for a LAZ whose table of chunks cannot be right: lazrs ends the process where memory fails."""
+    """Raise a ValueError for a LAZ with a wrong table of chunks: lazrs would exhaust the memory and abort."""
     here, size = stream.tell(), os.fstat(stream.fileno()).st_size
     stream.seek(start)
     (table,) = struct.unpack("<q", stream.read(8))
@@ -253,7 +243,7 @@ def _ply(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _text(stream: IO[bytes]) -> Iterator[Floats]:
-    """Read the first three columns of a text, after a header or a number of points, if there are any."""
+    """Yield the first three columns of a text, after a header or a number of points."""
     separator, first, announced, count = None, True, None, 0
     while block := stream.read(PART_BYTES):
         block += stream.readline(10_000)
@@ -276,13 +266,11 @@ def _text(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _columns(line: bytes) -> int:
-    """Count the numbers at the beginning of a line."""
     words = re.split(rb"[\s,;]+", line.strip())
     return sum(1 for _ in itertools.takewhile(lambda word: re.fullmatch(rb"[-+]?[\d.]+([eE][-+]?\d+)?", word), words))
 
 
 def _require_count(count: int, announced: int) -> None:
-    """Raise a ValueError if a file holds other points than it announces."""
     if count != announced:
         raise ValueError(f"it announces {announced} points, and has {count}")
 
@@ -294,7 +282,6 @@ def _cloud_map(
     sensor_positions_m: ArrayLike | None,
     notes: ImportNotes,
 ) -> PartialMap:
-    """Turn points, in parts, into a map."""
     cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
     cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
     sensors = _sensors(sensor_positions_m, reading.up)
@@ -337,7 +324,6 @@ def _cloud_map(
 
 
 def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
-    """Return positions (M, 2) of a sensor in the plan."""
     if given is None:
         return None
     remedy = "give x, y (and z) in metres, (M, 2) or (M, 3)."
@@ -355,7 +341,7 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
 def _occupied_voxels(
     what: str, parts: Iterable[NDArray[Any]], cell_m: float, reading: MeshReading, notes: ImportNotes
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
-    """Return indices x, y, z (V, 3) of the voxels with points, on multiples of their size, and their numbers of points.
+    """Return indices x, y, z (V, 3) of the voxels with points, and their numbers of points.
 
     The third value has the number of points, and the sum of their heights [m], of each layer.
     """
@@ -394,13 +380,12 @@ def _occupied_voxels(
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge sorted keys with their counts."""
     keys, inverse = np.unique(np.concatenate([keys for keys, _ in pending]), return_inverse=True)
     return keys, np.bincount(inverse, np.concatenate([counts for _, counts in pending])).astype(np.int64)
 
 
 def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> Bools:
-    """Cells (ny, nx) with points in enough layers of the height band, and not much fewer than those beside them."""
+    """Return cells (ny, nx) with points in enough layers of the height band that are not noise of a wall."""
     size = shape[0] * shape[1]
     layers = np.bincount(cell, minlength=size).reshape(shape)
     points = np.bincount(cell, count, minlength=size).reshape(shape)
@@ -415,9 +400,9 @@ def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, 
 def _floor_and_ceiling(
     layer: NDArray[np.int64], heights_m: Mapping[int, tuple[int, float]], band_m: tuple[float, float] | None
 ) -> tuple[float, float | None]:
-    """Return the heights of the floor below a band, the lowest by default, and of the ceiling above it, if any [m].
+    """Return the heights of the floor below a band, by default the lowest, and of the ceiling, if any [m].
 
-    Each is the mean height of the points in its two fullest layers: a flat surface with noise is spread over two.
+    Each is the mean height of the points in its two fullest layers, since noise spreads a surface over two.
     """
     first = int(layer.min())
     pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # pairs[k] counts the layers k and k + 1
@@ -427,7 +412,7 @@ def _floor_and_ceiling(
     for run in runs:
         if len(run) * LAYER_M <= SLAB_M:
             lower = int(run[np.argmax(pairs[run])]) + first
-            counts, sums_m = zip(*(heights_m.get(each, (0, 0.0)) for each in (lower, lower + 1)), strict=True)
+            counts, sums_m = zip(*(heights_m.get(number, (0, 0.0)) for number in (lower, lower + 1)), strict=True)
             slabs_m.append(round(sum(sums_m) / sum(counts), 3))
     low = math.inf if band_m is None else height_pair("height_band_m", band_m)[0]
     below = [slab for slab in slabs_m if slab < low] or [first * LAYER_M]
@@ -436,14 +421,12 @@ def _floor_and_ceiling(
 
 
 def _looks_y_up(voxels: NDArray[np.int64], bounds: Floats) -> bool:
-    """Return whether the fullest layers of the cloud lie across y, not z; see `looks_y_up`."""
     layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
     fullest = [np.convolve(cells, (1, 1)).max() for cells in layers]
     return looks_y_up(np.ptp(bounds, axis=0), *fullest)
 
 
 def _without_strays(free: Bools, cell_m: float) -> Bools:
-    """Leave out cells that have few others around them."""
     size = 2 * round(WINDOW_M / cell_m / 2) + 1
     around = ndimage.uniform_filter(free.astype(np.float32), size, mode="constant")
     usual = np.quantile(around[free], 0.9) if free.any() else 0.0
@@ -451,7 +434,7 @@ def _without_strays(free: Bools, cell_m: float) -> Bools:
 
 
 def _closed(free: Bools, wall: Bools, cell_m: float) -> Bools:
-    """Close narrow gaps and small holes of a scanned floor, not through walls, nor what walls enclose."""
+    """Close narrow gaps and small holes of a scanned floor, except at walls."""
     steps = max(1, round(GAP_M / cell_m))
     grown = ndimage.binary_dilation(free, iterations=steps, mask=~wall)
     open_cells = ndimage.binary_dilation(
@@ -467,7 +450,7 @@ def _closed(free: Bools, wall: Bools, cell_m: float) -> Bools:
 
 
 def _enclosed(free: Bools, cell_m: float) -> Bools:
-    """Cells of free areas that are narrow or small, as within walls, pillars and shelves."""
+    """Return cells of narrow or small free areas, as within walls, pillars and shelves."""
     area, count = ndimage.label(free)
     small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
     return narrow_areas(free, cell_m) | (free & small[area])
@@ -478,7 +461,7 @@ def _beside(cells: Bools) -> Bools:
 
 
 @njit(cache=True)
-def _see_through(wall, targets, sensors, free):  # type: ignore[no-untyped-def]
+def _see_through(wall, targets, sensors, free):
     """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):

@@ -1,7 +1,7 @@
-"""The faces of a mesh: the planes that they lie on, which face of a plane is where, and which ones a line meets.
+"""Faces of a mesh: their planes, the face at a point of a plane, and the faces on a line.
 
-Faces in one plane reflect to one image, so sequences of reflections are distinguished by planes, not by faces. In a
-scanned mesh nearly every face is a plane of its own.
+Faces in one plane reflect to one image, so that sequences of reflections are distinguished by planes. In a scanned mesh
+nearly every face is a plane of its own.
 """
 
 from typing import NamedTuple
@@ -13,16 +13,16 @@ from sionna_partial.arrays import Floats, span_in_strip
 from sionna_partial.process import njit
 
 MOST_FACES = 64
-"""Most faces that a line may meet: those beyond are left out."""
+"""Largest number of faces on a line; further ones are left out."""
 
 _LEAF = 4
 """Largest number of faces in a box that is not divided further."""
 
 _INSIDE = 1e-9
-"""Part of a face by which a line may miss it: neighbours leave no gap."""
+"""Fraction of a face by which a line may miss it, so that neighbours leave no gap."""
 
 PLANE_TOLERANCE_M = 1e-4
-"""Distance of corners from a plane [m] up to which a face lies in it. Vertices are single precision."""
+"""Distance of corners from a plane [m] up to which a face lies in it, for single precision."""
 
 _NORMAL_TOLERANCE = 1e-4
 """Difference of unit normals up to which faces are parallel: 1 cm, which the solver accepts, in an image 50 m away."""
@@ -34,8 +34,8 @@ _FACE_TOLERANCE_M = 1e-3
 class Boxes(NamedTuple):
     """F items in a tree of K boxes; box 0 holds all.
 
-    Box k holds the part `start` to `stop` of the items in `order` (F,), and `child` is the first of the two boxes in
-    it, or -1. `low_m`, `high_m` (K, 3) are the corners of the boxes.
+    Box k has the corners `low_m`, `high_m` (K, 3) and holds items `start` to `stop` in `order` (F,); `child` is the
+    first of its two boxes, or -1.
     """
 
     order: NDArray[np.int64]
@@ -47,7 +47,7 @@ class Boxes(NamedTuple):
 
 
 class FaceTree(NamedTuple):
-    """F faces in boxes: their corners (F, 3, 3) in the order of the boxes, and the plane of each face (F,)."""
+    """F faces in boxes: corners (F, 3, 3) in the order of the boxes, and planes (F,)."""
 
     boxes: Boxes
     corner_m: Floats
@@ -55,14 +55,13 @@ class FaceTree(NamedTuple):
 
 
 def face_tree(corner_m: Floats, plane: NDArray[np.int32]) -> FaceTree:
-    """Sort faces with corners (F, 3, 3) [m], each of one of some planes (F,), into boxes."""
     boxes = divide(corner_m.min(axis=1), corner_m.max(axis=1), _LEAF)
     return FaceTree(boxes, corner_m[boxes.order], plane)
 
 
 @njit(cache=True)
-def divide(low_m, high_m, leaf):  # type: ignore[no-untyped-def]
-    """Divide items with these corners into boxes of at most `leaf`, each at the median along the longest side."""
+def divide(low_m, high_m, leaf):
+    """Divide items into boxes of at most `leaf`, each at the median along the longest side."""
     count = len(low_m)
     size = 4 * (count // leaf + 1)
     order, middle = np.arange(count), low_m + high_m
@@ -93,7 +92,7 @@ def divide(low_m, high_m, leaf):  # type: ignore[no-untyped-def]
 
 
 class Met(NamedTuple):
-    """Scratch of one line: the faces that it meets, and at which fraction of its length."""
+    """Scratch of one line: the faces that it meets, and the fractions of its length."""
 
     face: NDArray[np.int64]
     at: Floats
@@ -101,14 +100,13 @@ class Met(NamedTuple):
 
 
 @njit(cache=True)
-def scratch():  # type: ignore[no-untyped-def]
-    """Make room for one line."""
+def scratch():
     return Met(np.empty(MOST_FACES, np.int64), np.empty(MOST_FACES), np.empty(128, np.int64))
 
 
 @njit(cache=True)
-def faces_between(tree, a, b, own, other, met):  # type: ignore[no-untyped-def]
-    """Write the faces between two points, except faces in the planes `own` and `other`, and return their number.
+def faces_between(tree, a, b, own, other, met):
+    """Write the faces between two points, except faces in the planes `own` and `other`; return their number.
 
     Several faces in one plane count once.
     """
@@ -139,8 +137,8 @@ def faces_between(tree, a, b, own, other, met):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _meets(corner, a, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Fraction of a line from a point at which it meets a triangle, or -1 (Moeller and Trumbore 1997)."""
+def _meets(corner, a, dx, dy, dz):
+    """Return the fraction of a line at which it meets a triangle, or -1 (Moeller and Trumbore 1997)."""
     ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     vx, vy, vz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = dy * vz - dz * vy, dz * vx - dx * vz, dx * vy - dy * vx
@@ -159,8 +157,7 @@ def _meets(corner, a, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _insert(face, t, plane, own, other, met, count):  # type: ignore[no-untyped-def]
-    """Add a face, sorted, unless one of its plane is there or it is in an excluded plane; the new number of faces."""
+def _insert(face, t, plane, own, other, met, count):
     p = plane[face]
     if p in (own, other) or count == MOST_FACES:
         return count
@@ -178,10 +175,9 @@ def _insert(face, t, plane, own, other, met, count):  # type: ignore[no-untyped-
 class FaceBins(NamedTuple):
     """F faces of P planes, sorted into B square bins of each plane.
 
-    `axes` (P, 2) are the two coordinates that distinguish the faces of a plane, in which `low_m` (P, 2) is the
-    corner of its bins and `edge_m` (P,) their size; `columns` (P,) is their number in a row, and `first_bin` (P + 1,)
-    the first bin. `start` (B + 1,) and `face` are the faces that reach into each bin, one bin after the other, and
-    `corner_m` (F, 3, 2) the corners of the faces in the coordinates of their planes.
+    `axes` (P, 2) are the two coordinates used in a plane, in which `low_m` (P, 2) is the corner of its bins, `edge_m`
+    (P,) their size, `columns` (P,) their number in a row and `first_bin` (P + 1,) the first. `start` (B + 1,) and
+    `face` list the faces in each bin; `corner_m` (F, 3, 2) are corners in these coordinates.
     """
 
     axes: NDArray[np.int64]
@@ -197,7 +193,7 @@ class FaceBins(NamedTuple):
 class MeshPlanes(NamedTuple):
     """F faces of a mesh, grouped by P planes.
 
-    `plane` (F,) is the plane of every face; a face without area has its own. A point lies in a plane where
+    `plane` (F,) is the plane of every face; a face without area has its own. Points of a plane satisfy
     ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane.
     """
 
@@ -237,8 +233,7 @@ def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) 
 
 
 @njit(cache=True)
-def mix(a, b):  # type: ignore[no-untyped-def]
-    """Hash two integers into one."""
+def mix(a, b):
     h = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
     h ^= h >> np.uint64(29)
     h *= np.uint64(0xBF58476D1CE4E5B9)
@@ -246,8 +241,8 @@ def mix(a, b):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _plane_ids(order, normal, offset, corner):  # type: ignore[no-untyped-def]
-    """Plane of every face, and the first face of every plane; faces come in the order given, largest first.
+def _plane_ids(order, normal, offset, corner):
+    """Return the plane of every face, and the first face of every plane; faces come in `order`, largest first.
 
     Planes are kept by cells of |normal| and |offset|, and looked for in the 16 cells around a face's own.
     """
@@ -282,8 +277,7 @@ def _plane_ids(order, normal, offset, corner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _in_plane(first, f, normal, offset, corner):  # type: ignore[no-untyped-def]
-    """Return whether a face lies in the plane of the face `first`."""
+def _in_plane(first, f, normal, offset, corner):
     nx, ny, nz = normal[first]
     sign = 1.0 if nx * normal[f, 0] + ny * normal[f, 1] + nz * normal[f, 2] > 0.0 else -1.0
     for k in range(3):
@@ -297,8 +291,8 @@ def _in_plane(first, f, normal, offset, corner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no-untyped-def]
-    """First entry of every bin, and the faces in bin after bin: row by row, the bins of a row that a face covers."""
+def _fill_bins(plane, corner, low, edge, columns, first_bin):
+    """Return the first entry of every bin, and the faces in bin after bin, row by row."""
     start = np.zeros(first_bin[-1] + 1, np.int64)
     items = np.empty(0, np.int32)
     for stored in (False, True):
@@ -325,8 +319,7 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):  # type: ignore[no
 
 
 @njit(cache=True)
-def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
-    """Face of plane p at a point of it, or -1."""
+def face_at(bins, p, x, y, z):
     axes, low, edge, columns, first_bin, start, face, corner = bins
     u, v = axes[p, 0], axes[p, 1]
     x, y = (x if u == 0 else y if u == 1 else z), (x if v == 0 else y if v == 1 else z)
@@ -343,8 +336,7 @@ def face_at(bins, p, x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _inside(corner, f, x, y):  # type: ignore[no-untyped-def]
-    """Return whether a point lies on a face or at most the tolerance beyond its edges."""
+def _inside(corner, f, x, y):
     px, py, qx, qy = corner[f, 1, 0], corner[f, 1, 1], corner[f, 2, 0], corner[f, 2, 1]
     turn = (px - corner[f, 0, 0]) * (qy - corner[f, 0, 1]) - (py - corner[f, 0, 1]) * (qx - corner[f, 0, 0])
     sign = 1.0 if turn > 0.0 else -1.0

@@ -1,14 +1,13 @@
-"""Specular paths of meshes, with or without walls that they go through, by the sequences of planes that rays met.
+"""Specular paths of meshes, with or without walls that they cross, by the sequences of planes that rays met.
 
-A specular path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays
-determine which sequences there are, and, seen from the image, in which directions their last leg goes and how far. A
-receiver that lies there, or a little beside, is a candidate if the line to it, folded back, meets a face of each plane.
+A path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays determine the
+sequences and, seen from the image, directions and reach of the last leg. A receiver there, or a little beside, is a
+candidate if the line to it, folded back, meets a face of each plane.
 
-Where walls let power through, every leg of a candidate is then cast through the mesh, the faces on it are grouped to
-walls, and the power of the path follows. Where no wall may be crossed, Sionna RT finds the faces in its way.
+Where walls let power through, every leg is cast through the mesh, and its faces are grouped to walls, which gives the
+power. Where none may be crossed, Sionna RT finds the faces in the way.
 
-Plans fold lines with `unfold` of `plan/reflections.py`. It works in two dimensions, with walls instead of planes, and
-gives fractions of the length in the plan, from which heights follow: both functions have one line in common.
+`unfold` of `plan/reflections.py` folds lines in the plan; the functions share one line only.
 """
 
 import itertools
@@ -49,13 +48,13 @@ from sionna_partial.tracing.select import Limits, Listed, discount_after, needs_
 from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces
 
 _REACH, _REACH_M = 1.1, 0.3
-"""Factor and length [m] by which receivers may lie farther than the sequence's rays went."""
+"""Factor and length [m] by which receivers may be farther than the sequence's rays reached."""
 
 _LEAF = 8
 """Largest number of receivers in a box that is not divided further."""
 
 _PART = 0.5
-"""Part of the weakest power that matters down to which sequences are followed, as split rays only sample them."""
+"""Fraction of the smallest power that matters down to which sequences are followed, as split rays only sample them."""
 
 _AT_ONCE = 20_000
 """Number of candidates through walls that are written together, which bounds the memory."""
@@ -64,14 +63,11 @@ _SEQUENCES_AT_ONCE, _PARTS = 500, 64
 """Number of sequences whose candidates one thread lists at a time, and about the most parts of all sequences."""
 
 _ENTRIES = 160
-"""Most faces that a path through walls may meet."""
+"""Largest number of faces on a path through walls."""
 
 
 _OPAQUE_MARGIN, _MARGIN = 8.0, 4.0
-"""Distances in direction from a sequence's rays up to which its receivers are looked for, in spacings of the rays.
-
-Split rays are fewer, which makes the spacing wide.
-"""
+"""Distances in direction from a sequence's rays to its receivers, in spacings of the rays; split rays are sparse."""
 
 
 class View(NamedTuple):
@@ -85,14 +81,14 @@ class View(NamedTuple):
 
 
 class Traced(NamedTuple):
-    """Sequences of planes that rays met, and where their receivers are."""
+    """Sequences of planes that rays met, and the views of their receivers."""
 
     sequences: Sequences
     views: Views
 
 
 class Images(NamedTuple):
-    """The columns of `Traced` and of the mesh that `fold_line` reads: passing both takes longer than its work."""
+    """The columns of `Traced` and of the mesh for `fold_line`: passing both takes longer than its work."""
 
     parent: NDArray[np.int32]
     plane: NDArray[np.int32]
@@ -105,8 +101,7 @@ class Images(NamedTuple):
 
 
 @njit(cache=True)
-def images_of(traced, mesh):  # type: ignore[no-untyped-def]
-    """Take the columns from a mesh and the sequences in it."""
+def images_of(traced, mesh):
     (sequences, views), materials = traced, mesh.materials
     columns = sequences.parent, sequences.plane, views.depth, views.source_m
     return Images(*columns, mesh.planes, mesh.material, materials.largest, materials.wavelength_m)
@@ -123,8 +118,8 @@ class Pairs(NamedTuple):
 class MeshReflections:
     """Specular paths between a transmitter (3,) and receivers (N, 3), all between opaque faces, or all through walls.
 
-    `rays` come from `shoot_rays`, with the same transmitter and depth, and count the faces as `mesh` does; no face is
-    crossed then. With a number of rays, paths cross 1 to `max_walls` walls.
+    With `rays` from `shoot_rays`, of the same transmitter and depth, no face is crossed. With a number of rays, paths
+    cross 1 to `max_walls` walls.
     """
 
     def __init__(
@@ -135,11 +130,13 @@ class MeshReflections:
         settings: TraceSettings,
         rays: Iterable[Rays] | int,
         gains: Gains = ISOTROPIC,
+        *,
+        coarse: bool = False,
     ) -> None:
         ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64)), settings.max_depth
         if isinstance(rays, int):
             self.name, self._opaque, self._rays = "paths through walls", None, rays
-            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1)
+            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1, coarse=coarse)
         else:
             self.name, limits = "reflections", Limits(depth, depth, 0, 1.0, 0.0)
             sequences = collect_sequences(rays, mesh.planes)
@@ -171,7 +168,6 @@ class MeshReflections:
             yield Listed(rx, power, partial(self._written, traced, node, rx), done, at_once=_AT_ONCE)
 
     def _split(self, needed: Floats) -> Traced:
-        """Split rays at all faces; there are no sequences where no reflection is allowed, or no face there."""
         links, sequences = self._links, collect_sequences([], self._links.mesh.planes)
         if links.limits.reflections and len(needed) and len(links.mesh.tree.plane):
             wavelength_m = links.mesh.materials.wavelength_m
@@ -189,8 +185,7 @@ class MeshReflections:
 
 
 @njit(cache=True, nogil=True)
-def _straight(links):  # type: ignore[no-untyped-def]
-    """Power (N,) of straight lines to all receivers, 0 where no wall is on them, or too many."""
+def _straight(links):
     met, entries, power = scratch(), met_faces(_ENTRIES), np.zeros(len(links.rx_m))
     faces, points = np.empty(0, np.int32), np.empty((0, 3))
     for rx in range(len(power)):
@@ -201,8 +196,7 @@ def _straight(links):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _pairs(nodes, traced, boxes, needed, links):  # type: ignore[no-untyped-def]
-    """List the candidates of some sequences that have the power `needed` (N,) of the receivers in their view."""
+def _pairs(nodes, traced, boxes, needed, links):
     (sequences, views), mesh, limits, rx_m, tx_m = traced, links.mesh, links.limits, links.rx_m, links.tx_m
     all_node, all_rx, all_power = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)
     met, entries, depth, through, count = scratch(), met_faces(_ENTRIES), max(1, limits.depth), limits.walls > 0, 0
@@ -238,8 +232,7 @@ def _pairs(nodes, traced, boxes, needed, links):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _write(nodes, rx, traced, links, room):  # type: ignore[no-untyped-def]
-    """Kinds and faces (C, D) of candidates, vertices (C, D, 3), and whether each is of a wall that is crossed."""
+def _write(nodes, rx, traced, links, room):
     met, entries, shape = scratch(), met_faces(room), (len(nodes), room)
     kind, face, same_wall = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32), np.zeros(shape, np.bool_)
     vertices, depth = np.zeros((len(nodes), room, 3)), max(1, links.limits.depth)
@@ -260,8 +253,7 @@ def _write(nodes, rx, traced, links, room):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no-untyped-def]
-    """Write the receivers in view of a sequence's image to `found` and count them."""
+def receivers_in_view(view, boxes, rx, bounds, stack, found):
     source, low, high, margin, reach = view
     count, stack[0], top = 0, 0, 1
     while top > 0:
@@ -289,8 +281,7 @@ def receivers_in_view(view, boxes, rx, bounds, stack, found):  # type: ignore[no
 
 
 @njit(cache=True)
-def farthest(source, boxes):  # type: ignore[no-untyped-def]
-    """Distance that no receiver exceeds."""
+def farthest(source, boxes):
     total = 0.0
     for axis in range(3):
         total += max(source[axis] - boxes.low_m[0, axis], boxes.high_m[0, axis] - source[axis]) ** 2
@@ -298,12 +289,12 @@ def farthest(source, boxes):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-def]
-    """Write what bounds the points in view of an image and beyond its last plane, no receiver being farther away.
+def bound_view(view, farthest, planes, p, bounds):
+    """Write bounds of the points in view of an image and beyond its last plane.
 
     Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
     the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
-    the image lies within r times that distance of r times the middle.
+    the image is within r times that distance of r times the middle.
     """
     source, low, high, margin, reach = view
     reach = min(reach, farthest)
@@ -324,8 +315,7 @@ def bound_view(view, farthest, planes, p, bounds):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
-    """Return whether no point of a box is in view."""
+def _apart(low, high, bounds):
     for axis in range(3):
         if low[axis] > bounds[1, axis] or high[axis] < bounds[0, axis]:
             return True
@@ -341,7 +331,7 @@ def _apart(low, high, bounds):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fold_line(node, target, images, face, points):  # type: ignore[no-untyped-def]
+def fold_line(node, target, images, face, points):
     """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
 
     Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
@@ -372,7 +362,7 @@ def fold_line(node, target, images, face, points):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _follow(reflections, target, links, met, entries, faces, points):  # type: ignore[no-untyped-def]
+def _follow(reflections, target, links, met, entries, faces, points):
     """Write all faces that a path with reflections meets; return their number, -1 if it crosses no or many walls."""
     mesh, count, crossed = links.mesh, 0, 0
     a, own = links.tx_m, np.int64(-1)
@@ -400,8 +390,7 @@ def _follow(reflections, target, links, met, entries, faces, points):  # type: i
 
 
 @njit(cache=True)
-def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
-    """Return whether no leg of a path is so short that Sionna RT drops it."""
+def _has_long_legs(entries, count, tx, target):
     for k in range(count + 1):
         square = 0.0
         for axis in range(3):
@@ -414,20 +403,13 @@ def _has_long_legs(entries, count, tx, target):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _gain_to(point, links):  # type: ignore[no-untyped-def]
-    """Gain of the transmit antenna towards a point."""
-    return gain_towards(links.gains, point[0] - links.tx_m[0], point[1] - links.tx_m[1], point[2] - links.tx_m[2])
-
-
-@njit(cache=True)
-def _power(entries, count, target, links):  # type: ignore[no-untyped-def]
-    """Power of a path between vertical antennas."""
+def _power(entries, count, target, links):
     planes, materials, tx = links.mesh.planes, links.mesh.materials, links.tx_m
     first = entries.point_m[0] if count else target
     kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
     total = np.sqrt(kx * kx + ky * ky + kz * kz)
     k = kx / total, ky / total, kz / total
-    e, gain = vertical_field(k), _gain_to(first, links)
+    e, gain = vertical_field(k), gain_towards(links.gains, kx, ky, kz)
     for j in range(count):
         here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
         total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)

@@ -1,9 +1,8 @@
-"""The sequences of planes that rays from a transmitter meet.
+"""Sequences of planes that rays from a transmitter meet.
 
-Between opaque faces, Mitsuba reflects many rays. Where faces let power through, every ray splits at every face into a
-reflected ray and one that goes on; fewer rays are followed, here, down to the power that still matters. An opaque face
-is a face with transmission 0, where only the reflected ray is left: Mitsuba follows ten times as many of these rays in
-less time. Both fill the same tree.
+Between opaque faces, Mitsuba reflects many rays. Where faces let power through, fewer rays are followed here; each
+splits at every face into a reflected and a transmitted ray, down to the power that matters. For opaque faces, Mitsuba
+is faster by far. Both fill the same tree.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -21,7 +20,7 @@ from sionna_partial.tracing.select import Limits, NeedsByDistance, discount_afte
 from sionna_partial.tracing.walls import SolidMesh, cosine_at, is_one_wall
 
 SPLIT_RAYS = 20_000
-"""Number of rays that are split at faces; fewer where fewer are asked for."""
+"""Largest number of rays that are split at faces."""
 
 _RAYS_PER_CHUNK = 250_000
 
@@ -37,10 +36,10 @@ class MeshLinks(NamedTuple):
 
 
 class Rays(NamedTuple):
-    """R rays that were reflected like light, up to D times.
+    """R rays that were reflected up to D times.
 
-    `face` (R, D) are the faces that each met, counted through the shapes, -1 once it has escaped; `leg_m` (R, D + 1)
-    the lengths between them, inf where nothing was met; `direction` (R, D + 1, 3) the unit directions of the legs.
+    `face` (R, D) are the faces met, counted through the shapes, -1 after escape; `leg_m` (R, D + 1) the lengths between
+    them, inf where nothing was met; `direction` (R, D + 1, 3) the unit directions of the legs.
     """
 
     face: NDArray[np.int32]
@@ -53,8 +52,8 @@ def shoot_rays(
 ) -> Iterator[Rays]:
     """Shoot `count` rays from a transmitter (3,) in all directions, and reflect each up to `max_depth` times.
 
-    Directions form the Fibonacci lattice that Sionna RT's own rays form. `shapes` are all shapes of the scene, in the
-    order in which their faces are counted. Rays come part by part, always in the same order.
+    Directions are Sionna RT's Fibonacci lattice. `shapes` are all shapes of the scene in face order. Rays come part by
+    part, always in the same order.
     """
     import drjit as dr
     import mitsuba as mi
@@ -74,7 +73,6 @@ def shoot_rays(
 
 
 def _first_faces(shapes: Sequence[Any]) -> Any:
-    """Tabulate the first face of each shape by the shape's number in Dr.Jit's registry."""
     import drjit as dr
     import mitsuba as mi
 
@@ -86,7 +84,6 @@ def _first_faces(shapes: Sequence[Any]) -> Any:
 
 
 def lattice(number: NDArray[np.int64], count: int) -> NDArray[np.float32]:
-    """Return the unit vectors with the given numbers in the lattice of `count` directions."""
     turn = 2.0 * np.pi * np.modf(number / ((1.0 + np.sqrt(5.0)) / 2.0))[0]
     z = 1.0 - 2.0 * number / max(1, count - 1)
     across = np.sqrt(np.maximum(0.0, 1.0 - z * z))
@@ -112,7 +109,6 @@ def _launch(mi_scene: Any, first_face: Any, rays: Any, max_depth: int) -> list[t
 
 
 def _collect(legs: list[tuple[Any, Any, Any]], max_depth: int) -> Rays:
-    """Copy traced rays out of Dr.Jit."""
     face = np.stack([leg[0].numpy() for leg in legs], axis=1)[:, :max_depth]
     leg_m = np.stack([leg[1].numpy() for leg in legs], axis=1)
     return Rays(face, leg_m, np.stack([leg[2].numpy().T for leg in legs], axis=1))
@@ -121,10 +117,9 @@ def _collect(legs: list[tuple[Any, Any, Any]], max_depth: int) -> Rays:
 class Sequences(NamedTuple):
     """Every sequence of planes that rays met, as a tree; the first `size` rows of the arrays are used.
 
-    `parent` (M,) is the sequence without its last plane (-1 for none), `plane` (M,) that plane. Boxes `low`, `high`
-    (M, 3) hold the unit directions in which rays left it, and `reach_m` (M,) is the unfolded length of the longest of
-    these rays, to where it met the next face. `left` (M,) is the largest fraction of power that split rays had left.
-    `table` is a hash table of the sequences, -1 where it is empty.
+    `parent` (M,) is the sequence without its last plane (-1 for none), `plane` (M,) that plane. Boxes `low`, `high` (M,
+    3) hold the unit directions in which rays left it, `reach_m` (M,) is the longest unfolded length of these rays to
+    the next face, `left` (M,) the largest fraction of power of split rays. `table` is a hash table, -1 where empty.
     """
 
     parent: NDArray[np.int32]
@@ -141,8 +136,8 @@ class Sequences(NamedTuple):
 class Views(NamedTuple):
     """Views of M sequences, in which their receivers are.
 
-    `order` has each sequence after its parent, with all that begin like it behind it; `depth` is the number of planes,
-    `source_m` (M, 3) the image of the transmitter, and `margin` the width by which the box of directions is enlarged.
+    `order` has each sequence after its parent, followed by all its extensions; `depth` is the number of planes,
+    `source_m` (M, 3) the image of the transmitter, `margin` the width by which the box of directions is enlarged.
     """
 
     order: NDArray[np.int32]
@@ -152,7 +147,6 @@ class Views(NamedTuple):
 
 
 def collect_sequences(rays: Iterable[Rays], planes: MeshPlanes) -> Sequences:
-    """Make the tree of all sequences of planes that rays have met."""
     sequences, size = _no_sequences(), 0
     for part in rays:
         added, depth = 0, part.face.shape[1]
@@ -165,14 +159,13 @@ def collect_sequences(rays: Iterable[Rays], planes: MeshPlanes) -> Sequences:
 
 
 def _no_sequences() -> Sequences:
-    """Return a tree without sequences or room for any."""
     number, box, length = np.empty(0, np.int32), np.empty((0, 3), np.float32), np.empty(0, np.float32)
     return Sequences(number, number, box, box, length, np.empty(0), number, 0, 0)
 
 
 @njit(cache=True)
-def _with_room(sequences, size, more):  # type: ignore[no-untyped-def]
-    """Return `size` sequences with room for some more: at first 1024, then twice as many, as a hash table needs it."""
+def _with_room(sequences, size, more):
+    """Return `size` sequences with room for more: at first 1024, then twice as many, as a hash table needs it."""
     parent, plane, low, high, reach, left, table, _, rays = sequences
     room = max(1024, size + more)
     parent, plane, reach, left = grow(parent, room), grow(plane, room), grow(reach, room), grow(left, room)
@@ -184,8 +177,7 @@ def _with_room(sequences, size, more):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _add_rays(sequences, size, added, face, leg, direction, plane_of):  # type: ignore[no-untyped-def]
-    """Add the sequences of rays while there is room; return how many rays are added, and the number of sequences."""
+def _add_rays(sequences, size, added, face, leg, direction, plane_of):
     parent, plane, low, high, reach, _, table, _, _ = sequences  # attributes cost time in a loop
     depth = face.shape[1]
     while added < len(face) and size + depth <= len(parent):
@@ -202,8 +194,7 @@ def _add_rays(sequences, size, added, face, leg, direction, plane_of):  # type: 
 
 
 @njit(cache=True)
-def _slot(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
-    """Slot in the hash table of the sequence that adds the plane `last` to the sequence `node`, or where it belongs."""
+def _slot(table, parent, plane, node, last):
     mask = np.uint64(len(table) - 1)
     slot = mix(node + 1, last) & mask
     while table[slot] >= 0 and (parent[table[slot]] != node or plane[table[slot]] != last):
@@ -212,8 +203,7 @@ def _slot(table, parent, plane, node, last):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _next_sequence(table, parent, plane, size, node, last):  # type: ignore[no-untyped-def]
-    """Find the sequence that adds the plane `last` to the sequence `node`, or add it as number `size`."""
+def _next_sequence(table, parent, plane, size, node, last):
     slot = _slot(table, parent, plane, node, last)
     if table[slot] < 0:
         table[slot], parent[size], plane[size] = size, node, last
@@ -221,8 +211,7 @@ def _next_sequence(table, parent, plane, size, node, last):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def _widen(low, high, node, direction):  # type: ignore[no-untyped-def]
-    """Enlarge the box of directions in which rays left a sequence."""
+def _widen(low, high, node, direction):
     for axis in range(3):
         low[node, axis], high[node, axis] = (
             min(low[node, axis], direction[axis]),
@@ -244,7 +233,7 @@ class _RayStack(NamedTuple):
 
 
 def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequences:
-    """Make the tree of the sequences of planes that rays meet which split at all faces, down to the power needed."""
+    """Make the tree of sequences met by rays that split at all faces, down to the power needed."""
     boxes = links.mesh.tree.boxes
     low, high = np.minimum(boxes.low_m[0], links.tx_m), np.maximum(boxes.high_m[0], links.tx_m)
     far = float(np.linalg.norm(high - low)) + 1.0
@@ -254,7 +243,7 @@ def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequenc
 
 
 @njit(cache=True)
-def _split(sequences, directions, needed, links, far):  # type: ignore[no-untyped-def]
+def _split(sequences, directions, needed, links, far):
     """Add the sequences of rays in some directions (R, 3), and count them; no line in the mesh is longer than `far`."""
     room, size = MOST_FACES * (links.limits.reflections + 1), sequences.size
     stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
@@ -272,8 +261,8 @@ def _split(sequences, directions, needed, links, far):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _go_on(sequences, size, stack, top, needed, links, far):  # type: ignore[no-untyped-def]
-    """Follow one ray through all faces, and put the reflected ones in its place; the numbers of sequences and rays."""
+def _go_on(sequences, size, stack, top, needed, links, far):
+    """Follow one ray through all faces, and stack the reflected ones; return the numbers of sequences and rays."""
     mesh, limits, met, end = links.mesh, links.limits, stack.met, stack.end
     a, d = stack.value[top, :3].copy(), stack.value[top, 3:6].copy()
     length, left = stack.value[top, 6], stack.value[top, 7]
@@ -314,8 +303,7 @@ def _go_on(sequences, size, stack, top, needed, links, far):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _reflect(a, d, length, planes, p, ray):  # type: ignore[no-untyped-def]
-    """Write origin and direction of a ray that a plane reflects after a length."""
+def _reflect(a, d, length, planes, p, ray):
     along = d[0] * planes.normal[p, 0] + d[1] * planes.normal[p, 1] + d[2] * planes.normal[p, 2]
     for axis in range(3):
         ray[axis] = a[axis] + length * d[axis]
@@ -330,8 +318,8 @@ def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.fl
 
 
 @njit(cache=True)
-def _images(parent, plane, planes, tx, margin):  # type: ignore[no-untyped-def]
-    """Depth, image of the transmitter and margin of every sequence: a small plane bounds the directions."""
+def _images(parent, plane, planes, tx, margin):
+    """Return depth, image of the transmitter and margin of every sequence: a small plane bounds the directions."""
     depth, source, margins = np.empty(len(parent), np.int32), np.empty((len(parent), 3)), np.empty(len(parent))
     for node in range(len(parent)):
         p, above = plane[node], parent[node]
@@ -352,8 +340,8 @@ def _images(parent, plane, planes, tx, margin):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _depth_first(parent):  # type: ignore[no-untyped-def]
-    """Order of the sequences in which those with the same first planes are together."""
+def _depth_first(parent):
+    """Return the order of the sequences in which those with the same first planes are together."""
     child, beside = np.full(len(parent) + 1, -1, np.int32), np.empty(len(parent), np.int32)
     for node in range(len(parent) - 1, -1, -1):
         beside[node], child[parent[node] + 1] = child[parent[node] + 1], node

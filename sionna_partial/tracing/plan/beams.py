@@ -1,21 +1,19 @@
-"""Beams of a floor plan: sequences of walls that can reflect a path between two points, and the receivers they reach.
+"""Beams of a floor plan: sequences of walls that can reflect a path, and the receivers that they reach.
 
-A wall of full height reflects a path in the plan as a line does, so that the search has two dimensions. The image of
-the transmitter and a window, the part of the last wall that reflects it, bound a beam. Coordinates inside a beam: with
-the image source S and the window from A to B, a point is S + r ((1 - t)(A - S) + t (B - S)). The window is r = 1, t
-runs over the beam from 0 to 1, and on any line 1 / r is linear in t.
+The search has two dimensions, as a wall of full height reflects a path in the plan like a line. The image S of the
+transmitter and a window from A to B, the reflecting part of the last wall, bound a beam. A point in it is
+S + r ((1 - t)(A - S) + t (B - S)): the window is r = 1, t runs from 0 to 1, and on any line 1 / r is linear in t.
 
-One search (`follow`) takes the beams of one number of reflections to those of one more. An opaque wall is a wall that
-no path crosses: `Limits.walls` is 0. Walls in a beam are sorted in one of two ways:
+One search (`follow`) takes the beams of one number of reflections to the next. Opaque walls are walls that no path
+crosses (`Limits.walls` is 0). Walls in a beam are sorted in one of two ways:
 
-- Opaque walls end a beam. `_look` splits it by the nearest wall, the upper envelope of segments in (t, 1 / r), among
-  walls that are clipped in strips from the window outwards until those found fill the view. A beam sees low walls, and
-  past them. Every sequence is listed, whatever its power, as `select.py` needs the sum of all bounds.
-- Through walls, all walls behind the window are clipped, and `_lay` sorts them by distance between two edges, so that
-  the walls in front of any point are known, and with them a bound of the power there. Beams too weak for every
-  receiver end.
+- Opaque walls: `_look` splits a beam by the nearest wall, the upper envelope of segments in (t, 1 / r), among walls
+  clipped in strips from the window outwards until the view is full. A beam sees low walls, and past them. Every
+  sequence is listed, as `select.py` needs the sum of all bounds.
+- Through walls: all walls behind the window are clipped and `_lay` sorts them by distance between two edges. This
+  gives the walls before any point and a bound of the power there. Beams too weak for every receiver end.
 
-With `_lay` and `_add_pairs` for opaque walls, too, traces between them took longer.
+`_lay` and `_add_pairs` for opaque walls, too, would be slower.
 """
 
 import math
@@ -46,6 +44,7 @@ from sionna_partial.tracing.plan.clipping import (
 from sionna_partial.tracing.plan.room import FACES, Building, Room
 from sionna_partial.tracing.power import COSINES, gain_between
 from sionna_partial.tracing.select import discount_after, matters, needs_by_distance
+from sionna_partial.tracing.walls import are_in_wall
 
 _BEAMS_AT_ONCE = 256
 """Number of beams through walls that one thread works on at a time."""
@@ -58,10 +57,10 @@ _ROOT_ANGLE_RAD = 0.1234567
 
 
 class BeamTree(NamedTuple):
-    """M beams that form trees: a beam is the sequence of walls from a root down to it.
+    """M beams as trees: a beam is the sequence of walls from a root down to it.
 
-    `parent` (M,) is -1 at the roots, `piece` (M,) the piece of a wall that reflects the beam, and `source_m` (M, 2) the
-    image of the transmitter. Beams 4 k to 4 k + 3 are the roots of source k, one for each quadrant of its view.
+    `parent` (M,) is -1 at the roots, `piece` (M,) the reflecting piece of a wall, `source_m` (M, 2) the image of the
+    transmitter. Beams 4 k to 4 k + 3 are the roots of source k, one for each quadrant.
     """
 
     parent: NDArray[np.int32]
@@ -70,21 +69,18 @@ class BeamTree(NamedTuple):
 
     @classmethod
     def of(cls, beams: "Beams") -> "BeamTree":
-        """Return beams as a tree."""
         return cls(beams.parent, beams.piece, beams.window[:, :2].copy())
 
     def extended(self, beams: "Beams") -> "BeamTree":
-        """Add beams whose parents are in the tree."""
         columns: Any = zip(self, BeamTree.of(beams), strict=True)
         return BeamTree(*map(np.concatenate, columns))
 
 
 class Needed(NamedTuple):
-    """The power that a beam must have to matter, relative to (wavelength / 4 pi)^2.
+    """Smallest power that matters, relative to (wavelength / 4 pi)^2.
 
-    `power` (N,) is the smallest that matters to each receiver; `distance_m`, `relative` and `near` are as in
-    `NeedsByDistance`, in the plan. `cells` (ny, nx) is the smallest in square cells, whose corner x0 and y0, edge
-    [m] and number of columns are `grid` (4,).
+    `power` (N,) is for each receiver; `distance_m`, `relative` and `near` are as in `NeedsByDistance`, in the plan.
+    `cells` (ny, nx) is for square cells; `grid` (4,) are their corner x0 and y0, edge [m] and number of columns.
     """
 
     power: Floats
@@ -98,9 +94,9 @@ class Needed(NamedTuple):
 class Beams(NamedTuple):
     """M beams of one number of reflections.
 
-    `parent` (M,) is the beam before the last reflection, counted through all beams, and `piece` (M,) the piece of wall
-    that reflects it; -1 for the roots. `window` (M, 6) are the image of the transmitter and the ends of the window [m].
-    `left` (M, 2) bounds what reflections and what walls leave of the power, `crossed` (M,) is the smallest number of
+    `parent` (M,) is the beam before the last reflection, counted through all beams, `piece` (M,) the reflecting piece
+    of wall; -1 for the roots. `window` (M, 6) are the image of the transmitter and the ends of the window [m]. `left`
+    (M, 2) bounds the fractions of power after reflections and after walls, `crossed` (M,) is the smallest number of
     walls, `more` (M,) the largest number of further reflections, `sequence` (M,) the number of the sequence of lines.
     """
 
@@ -144,10 +140,10 @@ class _Beam(NamedTuple):
 
 
 class _Layers(NamedTuple):
-    """Scratch of one beam: the walls in it, and the walls between two edges, from the window outwards.
+    """Scratch of one beam: its walls, and the walls between two edges, from the window outwards.
 
     For clipped wall c, `slope` (C,) is the slope of 1 / r, `along` (C, 2) its direction. For edge i, `ray` (E, 3) is
-    the direction and length of the beam there. Between edges i and i + 1 lie `depth` (E,) walls: `wall` (E, D), behind
+    the direction and length of the beam. Between edges i and i + 1, there are `depth` (E,) walls `wall` (E, D), behind
     which `left` (E, D) of the power is left after `crossed` (E, D) walls. `open` (P,) is the last window of a line.
     """
 
@@ -163,7 +159,6 @@ class _Layers(NamedTuple):
 
 
 def needed_of(power: Floats, room: Room, wavelength_m: float) -> Needed:
-    """Sort what matters to receivers (N,)."""
     far = needs_by_distance(room.tx_m[:2], room.rx_m[:, :2], power, wavelength_m)
     power = power * (4.0 * math.pi / wavelength_m) ** 2
     low = room.rx_m[:, :2].min(axis=0)
@@ -176,10 +171,10 @@ def needed_of(power: Floats, room: Room, wavelength_m: float) -> Needed:
 def trace_beams(
     building: Building, receivers: PointBins, sources_m: Floats, max_depth: NDArray[np.int64]
 ) -> tuple[BeamTree, NDArray[np.int32]]:
-    """Find every sequence of opaque walls from sources (E, 2), each with its own largest depth (E,), to receivers.
+    """Find every sequence of opaque walls from sources (E, 2) with largest depths (E,) to receivers.
 
-    Returns the beams and pairs (K, 2) of a beam and a receiver in its view, ordered by sequence and then by receiver,
-    each sequence of wall lines once for a receiver.
+    Returns the beams and pairs (K, 2) of beam and receiver in its view, ordered by sequence and then receiver; a
+    receiver has each sequence of wall lines once.
     """
     nothing, beams = np.zeros(0), Beams.first(sources_m, max_depth, 1.0)
     needed = Needed(np.zeros(len(receivers.order)), nothing, nothing, nothing, np.zeros((1, 1)), np.zeros(4))
@@ -194,7 +189,7 @@ def trace_beams(
 def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.int32], Floats]:
     """Reflect the last beams of a tree; return the new ones, pairs (K, 2) of beam and receiver, and powers (K,).
 
-    Each sequence of wall lines is once in the pairs of a receiver. Powers are bounds of the fraction that walls leave.
+    A receiver has each sequence of wall lines once. Powers are bounds of the fraction after walls.
     """
     building, count, before = task.building, len(beams.parent), len(tree.parent) - len(beams.parent)
     at_once = _BEAMS_AT_ONCE if building.limits.walls else max(1, count)
@@ -214,7 +209,7 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
 
 
 @njit(cache=True, nogil=True)
-def _follow_beams(beams, before, first, stop, task):  # type: ignore[no-untyped-def]
+def _follow_beams(beams, before, first, stop, task):
     """Follow some beams, of which there are others `before`; return as `follow`, without sequences."""
     layers, building = _layers_of(task.building.plan), task.building
     plan, opaque, room, receivers = building.plan, building.limits.walls == 0, building.room, task.receivers
@@ -264,8 +259,7 @@ def _follow_beams(beams, before, first, stop, task):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def _layers_of(plan):  # type: ignore[no-untyped-def]
-    """Make scratch for the walls in one beam and their layers."""
+def _layers_of(plan):
     size = len(plan.pieces_m)
     edges = 2 * size + 2
     return _Layers(
@@ -282,8 +276,8 @@ def _layers_of(plan):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _clip_walls(plan, beam, own, opaque, layers):  # type: ignore[no-untyped-def]
-    """Clip the walls in a beam, only the nearest if they are opaque, and sort their edges; return their number."""
+def _clip_walls(plan, beam, own, opaque, layers):
+    """Clip the walls in a beam, only the nearest if opaque, and sort their edges; return their number."""
     scratch, grid = layers.clipped, plan.cells.grid
     scratch.visit[-1] += 1
     if opaque:
@@ -310,10 +304,10 @@ def _clip_walls(plan, beam, own, opaque, layers):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _look(count, line, low, layers, span, wall):  # type: ignore[no-untyped-def]
-    """Split a beam by the nearest opaque wall and the low walls before it, from t0, 1 / r0 to t1, 1 / r1 each.
+def _look(count, line, low, layers, span, wall):
+    """Split a beam by the nearest opaque wall and the low walls before it.
 
-    Returns these windows, their clipped walls, -1 where there is none, and their number.
+    Returns windows (t0, 1 / r0, t1, 1 / r1), their clipped walls, -1 for none, and their number.
     """
     found, order, active, edge = layers.clipped.found, layers.clipped.order, layers.clipped.active, layers.clipped.edge
     slope, walls = layers.slope, layers.clipped.wall
@@ -351,7 +345,7 @@ def _look(count, line, low, layers, span, wall):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _lay(beam, count, task, layers, windows):  # type: ignore[no-untyped-def]
+def _lay(beam, count, task, layers, windows):
     """Put the walls of a beam into layers; return the windows that reflect it.
 
     Windows are (t from, t to, power after reflections, power after walls), (clipped wall, walls crossed), and their
@@ -371,15 +365,14 @@ def _lay(beam, count, task, layers, windows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _nearness(layers, c, t):  # type: ignore[no-untyped-def]
+def _nearness(layers, c, t):
     """Return 1 / r of a clipped wall at t."""
     found = layers.clipped.found
     return found[c, 1] + layers.slope[c] * (t - found[c, 0])
 
 
 @njit(cache=True)
-def _sort_by_distance(layers, count, t):  # type: ignore[no-untyped-def]
-    """Sort the active walls by their distance at t; they are nearly sorted."""
+def _sort_by_distance(layers, count, t):
     active = layers.clipped.active
     for j in range(1, count):
         c, k = active[j], j
@@ -391,11 +384,11 @@ def _sort_by_distance(layers, count, t):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped-def]
-    """Put the walls between two edges, which paths may cross, into layers."""
+def _lay_one(beam, i, active, task, layers, windows):
     scratch, plan_line, low = layers.clipped, task.building.plan.line, task.building.plan.low
     pieces = task.building.plan.pieces_m
-    of_piece, solid, depth_m = task.building.material, task.building.interior.solid, task.building.interior.depth_m
+    of_piece, interior = task.building.material, task.building.interior
+    solid, depth_m = interior.solid, interior.depth_m
     most_reflected = task.building.materials.most_reflected
     most_transmitted = task.building.materials.most_transmitted
     limits, left, crossed = task.building.limits, beam.left, beam.crossed
@@ -404,6 +397,7 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
     t0, x_0, y_0, size_0 = scratch.edge[i], layers.ray[i, 0], layers.ray[i, 1], layers.ray[i, 2]
     t1, x_1, y_1, size_1 = scratch.edge[i + 1], layers.ray[i + 1, 0], layers.ray[i + 1, 1], layers.ray[i + 1, 2]
     start_0 = start_1 = steep_0 = steep_1 = first = 0.0
+    before_0, before_1, may_be_same = size_0, size_1, order > 0 and depth_m > 0.0
     for j in range(min(active, FACES)):
         c = scratch.active[j]
         piece = scratch.wall[c]
@@ -420,12 +414,17 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
         total = beam.reflected * left * (task.most_transmitted if crossed == 0 else 1.0)
         if not matters(total * discount, near, task.needed):
             break
-        if beam.more > 0 and not _is_solid(pieces, solid, beam.window, piece):
+        rays = (x_0, y_0, cos_0, before_0, r_0), (x_1, y_1, cos_1, before_1, r_1)
+        inside = may_be_same and are_in_wall(interior, beam.window[0], beam.window[1], rays)
+        before_0, before_1, may_be_same = r_0, r_1, depth_m > 0.0 and not low[piece]
+        if beam.more > 0 and not ((inside and j > 0) or _is_solid(pieces, solid, beam.window, piece)):
             flat = near / np.hypot(near, 2.0 * task.building.room.height_m)
             part = most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
             if matters(part * total * next_discount, near, task.needed):
                 new = t0, t1, part * beam.reflected, left, crossed
                 windows = _extend(layers, plan_line, of_piece, c, new, windows)
+        if inside and j == 0 and not low[piece]:
+            break
         through = 1.0 if low[piece] else most_transmitted[material, min(int(most * COSINES) + 1, COSINES)]
         same = j > 0 and first > 0.0
         if same:
@@ -445,7 +444,7 @@ def _lay_one(beam, i, active, task, layers, windows):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _is_solid(pieces, solid, beam, piece):  # type: ignore[no-untyped-def]
+def _is_solid(pieces, solid, beam, piece):
     """Return whether a beam meets a wall from inside it."""
     px, py = pieces[piece, 0, 0], pieces[piece, 0, 1]
     dx, dy = pieces[piece, 1, 0] - px, pieces[piece, 1, 1] - py
@@ -454,7 +453,7 @@ def _is_solid(pieces, solid, beam, piece):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _extend(layers, lines, material, c, new, windows):  # type: ignore[no-untyped-def]
+def _extend(layers, lines, material, c, new, windows):
     """Add a window that reflects a beam, or enlarge the one beside it."""
     t0, t1, reflected, left, crossed = new
     span, wall, count = windows
@@ -474,15 +473,14 @@ def _extend(layers, lines, material, c, new, windows):  # type: ignore[no-untype
 
 
 @njit(cache=True)
-def _piece_of(layers, c, span):  # type: ignore[no-untyped-def]
-    """Return a part of a view as `reflect` takes it: (t0, w0, t1, w1)."""
+def _piece_of(layers, c, span):
+    """Return a part of a view as input of `reflect`: (t0, w0, t1, w1)."""
     w0, w1 = _nearness(layers, c, span[0]), _nearness(layers, c, span[1])
     return span[0], max(w0, 1e-9), span[1], max(w1, 1e-9)
 
 
 @njit(cache=True)
-def _is_needed(beam, task):  # type: ignore[no-untyped-def]
-    """Return whether a beam may matter, as it is or after more reflections."""
+def _is_needed(beam, task):
     limits = task.building.limits
     order = limits.reflections - beam.more
     total = beam.reflected * beam.left * (task.most_transmitted if beam.crossed == 0 else 1.0)
@@ -495,8 +493,7 @@ def _is_needed(beam, task):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _window_distance(beam):  # type: ignore[no-untyped-def]
-    """Return the distance of a window from the source of its beam."""
+def _window_distance(beam):
     ax, ay, bx, by = beam[2] - beam[0], beam[3] - beam[1], beam[4] - beam[0], beam[5] - beam[1]
     wx, wy = bx - ax, by - ay
     size = np.hypot(wx, wy)
@@ -506,7 +503,7 @@ def _window_distance(beam):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _reaches(beam, near, left, needed):  # type: ignore[no-untyped-def]
+def _reaches(beam, near, left, needed):
     """Return whether a beam would matter to any receiver behind its window if no wall were there."""
     x0, y0, edge, (rows, columns) = needed.grid[0], needed.grid[1], needed.grid[2], needed.cells.shape
     corner = cone_of(beam, True, needed.grid, rows)
@@ -526,7 +523,7 @@ def _reaches(beam, near, left, needed):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _add_pairs(beam, number, count, task, layers, pairs):  # type: ignore[no-untyped-def]
+def _add_pairs(beam, number, count, task, layers, pairs):
     """Pair a reflected beam with the receivers that need it, behind a wall or after one."""
     window, receivers, (pair, through, used) = beam.window, task.receivers, pairs
     ax, ay, bx, by = window[2] - window[0], window[3] - window[1], window[4] - window[0], window[5] - window[1]
@@ -557,8 +554,8 @@ def _add_pairs(beam, number, count, task, layers, pairs):  # type: ignore[no-unt
 
 
 @njit(cache=True)
-def _left_at(beam, count, layers, t, r):  # type: ignore[no-untyped-def]
-    """Return a bound of the power that walls leave of a beam at a point; 0 if no wall is in front of it."""
+def _left_at(beam, count, layers, t, r):
+    """Return a bound of a beam's power after walls at a point; 0 if no wall is in front of it."""
     edge = layers.clipped.edge
     low, high = 0, 2 * count + 1
     t = min(max(t, THINNEST), 1.0 - THINNEST)

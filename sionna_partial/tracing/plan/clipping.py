@@ -1,7 +1,4 @@
-"""Walls clipped to a beam: the part of each wall that is in it, its windows, and the points in a part of it.
-
-Coordinates inside a beam are explained in `beams.py`.
-"""
+"""Walls clipped to a beam, in the coordinates of `beams.py`."""
 
 from typing import NamedTuple
 
@@ -13,24 +10,23 @@ from sionna_partial.process import njit
 from sionna_partial.scene.outlines import grow
 
 TOLERANCE_M = 1e-4
-"""Width by which beams are widened [m]: transmitter, receivers and corners share one lattice, and the solver that
-checks the candidates computes in single precision."""
+"""Width by which beams are widened [m], as points share one lattice and the solver has single precision."""
 
 _STRIP_CELLS = 6.0
 """Depth of the strips in which a narrow beam is searched for walls [cells of the index]."""
 
 _FAR_M = 1e6
-"""Length at which beams that hit nothing are cut off [m]. It is fixed, so that no receiver depends on the others."""
+"""Length at which beams that hit nothing are cut off [m], fixed so that no receiver depends on the others."""
 
 THINNEST = 1e-12
-"""Part of a beam's width below which nothing lies between two edges."""
+"""Smallest part of a beam's width between two edges."""
 
 
 class Clipped(NamedTuple):
-    """Arrays that one beam after the other is worked out in; `visit` ends with the number of the present beam.
+    """Scratch of one beam; `visit` ends with the number of the present beam.
 
-    Of the walls clipped to a beam, `found` (C, 4) are the parts (t0, 1 / r0, t1, 1 / r1), `wall` (C,) the pieces, and
-    `order` sorts them by t0. `active` are the walls at a t, and `edge` the sorted ends.
+    Of the clipped walls, `found` (C, 4) are the parts (t0, 1 / r0, t1, 1 / r1), `wall` (C,) the pieces, and `order`
+    sorts them by t0. `active` are the walls at a t, and `edge` the sorted ends.
     """
 
     found: Floats
@@ -42,19 +38,15 @@ class Clipped(NamedTuple):
 
 
 @njit(cache=True)
-def scratch_of(plan):  # type: ignore[no-untyped-def]
-    """Make scratch for the walls in one beam."""
+def scratch_of(plan):
     size = len(plan.pieces_m)
     wall, order, active = np.empty(size, np.int32), np.empty(size, np.int32), np.empty(size, np.int32)
     return Clipped(np.empty((size, 4)), wall, order, active, np.empty(2 * size + 2), np.zeros(size + 1, np.int64))
 
 
 @njit(cache=True)
-def _clip(beam, wall, reflected):  # type: ignore[no-untyped-def]
-    """Return the part of a wall inside a beam and beyond its window, as (t0, w0, t1, w1) with w = 1 / r and t0 < t1.
-
-    t0 >= t1 if there is none.
-    """
+def _clip(beam, wall, reflected):
+    """Return the part of a wall in a beam, beyond its window: (t0, w0, t1, w1) with w = 1 / r; t0 >= t1 if none."""
     ax, ay = beam[2] - beam[0], beam[3] - beam[1]
     bx, by = beam[4] - beam[0], beam[5] - beam[1]
     area = ax * by - ay * bx
@@ -83,11 +75,11 @@ def _clip(beam, wall, reflected):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def clip_nearest(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
-    """Clip the walls in a beam, from its window outwards, until they hide everything beyond them; return their number.
+def clip_nearest(plan, beam, own, scratch):
+    """Clip the walls in a beam, from its window outwards, until they hide everything else; return their number.
 
-    Cells of the index are visited in strips across the beam. Other cells lie beyond all strips, so that walls that fill
-    the whole view within the strips hide them.
+    Cells of the index are visited in strips across the beam. Other cells are beyond all strips, so that walls that fill
+    the view within the strips hide them.
     """
     x0, y0, edge, columns, rows = plan.cells.grid
     x1, y1 = x0 + columns * edge, y0 + rows * edge
@@ -109,7 +101,7 @@ def clip_nearest(plan, beam, own, scratch):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-def]
+def _leaves(corner, low, high, axis, first, second):
     """Return whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
     return (min(corner[0, axis], corner[1, axis]) > high and min(first, second) >= 0.0) or (
         max(corner[0, axis], corner[1, axis]) < low and max(first, second) <= 0.0
@@ -117,7 +109,7 @@ def _leaves(corner, low, high, axis, first, second):  # type: ignore[no-untyped-
 
 
 @njit(cache=True)
-def clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-untyped-def]
+def clip_cells(plan, beam, own, corner, count, scratch):
     """Clip the walls in the cells of a strip that were not clipped before; return the number of all clipped walls."""
     visit = scratch.visit[-1]
     first, last = rows_in(corner, plan.cells)
@@ -145,8 +137,8 @@ def clip_cells(plan, beam, own, corner, count, scratch):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def rows_in(corner, bins):  # type: ignore[no-untyped-def]
-    """Return the first row of square bins that a quadrilateral reaches, and the row after the last."""
+def rows_in(corner, bins):
+    """Return the range of rows of square bins that a quadrilateral reaches."""
     y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
     low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
     high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
@@ -154,8 +146,8 @@ def rows_in(corner, bins):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def entries_in(corner, bins, row):  # type: ignore[no-untyped-def]
-    """Return the first entry of the bins of a row that a convex quadrilateral reaches, and the entry after the last."""
+def entries_in(corner, bins, row):
+    """Return the range of entries of the bins of a row that a convex quadrilateral reaches."""
     x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
     left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
     if left > right:
@@ -166,8 +158,7 @@ def entries_in(corner, bins, row):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _is_filled(low, scratch, count, far):  # type: ignore[no-untyped-def]
-    """Return whether walls no farther than `far` that are not low fill the whole view."""
+def _is_filled(low, scratch, count, far):
     reach = 1e-12
     for k in range(count):
         i = scratch.order[k]
@@ -183,7 +174,7 @@ def _is_filled(low, scratch, count, far):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _sort(values, count):  # type: ignore[no-untyped-def]
+def _sort(values, count):
     """Sort the first `count` values in place (Shell 1959); `np.sort` takes a second to compile."""
     gap = 1
     while 3 * gap + 1 < count:
@@ -199,8 +190,7 @@ def _sort(values, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def sort_edges(found, edge, count):  # type: ignore[no-untyped-def]
-    """Write the sorted ends of the clipped walls, and of the beam."""
+def sort_edges(found, edge, count):
     edge[0], edge[1] = 0.0, 1.0
     for i in range(count):
         edge[2 * i + 2], edge[2 * i + 3] = min(max(found[i, 0], 0.0), 1.0), min(max(found[i, 2], 0.0), 1.0)
@@ -208,8 +198,7 @@ def sort_edges(found, edge, count):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def move_to(t, found, order, active, count, begun, number):  # type: ignore[no-untyped-def]
-    """Update the walls that are active at a larger t; return the numbers of walls begun and active."""
+def move_to(t, found, order, active, count, begun, number):
     while begun < count and found[order[begun], 0] <= t:
         active[number] = order[begun]
         begun, number = begun + 1, number + 1
@@ -222,7 +211,7 @@ def move_to(t, found, order, active, count, begun, number):  # type: ignore[no-u
 
 
 @njit(cache=True)
-def reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
+def reflect(beam, piece, wall, child):
     """Write the beam reflected in a piece (t0, 1 / r0, t1, 1 / r1) of its view; return False if it is too thin."""
     sx, sy = beam[0], beam[1]
     for k in range(2):  # the ends change places
@@ -239,7 +228,7 @@ def reflect(beam, piece, wall, child):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def cone_of(beam, reflected, grid, rows):  # type: ignore[no-untyped-def]
+def cone_of(beam, reflected, grid, rows):
     """Return the corners (4, 2) of a beam from its window, or its source if it is a root, to beyond a grid."""
     x0, y0, x1, y1 = grid[0], grid[1], grid[0] + grid[3] * grid[2], grid[1] + rows * grid[2]
     far = np.hypot(max(abs(beam[0] - x0), abs(beam[0] - x1)), max(abs(beam[1] - y0), abs(beam[1] - y1)))
@@ -254,7 +243,7 @@ def cone_of(beam, reflected, grid, rows):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def corners_of(beam, reflected, piece):  # type: ignore[no-untyped-def]
+def corners_of(beam, reflected, piece):
     """Return the corners (4, 2) of a beam between its window and one piece of its view, cut off where it is far."""
     sx, sy = beam[0], beam[1]
     corner = np.empty((4, 2))
@@ -271,7 +260,7 @@ def corners_of(beam, reflected, piece):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _inward_edges(corner):  # type: ignore[no-untyped-def]
+def _inward_edges(corner):
     """Return unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
     normal, offset = np.empty((4, 2)), np.empty(4)
     for k in range(4):
@@ -285,8 +274,7 @@ def _inward_edges(corner):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def add_points(corner, number, receivers, pair, through, used):  # type: ignore[no-untyped-def]
-    """Pair a beam with the receivers in a part of it with some corners."""
+def add_points(corner, number, receivers, pair, through, used):
     points, (normal, offset) = receivers.points_m, _inward_edges(corner)
     first, last = rows_in(corner, receivers)
     for row in range(first, last):

@@ -1,12 +1,10 @@
 """Paths of a floor plan that are diffracted once at a vertical edge.
 
 An edge is a point in the plan. A candidate joins a path from the transmitter to an edge and a path from there to a
-receiver. On a vertical edge Keller's cone keeps the slope of a path, so that heights unfold along the whole path in the
-plan as they do without the edge.
+receiver. On a vertical edge Keller's cone keeps the slope of a path, so that heights unfold along the whole path.
 
-Between opaque walls, few reflections are possible before and after the edge, and beams find the paths. Through walls,
-both legs are straight lines to every edge and receiver. Arrivals, bounds and writing are the same; the two lists of
-candidates differ, as beams give pairs of edges and receivers, and lines give all.
+Between opaque walls, beams find pairs of edges and receivers with few reflections; through walls, straight lines join
+all edges and receivers. Arrivals, bounds and writing are shared.
 """
 
 from collections.abc import Iterator
@@ -55,7 +53,7 @@ from sionna_partial.tracing.power import (
 from sionna_partial.tracing.select import Listed
 
 MAX_REFLECTIONS = 2
-"""Largest number of reflections around the diffraction, including those at floor and ceiling."""
+"""Largest number of reflections around the diffraction, floor and ceiling included."""
 
 _EXTERIOR_M = 1e-5
 """Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
@@ -64,17 +62,16 @@ _NEAR_M = 1e-3
 """Shortest leg in the plan next to an edge [m]: walls that meet there do not reflect it."""
 
 _ASIDE_M = 1e-3
-"""Distance from an edge at which a leg through walls ends: the walls that meet there are not crossed [m]."""
+"""Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
 _NEGLIGIBLE = 3e-6
 """Rough bound of diffracted paths, relative to the reflected ones of a link, below which none is listed."""
 
 _FLAT_RAD = 1e-3
-"""Walls that meet at less than this angle from a straight line form no edge [rad]."""
+"""Smallest angle between walls and a straight line at an edge [rad]."""
 
 _EDGES_AT_ONCE = 32
-"""Number of edges whose beams are held in memory together. It does not depend on the receivers, nor does the order of
-the candidates."""
+"""Number of edges whose beams are in memory together; fixed, as the order of candidates depends on it."""
 
 _VARIANTS = 4
 """Variants of paths through walls: at most one reflection at floor or ceiling."""
@@ -83,13 +80,12 @@ _VARIANTS = 4
 class _Arrivals(NamedTuple):
     """J paths from the transmitter to edges, ordered by edge.
 
-    `start` (E + 1,) gives the first of each edge, `edge` (J,) the edge, `reflections` (J,) their number, `length_m`
-    (J,) the length in the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as `unfold` writes them,
-    `material` (J, R) of those walls, `cosine` (J, R) of the angles of incidence there, `angle` (J, 4) the direction of
-    arrival as `wedge_angle` gives it, `faces` (J, 2) the cosines of the angles of incidence at 0-face and n-face, -1 in
-    the shadow, and `lit` (J,) is True where the 0-face is lit. `toward` (J, 2) are horizontal unit vectors of
-    departure, and `gain` (J,) the largest gain of the antenna there. Walls on the path leave the fraction `left` (J,)
-    of its power; `crossed` (J,) is their number.
+    `start` (E + 1,) is the first path of each edge, `edge` (J,) the edge, `reflections` (J,) their number, `length_m`
+    (J,) the length in the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as in `unfold`, `material` (J, R)
+    and `cosine` (J, R) of these walls and angles of incidence, `angle` (J, 4) the direction of arrival as in
+    `wedge_angle`, `faces` (J, 2) the cosines of incidence at 0-face and n-face, -1 in the shadow, `lit` (J,) True where
+    the 0-face is lit. `toward` (J, 2) are horizontal unit vectors of departure, `gain` (J,) the largest gain of the
+    antenna there. Walls leave the fraction `left` (J,) of the power; `crossed` (J,) is their number.
     """
 
     start: NDArray[np.int64]
@@ -112,8 +108,8 @@ class _Arrivals(NamedTuple):
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
 
-    `utd` (E, 5) are the `wedge_constants`, and `material` (E, 2) is the material of both faces where the 0-face is lit,
-    and where it is not: to Sionna RT an edge is of one shape.
+    `utd` (E, 5) are the `wedge_constants`, `material` (E, 2) is for both faces where the 0-face is lit, and where it is
+    not: for Sionna RT an edge has one shape.
     """
 
     position_m: Floats
@@ -125,7 +121,6 @@ class _Edges(NamedTuple):
 
     @classmethod
     def of(cls, wedges: Wedges, wall_material: NDArray[np.int64]) -> "_Edges":
-        """Lay out wedges for the search of paths."""
         normals, count = wedges.normal[: len(wedges.edge_m)], len(wedges.edge_m)
         face_rad = np.arctan2(-normals[:, 0, 0], normals[:, 0, 1])
         exterior_rad = (np.arctan2(normals[:, 1, 0], -normals[:, 1, 1]) - face_rad) % (2 * np.pi)
@@ -150,11 +145,11 @@ class _EdgeTask(NamedTuple):
 
 
 class _Pair(NamedTuple):
-    """The number of a pair of a beam from an edge and a receiver, and the numbers of the edge and the receiver.
+    """Numbers of a pair of a beam from an edge and a receiver, of the edge, and of the receiver.
 
-    `left` is how many more reflections a path may have, `after` the number of reflections at walls after the edge,
-    `onward_m` the length of this leg, `departure` its direction as `wedge_angle` gives it,
-    `utd` and `material` are as in `_Edges`.
+    `left` is the number of further reflections allowed, `after` the number of reflections at walls after the edge,
+    `onward_m` the length of this leg, `departure` its direction as in `wedge_angle`; `utd` and `material` as in
+    `_Edges`.
     """
 
     number: np.int32
@@ -212,7 +207,6 @@ class _EdgeCandidates:
     def _candidates(
         self, tree: BeamTree, arrivals: _Arrivals, chosen: tuple[Indices, Indices, Indices, Indices], size: int
     ) -> Candidates:
-        """Write paths of beams from edges, receivers, arrivals and variants (C,)."""
         paths = _write_joined(tree, self._edges, arrivals, chosen, self._building, trail_of(self._geometry.plan), size)
         edge, lit = arrivals.edge[chosen[2]], arrivals.lit[chosen[2]]
         wedge = np.where(lit, edge, edge + len(self._edges.position_m)).astype(np.int32)
@@ -221,10 +215,7 @@ class _EdgeCandidates:
 
 
 class DiffractionCandidates(_EdgeCandidates):
-    """All paths over one edge between opaque walls, with at most two reflections, `walls_a_side` at walls on each side.
-
-    The beams from the edges are traced on all cores.
-    """
+    """All paths over one edge between opaque walls: at most two reflections, `walls_a_side` at walls on each side."""
 
     name = "diffractions"
 
@@ -280,7 +271,6 @@ class CrossedEdgeCandidates(_EdgeCandidates):
         self._lowered = crossing.lowered
 
     def listed(self, found: Floats) -> Iterator[Listed]:
-        """List the paths that links may need whose other indirect paths have the power `found` (N,)."""
         count = len(self._wedges.edge_m)
         if not count:
             return
@@ -301,24 +291,22 @@ class CrossedEdgeCandidates(_EdgeCandidates):
         size = len(trail_of(self._building.plan).surface) + 2
         tree = _straight_lines(self._edges.position_m)
         candidates = self._candidates(tree, arrivals, (edge, rx, arrival, variant), size)
-        possible = (candidates.kind > 0).any(axis=1)  # a row without any would be a direct path once more
+        possible = (candidates.kind > 0).any(axis=1)  # an empty row would be a direct path once more
         return self._lowered(candidates.rows(np.flatnonzero(possible)))
 
 
 def _straight_lines(sources_m: Floats) -> BeamTree:
-    """Return the straight lines from sources (E, 2) as beams without reflections."""
     none = np.full(len(sources_m), -1, np.int32)
     return BeamTree(none, none, sources_m)
 
 
 @njit(cache=True)
-def _shortest_leg_m(building):  # type: ignore[no-untyped-def]
-    """Return the shortest leg next to an edge [m]."""
+def _shortest_leg_m(building):
     return 20.0 * _ASIDE_M if building.limits.walls > 0 else _NEAR_M
 
 
 @njit(cache=True)
-def _unfold_all(tree, pairs, edges, building, reflections, trail):  # type: ignore[no-untyped-def]
+def _unfold_all(tree, pairs, edges, building, reflections, trail):
     """Return whether each path reaches an edge from outside its wedge, and the columns of `_Arrivals`."""
     size, room, shortest_m = len(pairs), building.room, _shortest_leg_m(building)
     good, count, crossed = np.zeros(size, np.bool_), np.zeros(size, np.int64), np.zeros(size, np.int64)
@@ -358,8 +346,8 @@ def _unfold_all(tree, pairs, edges, building, reflections, trail):  # type: igno
 
 
 @njit(cache=True)
-def _leg_power(trail, count, building):  # type: ignore[no-untyped-def]
-    """Return a bound of the power that the walls of a leg leave, if it is horizontal, for any polarisation."""
+def _leg_power(trail, count, building):
+    """Return a bound of the power after the walls of a leg, as if it were horizontal, for any polarisation."""
     power, table = 1.0, building.materials.transmission
     for k in range(count):
         if not (trail.same_wall[k] or building.plan.low[trail.surface[k]]):
@@ -368,7 +356,7 @@ def _leg_power(trail, count, building):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped-def]
+def _to_edge(building, origin, length, total, trail):
     """Write the walls on a line from the transmitter to an edge; return the numbers of entries and of walls."""
     part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
     x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
@@ -377,8 +365,7 @@ def _to_edge(building, origin, length, total, trail):  # type: ignore[no-untyped
 
 
 @njit(cache=True)
-def _from_edge(building, origin, target, length, total, count, trail):  # type: ignore[no-untyped-def]
-    """Add the walls on a line of some length from an edge to a receiver; return as `_to_edge`."""
+def _from_edge(building, origin, target, length, total, count, trail):
     part = _ASIDE_M / length
     x, y = origin[0] + part * (target[0] - origin[0]), origin[1] + part * (target[1] - origin[1])
     done = (total - length + _ASIDE_M) / total
@@ -387,34 +374,33 @@ def _from_edge(building, origin, target, length, total, count, trail):  # type: 
 
 
 @njit(cache=True)
-def _outside(normals, x, y):  # type: ignore[no-untyped-def]
-    """Return whether a point, seen from the edge, is in front of the 0-face of a wedge, and in front of either face."""
+def _outside(normals, x, y):
+    """Return whether a point, relative to the edge, is in front of the 0-face of a wedge, and of either face."""
     first = normals[0] * x + normals[1] * y > _EXTERIOR_M
     return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
 
 
 @njit(cache=True)
-def _angle_rad(face_rad, exterior_rad, x, y):  # type: ignore[no-untyped-def]
-    """Return the angle of a direction from an edge, counted from its 0-face; rounding may turn 0 into 2 pi."""
+def _angle_rad(face_rad, exterior_rad, x, y):
+    """Return the angle of a direction from the 0-face of an edge; rounding may turn 0 into 2 pi."""
     angle = (np.arctan2(y, x) - face_rad) % (2 * np.pi)
     return 0.0 if angle > 0.5 * exterior_rad + np.pi else angle
 
 
 @njit(cache=True)
-def _media(building):  # type: ignore[no-untyped-def]
-    """Return tables of `Materials` for edges and walls, the material of floor and ceiling, and the wavelength."""
+def _media(building):
     materials = building.materials
     tables = materials.reflection, materials.transition
     return tables, materials.largest, building.room.flat_material, materials.wavelength_m
 
 
 @njit(cache=True)
-def _strength(media, arrived, face, after, terms, path):  # type: ignore[no-untyped-def]
+def _strength(media, arrived, face, after, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
-    `media` are as in `_media`. Reflections before and after the edge are materials, cosines and their number. `face` is
-    the material of the edge with the cosines of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical
-    parts of the direction, and the number of reflections at floor and ceiling.
+    `arrived` and `after` are materials, cosines and number of reflections. `face` is the material of the edge with the
+    cosines of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical parts of the direction, and the
+    number of reflections at floor and ceiling.
     """
     (tables, largest, flat, _), (boundary, sine, slope, bounces) = media, path
     material, cosine, j, count = arrived
@@ -429,7 +415,7 @@ def _strength(media, arrived, face, after, terms, path):  # type: ignore[no-unty
 
 
 @njit(cache=True, nogil=True)
-def _list_joined(task, negligible, trail):  # type: ignore[no-untyped-def]
+def _list_joined(task, negligible, trail):
     """Join arrivals at edges and departures from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
 
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
@@ -465,8 +451,7 @@ def _list_joined(task, negligible, trail):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _heights(room, size):  # type: ignore[no-untyped-def]
-    """Return the heights [m] that variants of paths to each receiver cover (N, V), -1 where there is none."""
+def _heights(room, size):
     heights = np.full((len(room.rx_m), 2 * size), -1.0)
     for rx in range(len(room.rx_m)):
         for variant in range(2 * size):
@@ -476,7 +461,7 @@ def _heights(room, size):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):  # type: ignore[no-untyped-def]
+def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):
     """Add all paths of a pair, one for each arrival and variant; return the unlisted power.
 
     Paths with a rough bound below `negligible`, which takes `most`, are not listed.
@@ -520,20 +505,19 @@ def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, 
 
 
 @njit(cache=True)
-def _constants(edges, edge):  # type: ignore[no-untyped-def]
-    """Return the `wedge_constants` of an edge."""
+def _constants(edges, edge):
     return edges.utd[edge, 0], edges.utd[edge, 1], edges.utd[edge, 2], edges.utd[edge, 3], edges.utd[edge, 4]
 
 
 @njit(cache=True)
-def _spread(wavelength, length, onward):  # type: ignore[no-untyped-def]
+def _spread(wavelength, length, onward):
     """Return the spread of the power over an edge, to be divided by the length of the path, and 2 k L."""
     spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
     return spread, 4.0 * np.pi / wavelength * length * onward / (length + onward)
 
 
 @njit(cache=True)
-def _most_of_arrivals(largest, arrivals, material, highest):  # type: ignore[no-untyped-def]
+def _most_of_arrivals(largest, arrivals, material, highest):
     """Return bounds (J, 3) of fields that arrive at edges, and of reflections at the two faces there."""
     most, one = np.empty((len(arrivals.lit), 3)), np.int64(1)
     for edge in range(len(arrivals.start) - 1):
@@ -549,8 +533,7 @@ def _most_of_arrivals(largest, arrivals, material, highest):  # type: ignore[no-
 
 
 @njit(cache=True)
-def _most_at_walls(largest, material, cosine, count, length, highest):  # type: ignore[no-untyped-def]
-    """Return a bound of the field after walls, for a path of some length that rises by `highest` at most."""
+def _most_at_walls(largest, material, cosine, count, length, highest):
     most, sine = 1.0, length / np.sqrt(length * length + highest * highest)
     for k in range(count):
         most *= most_at_wall(largest, material[k], cosine[k] * sine)
@@ -558,7 +541,7 @@ def _most_at_walls(largest, material, cosine, count, length, highest):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def _list_crossed(group, edges, arrivals, needed, building, trail):  # type: ignore[no-untyped-def]
+def _list_crossed(group, edges, arrivals, needed, building, trail):
     """List the strong paths over some edges: edge, receiver, arrival and variant (C, 4), and powers (C,)."""
     room, materials, shortest_m = building.room, building.materials, _shortest_leg_m(building)
     chosen, power, used, terms = np.empty((1024, 4), np.int32), np.empty(1024), np.int64(0), np.empty((4, 3))
@@ -608,7 +591,7 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):  # type: ign
 
 
 @njit(cache=True, nogil=True)
-def _write_joined(tree, edges, arrivals, chosen, building, trail, size):  # type: ignore[no-untyped-def]
+def _write_joined(tree, edges, arrivals, chosen, building, trail, size):
     """Write chosen beams from edges, receivers, arrivals and variants (C,); paths with too short legs stay empty."""
     node, rx, arrival, variant = chosen
     paths, room, owner = empty_paths(len(rx), size), building.room, building.plan.owner
@@ -623,7 +606,7 @@ def _write_joined(tree, edges, arrivals, chosen, building, trail, size):  # type
 
 
 @njit(cache=True, forceinline=True)
-def _join(arrivals, j, origin, target, after, onward, building, trail):  # type: ignore[no-untyped-def]
+def _join(arrivals, j, origin, target, after, onward, building, trail):
     """Write all that a whole path meets in the plan; return the number of entries, -1 if Sionna RT drops the path."""
     length, count, through_walls = arrivals.length_m[j], np.int64(0), building.limits.walls > 0
     total, reflection = length + onward, np.int64(REFLECTION)

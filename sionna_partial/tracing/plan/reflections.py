@@ -1,8 +1,8 @@
 """Paths of a floor plan without diffraction: reflections between opaque walls, and paths through walls.
 
-Both are sequences of walls from `beams.py`, unfolded into the points where each wall reflects, with every possible
-number of reflections at floor and ceiling. They differ in the power that decides which of them are verified: paths
-between opaque walls have an upper bound for any polarisation, paths through walls the power of their Jones vector.
+Sequences of walls from `beams.py` are unfolded into points of reflection, with every possible number of reflections at
+floor and ceiling. Paths between opaque walls are selected by an upper bound of their power for any polarisation, paths
+through walls by the power of their Jones vector.
 """
 
 from collections.abc import Iterator
@@ -57,15 +57,15 @@ _VARIANTS = 6
 """Variants of paths through walls: at most two reflections at floor and ceiling."""
 
 _LISTED_AT_ONCE = 200_000
-"""Number of pairs of a sequence of opaque walls and a receiver that are listed together, which limits the memory."""
+"""Number of pairs of opaque sequence and receiver that are listed together, which bounds the memory."""
 
 _PAIRS_AT_ONCE = 5_000
 """Number of pairs that one thread works on at a time."""
 
 
 @njit(cache=True)
-def unfold(tree, node, pieces_m, target, walls, bounce):  # type: ignore[no-untyped-def]
-    """Write the reflections at walls of a path: return their number, -1 without a path, and the length in the plan.
+def unfold(tree, node, pieces_m, target, walls, bounce):
+    """Write the reflections at walls of a path; return their number, -1 without a path, and the length in the plan.
 
     `walls` and `bounce` are as in `Trail`.
     """
@@ -93,17 +93,16 @@ def unfold(tree, node, pieces_m, target, walls, bounce):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def _departure(k, building, target, trail):  # type: ignore[no-untyped-def]
-    """Return the horizontal offset from the transmitter to the end of the first leg."""
+def _departure(k, building, target, trail):
     x, y = (trail.bounce[0, 0], trail.bounce[0, 1]) if k > 0 else (target[0], target[1])
     return x - building.room.tx_m[0], y - building.room.tx_m[1]
 
 
 @njit(cache=True, forceinline=True)
-def _meet(k, building, target, trail):  # type: ignore[no-untyped-def]
+def _meet(k, building, target, trail):
     """Write all that a path with `k` reflections at walls meets in the plan.
 
-    Returns the number of entries, -1 if there is no path, and the number of walls that the path goes through.
+    Returns the number of entries, -1 if there is no path, and the number of walls crossed.
     """
     count = crossed = np.int64(0)
     start, done, own = (building.room.tx_m[0], building.room.tx_m[1]), 0.0, np.int64(-1)
@@ -125,8 +124,7 @@ def _meet(k, building, target, trail):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _write_paths(tree, pairs, variants, building, trail, size):  # type: ignore[no-untyped-def]
-    """Write variants of pairs of a beam and a receiver, with `size` columns of interactions."""
+def _write_paths(tree, pairs, variants, building, trail, size):
     paths, room, owner = empty_paths(len(pairs), size), building.room, building.plan.owner
     for c in range(len(pairs)):
         target = room.rx_m[pairs[c, 1]]
@@ -146,7 +144,6 @@ class SpecularCandidates:
         self._building = Building.opaque(geometry.plan, room, materials, max_depth)
 
     def listed(self, found: Floats, *, pairs_at_once: int = _LISTED_AT_ONCE) -> Iterator[Listed]:
-        """List the candidates; none is negligible."""
         room, plan, depth = self._building.room, self._building.plan, self._building.limits.depth
         tree, pairs = trace_beams(self._building, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
         for start in range(0, len(pairs), pairs_at_once):
@@ -165,7 +162,7 @@ class SpecularCandidates:
 
 
 @njit(cache=True, nogil=True)
-def _list_variants(tree, pairs, building, trail):  # type: ignore[no-untyped-def]
+def _list_variants(tree, pairs, building, trail):
     """List every variant of pairs between opaque walls: number of the pair, variant and bound (C,)."""
     room, largest, max_depth = building.room, building.materials.largest, building.limits.depth
     rx_m, wall_material, directed = room.rx_m, building.material, len(room.gains.table) > 1
@@ -199,7 +196,7 @@ def _list_variants(tree, pairs, building, trail):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _bounds(k, length, through, building, target, least, trail, possible):  # type: ignore[no-untyped-def]
+def _bounds(k, length, through, building, target, least, trail, possible):
     """Mark the variants of a path that may have the power `least`; return whether there is any."""
     room, table, some = building.room, building.materials.reflection, False
     x, y = _departure(k, building, target, trail)
@@ -221,10 +218,10 @@ def _bounds(k, length, through, building, target, least, trail, possible):  # ty
 
 
 @njit(cache=True, nogil=True)
-def _pair_powers(tree, pair, through, building, needed, trail):  # type: ignore[no-untyped-def]
+def _pair_powers(tree, pair, through, building, needed, trail):
     """Return the power (K, V) of each variant of pairs (beam, receiver), of which walls leave at most `through` (K,).
 
-    It is 0 where there is no path that goes through a wall, or none that has the power `needed` (N,).
+    It is 0 without a path through a wall that has the power `needed` (N,).
     """
     power, possible = np.zeros((len(pair), _VARIANTS)), np.empty(_VARIANTS, np.bool_)
     for i in range(len(pair)):
@@ -243,8 +240,7 @@ def _pair_powers(tree, pair, through, building, needed, trail):  # type: ignore[
 
 
 @njit(cache=True)
-def _path_power(trail, count, length, rise, building, target):  # type: ignore[no-untyped-def]
-    """Return the power between vertical antennas of the path of a trail, with reflections at floor and ceiling."""
+def _path_power(trail, count, length, rise, building, target):
     room, total = building.room, np.hypot(length, rise.height_m)
     end = (trail.points[0, 0], trail.points[0, 1]) if count > 0 else (target[0], target[1])
     ax, ay, done = room.tx_m[0], room.tx_m[1], 0.0
@@ -277,8 +273,7 @@ def _path_power(trail, count, length, rise, building, target):  # type: ignore[n
 
 
 @njit(cache=True)
-def _normal(plan, piece):  # type: ignore[no-untyped-def]
-    """Return the unit vector across a piece of a wall."""
+def _normal(plan, piece):
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
     wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
     size = np.hypot(wx, wy)
@@ -286,8 +281,7 @@ def _normal(plan, piece):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _has_floor(interior, x, y):  # type: ignore[no-untyped-def]
-    """Return whether there is floor at a point, and ceiling."""
+def _has_floor(interior, x, y):
     column, row = int(x / interior.cell_m), int(y / interior.cell_m)
     return 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1] and interior.floor[row, column]
 
@@ -300,14 +294,13 @@ class _Paths(NamedTuple):
     power: Floats
 
     def sums(self, count: int) -> Floats:
-        """Sum up the power of each of `count` receivers."""
         return np.bincount(self.pair[:, 1], self.power, count).astype(np.float64)
 
 
 class CrossingCandidates:
-    """Paths between the transmitter and the receivers of a room that go through walls, without diffraction.
+    """Paths of a room that go through walls, without diffraction, within `Limits`.
 
-    They have at most two reflections at floor and ceiling, and are limited by `Limits`.
+    They have at most two reflections at floor and ceiling.
     """
 
     name = "paths through walls"
@@ -319,15 +312,16 @@ class CrossingCandidates:
         interior: Interior,
         settings: TraceSettings,
         materials: Materials,
+        *,
+        coarse: bool = False,
     ) -> None:
         self._geometry = geometry
         walls = FACES if geometry.plan.low.any() else settings.max_walls  # obstacles below a path are counted later
-        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1)
+        limits = Limits.of(settings, walls, directed=len(room.gains.table) > 1, coarse=coarse)
         self.building = Building.of(geometry.plan, interior, room, materials, limits)
         self.lowered = Lowered.of(geometry, self.building, settings.max_walls)
 
     def listed(self, found: Floats) -> Iterator[Listed]:
-        """List the paths that links may need whose indirect paths without walls have the power `found` (N,)."""
         tree, (pair, variant, power) = self._found(found)
         yield Listed(pair[:, 1], power, partial(self._written, tree, pair, variant), 1.0)
 
@@ -354,7 +348,6 @@ class CrossingCandidates:
         return tree, _Paths(*(np.concatenate(column) for column in zip(*listed, strict=True)))
 
     def _paths(self, tree: BeamTree, pair: NDArray[np.int32], through: Floats, needed: Floats) -> _Paths:
-        """Find the paths of pairs (beam, receiver) of which walls leave no more than `through` (K,)."""
 
         def of_pairs(start: int) -> Floats:
             rows = slice(start, start + _PAIRS_AT_ONCE)

@@ -1,9 +1,8 @@
-"""The surfaces of a floor plan, and everything that a path between two points of it meets.
+"""Surfaces of a floor plan, and all that a path between two points meets.
 
-Seen from above, a path is a sequence of straight legs between reflections at walls. It goes through the walls that a
-leg crosses, unless walls are opaque (`Limits.walls` is 0): a leg between opaque walls meets nothing. Unfolded, the
-height of a path changes linearly with its length in the plan, so that its reflections at floor and ceiling depend on
-this length alone. Obstacles end below the ceiling: a path crosses them, or runs above them.
+Seen from above, a path is a sequence of straight legs between reflections at walls. A leg crosses walls, unless walls
+are opaque (`Limits.walls` is 0): then it meets nothing. The height changes linearly with the unfolded length in the
+plan, so that reflections at floor and ceiling depend on this length alone. Paths cross obstacles or run above them.
 
 The variant of a path is twice its number of reflections at floor and ceiling, plus 1 if the first is at the ceiling.
 """
@@ -25,7 +24,7 @@ from sionna_partial.tracing.select import Limits
 from sionna_partial.tracing.walls import Interior, group_faces, is_free_between
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
-"""Surfaces by number: no surface, floor, ceiling, a vertical edge, and from `WALLS` on walls or entries of a trail."""
+"""Surfaces: none, floor, ceiling, vertical edge, and from `WALLS` on walls or entries of a trail."""
 
 FACES = 40
 """Largest number of faces of walls that a leg may cross."""
@@ -44,8 +43,8 @@ class Room(NamedTuple):
     """Surfaces around a transmitter (3,) and receivers (N, 3), in the local frame [m].
 
     The floor is at 0, the ceiling at `height_m`; `floor` and `ceiling` are True if they reflect. `wall_material` (S,)
-    and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls, `gains` the gains of the
-    transmit antenna.
+    and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls, `gains` of the transmit
+    antenna.
     """
 
     height_m: float
@@ -67,7 +66,6 @@ class Room(NamedTuple):
         material_of_face: NDArray[np.int64],
         gains: Gains = ISOTROPIC,
     ) -> "Room":
-        """Take it from a scene, whose faces have these materials."""
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
         # Contiguous: numba compiles for each layout.
@@ -76,10 +74,7 @@ class Room(NamedTuple):
 
 
 class Building(NamedTuple):
-    """A floor plan with everything that decides which paths it has.
-
-    `material` (P,) are the materials of the pieces of its walls.
-    """
+    """A floor plan, the materials (P,) of the pieces of its walls, and all else that decides its paths."""
 
     plan: Plan
     interior: Interior
@@ -90,14 +85,12 @@ class Building(NamedTuple):
 
     @classmethod
     def of(cls, plan: Plan, interior: Interior, room: Room, materials: Materials, limits: Limits) -> "Building":
-        """Look up the materials of pieces."""
         return cls(plan, interior, room, materials, room.wall_material[plan.owner], limits)
 
     @classmethod
     def opaque(cls, plan: Plan, room: Room, materials: Materials, max_depth: int) -> "Building":
-        """Return a building whose walls are opaque."""
         nothing = np.zeros((1, 1), np.bool_)
-        interior = Interior(nothing, nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
+        interior = Interior.of(nothing, nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
         return cls.of(plan, interior, room, materials, Limits(max_depth, max_depth, 0, 1.0, 0.0))
 
 
@@ -114,8 +107,7 @@ class Rise(NamedTuple):
 
 
 @njit(cache=True)
-def has_variant(variant, room):  # type: ignore[no-untyped-def]
-    """Return whether a path can meet floor and ceiling in turn as a variant has it."""
+def has_variant(variant, room):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
         return first == FLOOR
@@ -125,8 +117,7 @@ def has_variant(variant, room):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def rise_of(variant, room, target):  # type: ignore[no-untyped-def]
-    """Return the heights along a variant of a path."""
+def rise_of(variant, room, target):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
         rise = target[2] - room.tx_m[2]
@@ -139,8 +130,7 @@ def rise_of(variant, room, target):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def height_at(fraction, room, rise):  # type: ignore[no-untyped-def]
-    """Return the height of a path after a fraction of its length [m]."""
+def height_at(fraction, room, rise):
     travelled = fraction * rise.height_m
     if rise.bounces == 0 or travelled <= rise.to_first_m:
         return room.tx_m[2] + rise.up * travelled
@@ -150,13 +140,13 @@ def height_at(fraction, room, rise):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def fraction_at_turn(turn, room, rise):  # type: ignore[no-untyped-def]
-    """Return the fraction of a path's length at its reflection number `turn` at floor or ceiling, 2 if it has fewer."""
+def fraction_at_turn(turn, room, rise):
+    """Return the fraction of a path's length at reflection number `turn` at floor or ceiling; 2 if there is none."""
     return (rise.to_first_m + turn * room.height_m) / rise.height_m if turn < rise.bounces else 2.0
 
 
 @njit(cache=True)
-def merge_heights(trail, count, room, target, rise, surface, vertices, row):  # type: ignore[no-untyped-def]
+def merge_heights(trail, count, room, target, rise, surface, vertices, row):
     """Write one row in path order: the `count` entries of a trail, and the reflections at floor and ceiling."""
     entry = turn = np.int64(0)
     px, py, done = room.tx_m[0], room.tx_m[1], 0.0
@@ -181,18 +171,16 @@ def merge_heights(trail, count, room, target, rise, surface, vertices, row):  # 
 
 
 @njit(cache=True)
-def gain_of_departure(room, x, y, rise, length):  # type: ignore[no-untyped-def]
-    """Return the gain of the antenna for a path of some length in the plan that departs with a horizontal offset."""
+def gain_of_departure(room, x, y, rise, length):
     if len(room.gains.table) == 1:
         return 1.0
     return gain_towards(room.gains, x, y, rise.up * rise.height_m / max(length, 1e-9) * np.hypot(x, y))
 
 
 class Leg(NamedTuple):
-    """A straight leg from one point of a path to another [m], which are fractions of the path's length.
+    """A straight leg between two points of a path [m], at fractions `done` and `stop` of its length.
 
-    `own` and `other` are the pieces of walls that reflect it there, -1 if none does. `done` and `stop` are the
-    fractions.
+    `own` and `other` are the pieces of walls that reflect it there, -1 for none.
     """
 
     start: tuple[float, float]
@@ -206,10 +194,10 @@ class Leg(NamedTuple):
 class Trail(NamedTuple):
     """Scratch of one path in the plan: its reflections, and all interactions in order from the transmitter.
 
-    `walls` are pieces that reflect it, `bounce` the points (x, y, fraction of the length) and the cosine of incidence
-    there. `surface` are pieces of walls, `kind` Sionna RT's number of each interaction, `same_wall` whether it is at a
-    further face of a wall that has been crossed, which costs nothing, and `cosine` the cosine of incidence there;
-    `points` are (x, y, fraction of the length).
+    `walls` are reflecting pieces, `bounce` the points (x, y, fraction of the length) and the cosine of incidence. Of
+    all interactions, `surface` are pieces of walls, `kind` Sionna RT's number, `same_wall` marks further faces of a
+    wall that has been crossed, which cost nothing, `cosine` is the cosine of incidence, `points` (x, y, fraction of the
+    length).
     """
 
     walls: NDArray[np.int64]
@@ -225,7 +213,6 @@ class Trail(NamedTuple):
 
 
 def trail_of(plan: Plan) -> Trail:
-    """Make scratch for paths in a plan."""
     return Trail(
         np.empty(_REFLECTIONS, np.int64),
         np.empty((_REFLECTIONS, 4)),
@@ -241,7 +228,7 @@ def trail_of(plan: Plan) -> Trail:
 
 
 @njit(cache=True)
-def cross_leg(plan, interior, leg, count, trail):  # type: ignore[no-untyped-def]
+def cross_leg(plan, interior, leg, count, trail):
     """Add the faces that a leg crosses to `count` entries; return the number of entries, and of walls crossed.
 
     The first is -1 if there are too many, or if a wall reflects a leg that came through another face of it.
@@ -265,8 +252,8 @@ def cross_leg(plan, interior, leg, count, trail):  # type: ignore[no-untyped-def
 
 
 @njit(cache=True)
-def _faces_on(plan, leg, dx, dy, length, trail):  # type: ignore[no-untyped-def]
-    """Write the pieces that a leg crosses, in order, and its fractions there; return their number, -1 if too many."""
+def _faces_on(plan, leg, dx, dy, length, trail):
+    """Write the pieces that a leg crosses, in order, with fractions; return their number, -1 if too many."""
     (ax, ay), (bx, by) = leg.start, leg.end
     x0, y0, edge, columns, rows = plan.cells.grid
     columns, rows, n = int(columns), int(rows), 0
@@ -307,7 +294,7 @@ def _faces_on(plan, leg, dx, dy, length, trail):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _crossed_at(piece, ax, ay, dx, dy, length):  # type: ignore[no-untyped-def]
+def _crossed_at(piece, ax, ay, dx, dy, length):
     """Return the fraction of a leg at which it crosses a piece of a wall, -1 if it does not.
 
     A point on the leg's line counts as left of it, so that a line through a shared corner crosses one of its walls.
@@ -321,16 +308,15 @@ def _crossed_at(piece, ax, ay, dx, dy, length):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _cosine(plan, piece, dx, dy, length):  # type: ignore[no-untyped-def]
-    """Return the cosine of the angle of incidence of a leg, seen from above."""
+def _cosine(plan, piece, dx, dy, length):
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
     wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
     return abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
 
 
 @njit(cache=True)
-def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-untyped-def]
-    """Return whether the first or the last of the faces on a leg and the wall that reflects it there are one wall."""
+def _is_reflected_inside(plan, interior, leg, n, trail):
+    """Return whether the first or the last face on a leg and the wall that reflects it there are one wall."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
     length = np.hypot(dx, dy)
     for wall, face, t in ((leg.own, 0, 0.0), (leg.other, n - 1, 1.0)):
@@ -346,8 +332,7 @@ def _is_reflected_inside(plan, interior, leg, n, trail):  # type: ignore[no-unty
 
 
 @njit(cache=True)
-def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
-    """Return whether no leg of a path of some length in the plan is so short that Sionna RT drops the path."""
+def has_long_legs(trail, count, length):
     previous = 0.0
     for k in range(count):
         if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:
@@ -357,23 +342,21 @@ def has_long_legs(trail, count, length):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def add_entry(trail, count, piece, kind, x, y, fraction):  # type: ignore[no-untyped-def]
-    """Add a reflection or a diffraction to `count` entries of a trail; return their number."""
+def add_entry(trail, count, piece, kind, x, y, fraction):
     trail.surface[count], trail.kind[count], trail.same_wall[count] = piece, kind, False
     trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = x, y, fraction
     return count + 1
 
 
 @njit(cache=True)
-def empty_paths(count, size):  # type: ignore[no-untyped-def]
+def empty_paths(count, size):
     """Return surfaces, kinds, vertices and `same_wall` of paths (C, D), without any interaction."""
     vertices, same_wall = np.zeros((count, size, 3)), np.zeros((count, size), np.bool_)
     return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
 
 
 @njit(cache=True, forceinline=True)  # copying the arguments of a call would take longer than the function
-def write_path(trail, count, room, owner, target, variant, paths, row):  # type: ignore[no-untyped-def]
-    """Write a variant of the path of a trail as one of `empty_paths`."""
+def write_path(trail, count, room, owner, target, variant, paths, row):
     surface, kind, vertices, same_wall = paths
     rise = rise_of(variant, room, target)
     merge_heights(trail, count, room, target, rise, surface, vertices, row)
@@ -409,7 +392,7 @@ def candidates_of(
 
 @dataclass(frozen=True)
 class Lowered:
-    """Replaces walls on candidates, which all reach the ceiling, by obstacles where walls are lower.
+    """Function that lowers walls on candidates, which all reach the ceiling, to obstacles.
 
     `walls_m` (S, 2, 2) are the walls, `corners_m` (T, 3, 2) the triangles of the tops of obstacles, `lid_m`
     (T,) their heights and `lid_face` (T,) a face of each top in the scene.
@@ -424,7 +407,6 @@ class Lowered:
 
     @classmethod
     def of(cls, geometry: SceneGeometry, building: Building, max_walls: int) -> "Lowered":
-        """Take the obstacles from a scene."""
         lids, count = geometry.lids, [len(lid.triangles) for lid in geometry.lids]
         corners_m = np.concatenate([np.zeros((0, 3, 2)), *(lid.corners_m[lid.triangles] for lid in lids)])
         lid_m = np.repeat(np.array([lid.top_m for lid in lids], float), count)
@@ -453,7 +435,7 @@ class Lowered:
 
 
 @njit(cache=True)
-def _lower(kind, face, vertices, same, walls, lids, ends, interior):  # type: ignore[no-untyped-def]
+def _lower(kind, face, vertices, same, walls, lids, ends, interior):
     """Write the walls that candidates cross at their heights, in place; return the numbers (C,), -1 if too many."""
     (tx_m, targets), (walls_m, top_m) = ends, walls
     crossings, most = np.zeros(len(kind), np.int64), kind.shape[1]
@@ -483,8 +465,8 @@ def _lower(kind, face, vertices, same, walls, lids, ends, interior):  # type: ig
 
 
 @njit(cache=True)
-def _add_lids(here, there, lids, kind, face, vertices, count):  # type: ignore[no-untyped-def]
-    """Add the tops that a segment crosses to `count` entries, in order; return their number, -1 if there is no room."""
+def _add_lids(here, there, lids, kind, face, vertices, count):
+    """Add the tops that a segment crosses to `count` entries, in order; return their number, -1 if too many."""
     corners, heights, faces = lids
     first = count
     for i in range(len(heights)):
@@ -511,8 +493,7 @@ def _add_lids(here, there, lids, kind, face, vertices, count):  # type: ignore[n
 
 
 @njit(cache=True)
-def _group(face, vertices, same, span, ends, walls_m, interior):  # type: ignore[no-untyped-def]
-    """Write which of the faces that a leg crosses are further faces of a wall; return the number of walls."""
+def _group(face, vertices, same, span, ends, walls_m, interior):
     (begin, end), (here, there) = span, ends
     dx, dy = there[0] - here[0], there[1] - here[1]
     length, cosine, found = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin), np.empty(end - begin)
