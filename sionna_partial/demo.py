@@ -28,7 +28,7 @@ TRUTH, NOTHING, PARTIAL = "truth", "nothing observed", "partial map"
 def run_demo(
     out: str | PathLike[str], progress: Progress | None = None, *, home: str = "apartment", step: int = 100
 ) -> tuple[list[str], str]:
-    """Predict the coverage of a shipped home after some steps of exploration, and compare it with the truth.
+    """Predict the coverage of a shipped, partly explored home, and compare it with the truth.
 
     Return the names of the written files (`coverage` in every format, `comparison.png`, `table.txt`) and the table.
     """

@@ -73,13 +73,13 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
-"""Distance from the border of patches within which a segment is taken to run along it [cells]."""
+"""Distance from a border of patches at which a segment runs along it [cells]."""
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 """Distance from the transmitter to further windows [m]."""
 
 STEEPEST = 4.0
-"""Largest ratio of a length's growth to the growth of its smooth surrogate, for lines that touch a cell's corner."""
+"""Largest ratio of the growth of a length and its smooth surrogate, for lines that touch a corner."""
 
 _NEAREST_M = 1e-6
 """Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
@@ -113,12 +113,12 @@ class SmoothLengths:
         self._resolution_m = partial.resolution_m
 
     def __call__(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the lengths (N,) [m] between ends (N, 3) or (3,) [m]; NaN for an end that is NaN."""
+        """Return the lengths (N,) [m] between ends (N, 3) or (3,) [m]; NaN for NaN."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         return self._integrals(start_m, end_m)[:, 0] * np.linalg.norm(end_m - start_m, axis=1)
 
     def slopes(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives (N, 3) with respect to start and end; 0 where the ends coincide."""
+        """Return the derivatives (N, 3) by start and end; 0 where they coincide."""
         start_m, end_m = np.broadcast_arrays(start_m, end_m)
         integrals, step_m = self._integrals(start_m, end_m), end_m - start_m
         distance_m = np.linalg.norm(step_m, axis=1, keepdims=True)
@@ -136,7 +136,7 @@ class SmoothLengths:
 
 
 def _even_patches(mask: Bools) -> NDArray[np.int32]:
-    """Return the distance to the next uneven patch in any direction, diagonals included; 0 in uneven patches.
+    """Return the distance to the next uneven patch, diagonals included; 0 in uneven patches.
 
     A patch lies between four cell centres. It is even if their cells have one state: the interpolation is constant
     there.
@@ -177,7 +177,7 @@ def _fill_integrals(
 
 @njit(cache=True)
 def _aside(start: float, end: float) -> float:
-    """Return the step to either side of a border along which a segment runs; 0 if it does not."""
+    """Return the step to either side of a border along which a segment runs, else 0."""
     along = abs(end - start) < _BORDER_CELLS and abs(start - np.round(start)) < _BORDER_CELLS
     return 2.0 * _BORDER_CELLS if along else 0.0
 
@@ -207,7 +207,7 @@ def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment
 def _add_patch(
     corners: NDArray[np.int8], row: int, column: int, segment: Segment, here: float, there: float, sums: Floats
 ) -> None:
-    """Add the integrals between two fractions of a segment in one patch, by Simpson's rule, which is exact here."""
+    """Add the integrals over a part of a segment in one patch by Simpson's rule, which is exact."""
     corner, right, up = corners[0, 0], corners[0, 1], corners[1, 0]
     twist = corners[1, 1] - right - up + corner
     width = there - here
@@ -309,7 +309,7 @@ class DifferentiableScene:
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Return the names of the M radio materials, in the order of the arguments of `DifferentiableLinks`."""
+        """Return the names of the M radio materials, in the order of arguments."""
         return self.simulation.materials
 
     @property
@@ -427,7 +427,7 @@ class DifferentiableLinks:
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return mean and standard deviation (N,) of the traced gain over unknown materials and residuals [dB]."""
+        """Return mean and standard deviation (N,) [dB] of the traced gain over unknown materials."""
         extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
         if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
             materials = WallMaterials.at(float(self.base.frequency_hz))
@@ -524,7 +524,7 @@ class _Legs:
         self.strongest[self.rx[weakest_first]] = weakest_first
 
     def moved_m(self, lengths: SmoothLengths, tx_m: Any, vertices_m: Any) -> Any:
-        """Return the lengths (Q,) in unknown cells for a transmitter at `tx_m` and vertices (P, D, 3) [m]."""
+        """Return the lengths (Q,) [m] for a transmitter at `tx_m` and vertices (P, D, 3) [m]."""
         vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
         nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
@@ -538,7 +538,7 @@ def _gain_db(power: Any) -> Any:
 
 
 def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return power (P,) and vertices (P, D, 3), 0 where there are none, for `given` float64 `PARAMETERS`."""
+    """Return power (P,) and vertices (P, D, 3), 0 where there are none, for `given` `PARAMETERS`."""
 
     @tf.custom_gradient
     def evaluate(*tensors: Any) -> tuple[tuple[Any, Any], Callable[..., list[Any]]]:
@@ -569,7 +569,7 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
 
 
 def _pulled(slopes: Floats, upstream: Any) -> Any:
-    """Sum (K,) of slopes (P, K) times upstream derivatives (P,), in an order that does not depend on threads."""
+    """Sum (K,) slopes (P, K) times upstream derivatives (P,), in an order independent of threads."""
     rows = tf.convert_to_tensor(upstream)[:, None] * slopes
     return tf.math.unsorted_segment_sum(rows, np.zeros(len(slopes), dtype=np.int32), 1)[0]
 
@@ -580,7 +580,7 @@ def _once_only(slopes: Any) -> Any:
 
 
 def moved_lengths_m(lengths: SmoothLengths, exact_m: Floats, base: tuple[Floats, Floats], ends: tuple[Any, Any]) -> Any:
-    """Return lengths (N,) in cells of one kind that change in proportion to smooth ones when the segments move.
+    """Return lengths (N,) that change in proportion to smooth ones when the segments move.
 
     `exact_m` [m] are the lengths at the ends `base` (N, 3), and `ends` are the present ones [m]. Lengths of 0 remain 0.
     """

@@ -20,11 +20,11 @@ THUMBNAIL_PX = 640
 _FEW = 4
 
 WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
-"""Delay of a bar in a call and in a command, and time between lines of a command without a terminal [s]."""
+"""Delays of bars in calls and commands, and time between lines without a terminal [s]."""
 
 
 def later(name: str) -> Any:
-    """Return a function of a later room, such as "plots.style:plot_map", that is imported when it is called."""
+    """Return a function such as "plots.style:plot_map" that is imported when it is called."""
     with optional_packages():
         return resolve_name(f"sionna_partial.{name}")
 
@@ -98,7 +98,7 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
 
 @contextmanager
 def counting(progress: CountProgress | bool | None, unit: str, *, command: bool = False) -> Iterator[CountProgress]:
-    """Open a receiver of counts of `unit` (plural); the count of the first report is not part of the rate."""
+    """Open a receiver of counts of `unit` (plural); the rate excludes the first count."""
     if callable(progress):
         yield progress
         return

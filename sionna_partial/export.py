@@ -25,7 +25,7 @@ TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
 """Variables in CSV and GeoTIFF; only pictures need `wall_parts`."""
 
 MAX_BYTES, MAX_ARRAY_BYTES = 500_000_000, 4_000_000_000
-"""Largest file that is read, and largest size of its arrays [bytes]."""
+"""Largest file that is read, and its largest arrays [bytes]."""
 
 LINK_STATES = ("link_state", "partial_link_state")
 
@@ -206,7 +206,7 @@ def _encode_geotiff(coverage: xr.Dataset, names: Sequence[str] = TABLE_VARIABLES
 
 
 def _bands(coverage: xr.Dataset, names: Sequence[str]) -> dict[str, xr.DataArray]:
-    """Return variables by name and by transmitter; link states are NaN where no receiver can be."""
+    """Return variables by name and transmitter; link states are NaN without receiver."""
     bands = {}
     for name in names:
         layer = coverage[name].astype(np.float32)

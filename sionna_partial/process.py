@@ -81,7 +81,7 @@ def end_at_signals() -> None:
 
 @contextmanager
 def signals_held() -> Iterator[None]:
-    """Delay signals, which would interrupt an import of a native library or a move of files."""
+    """Delay signals during an import of a native library or a move of files."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -146,7 +146,7 @@ def core_count() -> int:
 
 
 def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> Iterator[_Result]:
-    """Yield ``function(item)`` in the order of the items, computed by a thread per core, at most two items ahead."""
+    """Yield ``function(item)`` in order, by a thread per core, at most two items per core ahead."""
     waiting: deque[Future[_Result]] = deque()
     with ThreadPoolExecutor(core_count()) as pool:
         try:
@@ -184,7 +184,7 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
 
 
 def _outdated_by_others(compiled: Any) -> Any:
-    """Invalidate cached code when any compiled module changes: numba checks only the module of the function.
+    """Invalidate cached code when any compiled module changes: numba checks only one.
 
     A full disk only prevents caching.
     """
@@ -210,7 +210,7 @@ def _compiled_sources() -> str:
 
 
 def _private_folder() -> str:
-    """Return a folder that only this user can write to, because cached code is executed; "" if there is none."""
+    """Return a folder that only this user can write to, as cached code is executed; "" without."""
     with suppress(OSError):
         folder = Path(tempfile.gettempdir()) / f"sionna-partial-numba-{os.getuid()}"
         folder.mkdir(0o700, exist_ok=True)

@@ -100,7 +100,7 @@ def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
 
 
 def markdown_table(header: Sequence[str], rows: Iterable[Sequence[str]], *, names: int = 1) -> str:
-    """Return an aligned Markdown table: the first `names` columns to the left, figures to the right."""
+    """Return a Markdown table, the first `names` columns to the left, figures to the right."""
     cells = [list(header), *map(list, rows)]
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     sides = [str.ljust] * names + [str.rjust] * (len(widths) - names)

@@ -216,6 +216,7 @@ class TestPredict:
         titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
         assert titles == ["Transmitter:", "Radio:", "Walls:", "Map:", "Output:", "Options:"]
         assert text.index("Transmitter:") < text.index("--power") < text.index("Radio:") < text.index("--frequency")
+        assert "--tx X Y [Z]" in text
 
     @pytest.mark.parametrize(
         ("text", "frequency_hz"),
@@ -325,20 +326,15 @@ class TestMap:
             assert line.startswith("warning: ")
             assert word in line
 
-    def test_axis_and_height_band_of_a_cloud(self, tmp_path: Path) -> None:
-        points_m = np.random.default_rng(0).uniform((0, 0, 0), (3.1, 3, 0.5), (4000, 3))
-        points_m[:2000, 0] = 0.0
-        np.savetxt(tmp_path / "cloud.xyz", points_m)
-        maps = [load_map(tmp_path / "cloud.xyz", up="y", height_band_m=band) for band in ((2.5, 2.9), None)]
-        assert maps[0] != maps[1]
-        options = ["--up", "y", "--height-band", 2.5, 2.9]
-        result = run("export-scene", tmp_path / "cloud.xyz", "--out", tmp_path / "scene", *options)
-        assert result.exit_code == 0, result.output
-        assert load_map(tmp_path / "scene") == maps[0]
-
-    def test_wall_height(self, map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        words = ["export-scene", map_path, "--out", tmp_path / "scene", "--wall-height", 2.7]
-        assert arguments_of(monkeypatch, "export_scene", *words)["partial"] == load_map(map_path, wall_height_m=2.7)
+    def test_options_arrive(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        words = "--strict --up y --height-band 2.5 2.9 --wall-height 2.7 --unit 0.01 --storey EG --resolution 0.1"
+        words += " --obstacle-height 1.2 --wall-layer A --material-of A=brick"
+        command = ["export-scene", "scan.xyz", "--out", tmp_path / "scene"]
+        found = arguments_of(monkeypatch, "load_map", *command, *words.split())
+        expected = {"strict": True, "up": "y", "height_band_m": (2.5, 2.9), "wall_height_m": 2.7, "unit_m": 0.01}
+        expected |= {"storey": "EG", "resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
+        expected["layer_materials"] = {"A": Material.named("brick")}
+        assert {name: found[name] for name in expected} == expected
 
 
 class TestExportScene:
@@ -388,17 +384,10 @@ class TestInfo:
             assert f"{missing}: install sionna-partial again." in result.stdout
 
 
-class TestHelp:
-    def test_version(self) -> None:
-        assert run("--version").stdout == f"{__version__}\n"
-
-    def test_package_is_a_command(self) -> None:
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-        command = [sys.executable, "-m", "sionna_partial", "--version"]
-        assert subprocess.check_output(command, env=environment, text=True, timeout=600) == f"{__version__}\n"
-
-    def test_position_is_shown_as_it_is_typed(self) -> None:
-        assert "--tx X Y [Z]" in run("predict", "--help").stdout
+def test_version_of_the_package_as_a_command() -> None:
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    command = [sys.executable, "-m", "sionna_partial", "--version"]
+    assert subprocess.check_output(command, env=environment, text=True, timeout=600) == f"{__version__}\n"
 
 
 OPTIONS = [

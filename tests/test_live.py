@@ -88,15 +88,6 @@ class TestOrder:
 
 
 class TestMaps:
-    def test_costs_lie_on_the_cells_of_the_message(self) -> None:
-        heard = Heard(threshold_db=-60.0)
-        heard.live.on_map(message(grown()))
-        heard.step()
-        cost, sent = heard[-1].cost, heard[-1].message()
-        assert cost.shape == (4, 5)
-        assert (cost == -1).tolist() == (np.array(grown()) == 100).tolist()
-        assert (sent["info"]["width"], sent["info"]["height"], len(sent["data"])) == (5, 4, 20)
-
     @pytest.mark.parametrize("yaw", [0.0, 0.5, -2.5])
     def test_costs_of_turned_maps_are_those_at_the_cells(self, yaw: float) -> None:
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])

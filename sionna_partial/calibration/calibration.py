@@ -47,7 +47,7 @@ _log = logging.getLogger(__name__)
 
 
 LEAST_OFFSET_DB, FEWEST_DIRECT = 6.0, 3
-"""Median error of LOS links that no material explains [dB], and number of links that show it."""
+"""Smallest median error of LOS links that no material explains [dB], and number of such links."""
 
 _NUMBERS = (
     *("permittivity", "permittivity_std", "conductivity_s_m", "conductivity_std_s_m", "loss", "noise_db", "offset_db"),
@@ -64,8 +64,7 @@ OUTAGE = "measured outage"
 _NO_MATERIAL = "that shows a material: measure links that walls reflect, and trace with max_depth of 1 or more."
 
 _REFLECTING = Material(10.0, 1.0)
-"""Material of the trace that finds paths: everything reflects well, so that no path is missing for a better material.
-"""
+"""Material of the trace that finds paths: no reflection is too weak."""
 
 
 @read_only
@@ -309,7 +308,7 @@ def calibrate_materials(
 
 @dataclass(frozen=True)
 class _Fit:
-    """Steps to the most probable materials, the chosen materials, and their posteriors; deviations are (2, M)."""
+    """Steps of the search, chosen materials, and their posteriors; deviations are (2, M)."""
 
     steps: list[Point]
     point: Point

@@ -28,26 +28,23 @@ MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0
 """Candidates for the parameters of GainErrors."""
 
 MISSED_DB, BLOCKED_DB = 8.0, 12.0
-"""Mean excess of links with missed paths, and mean loss of links with blocked paths [dB]."""
+"""Mean excess of links with missed paths, mean loss of links with blocked paths [dB]."""
 
 STRAY_FRACTION = 0.01
-"""Fraction of LOS links that deviate either way, and smallest fraction of the others."""
+"""Fraction of LOS links that deviate either way; smallest fraction of other links."""
 
 EXPECTED_NOISE_DB, NOISE_SPREAD, MEAN_FRACTION = 3.0, 0.7, 0.5
-"""Prior: median of the noise [dB], standard deviation of its logarithm, and mean of the fractions."""
+"""Prior: median noise [dB], standard deviation of its logarithm, mean of the fractions."""
 
 LOSSLESS = np.array([[1.0], [0.0]])
-"""Relative permittivity and conductivity [S/m] of the vacuum; the excess of a material is positive and has a logarithm.
-"""
+"""Relative permittivity and conductivity [S/m] of the vacuum; the excess over it has a logarithm."""
 
 INCOMPLETE_WEIGHT = 0.35
-"""Power of the likelihood on incomplete maps, where the errors of links are correlated; 90 % intervals then cover on
-procedural homes."""
+"""Power of the likelihood on incomplete maps, where errors of links are correlated."""
 
 PRIOR_MEDIAN, PRIOR_SPREAD = np.array([[2.5], [0.15]]), np.array([[0.9], [1.8]])
 """Prior: median of permittivity less 1 and of conductivity [S/m], and standard deviation of their logarithms: 95 %
-between 1.4 and 16, and 0.004 and 5 S/m (building materials of ITU-R P.2040-3 at 28 GHz: 1.5 to 7.1, and 0.04 to 0.63
-S/m)."""
+between 1.4 and 16, and 0.004 and 5 S/m, around the building materials of ITU-R P.2040-3 at 28 GHz."""
 
 IMPEDANCE_OHM = 376.73
 """Impedance of the vacuum."""
@@ -56,25 +53,25 @@ LOWEST_GAIN_DB = -300.0
 """Predicted gain of a link whose paths all vanish [dB]."""
 
 TYPICAL_DEG, TYPICAL_LOSS_DB = np.arange(0.0, 80.0, 2.5), 30.0
-"""Angles of incidence at which reflections are compared [degrees], and the largest relevant loss [dB]."""
+"""Angles at which reflections are compared [degrees], and largest relevant loss [dB]."""
 
 INDEX_RANGE, FINE_INDEX = (1.01, 6.0), 3.4
-"""Range of searched refractive indices, and the index up to which fringes are resolved."""
+"""Range of searched refractive indices, and largest index with resolved fringes."""
 
 FRINGE_CELLS, FINEST_FRINGE_CELLS, COARSE_CELLS = 14, 60, 29
-"""Cells per fringe at the begin and end of the search; cells where there are no fringes."""
+"""Cells per fringe at the begin and end of the search, and without fringes."""
 
 SPLIT_FRACTION, HEAVY_FRACTION, MOST_CELLS = 0.004, 0.02, 600
-"""Fraction of the posterior above which a cell is divided until it is small, and in any case; number of added cells."""
+"""Fractions of the posterior above which a cell is divided until small, and in any case; number of added cells."""
 
 MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
-"""Number of fringes with a search for minima, of steps in each, and of fringes that are descended to the end."""
+"""Number of fringes that are searched, of steps in each, and of fringes that are descended to the end."""
 
 CELLS_A_REPORT = 64
 """Number of cells between reports of progress."""
 
 KEPT_FRACTION = 0.96
-"""Fraction of the power of each link that the kept paths have, for all `EXTREMES`."""
+"""Fraction of a link's power on the kept paths, for all `EXTREMES`."""
 
 EXTREMES = tuple((permittivity, loss) for permittivity in (1.2, 3.0, 8.0, 30.0) for loss in (0.0, 0.03, 3.0))
 """Extreme materials: relative permittivity, and its imaginary part."""
@@ -112,13 +109,13 @@ class LinkPaths:
         return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
 
     def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
-        """Return |a|^2 of each path (P,), and its derivatives (P, 2 M) by permittivities, then conductivities."""
+        """Return |a|^2 (P,), and its derivatives (P, 2 M) by permittivities, then conductivities."""
         parameters = self._parameters(permittivity, conductivity_s_m)
         slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
         return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
 
     def strong(self) -> Bools:
-        """Return which paths (P,) have `KEPT_FRACTION` of the power of their link for some of `EXTREMES`."""
+        """Return which paths (P,) have `KEPT_FRACTION` of a link's power for some of `EXTREMES`."""
         strong, ones = np.zeros(len(self.link), dtype=bool), np.ones(len(self.columns))
         scale_s_m = 2.0 * np.pi * float(self.paths.base.frequency_hz) * VACUUM_F_M
         for permittivity, loss in EXTREMES:
@@ -134,7 +131,7 @@ class LinkPaths:
 
 
 def link_gains_db(power: Floats, link: NDArray[np.int64], links: int) -> Floats:
-    """Return the gain of N links [dB] from the power of their paths (P,); -inf without paths."""
+    """Return the gains (N,) [dB] from the power of the paths (P,); -inf without paths."""
     with np.errstate(divide="ignore"):
         return 10.0 * np.log10(np.bincount(link, weights=power, minlength=links))
 
@@ -168,7 +165,7 @@ class GainErrors:
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
     def curve(self, error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[Floats, Floats, Floats]:
-        """Return the negative logarithm of the density of errors (N,) [dB], and its first and second derivatives."""
+        """Return the negative log density of errors (N,) [dB], and its first and second derivatives."""
         noise_db = np.sqrt(self.noise_db**2 + np.asarray(variance))
         parts = _log_densities(error_db, noise_db)
         fraction = _fractions(is_direct, self.missed_fraction, self.blocked_fraction)
@@ -194,7 +191,7 @@ _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 
 
 def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[GainErrors, float]:
-    """Return the most probable density of errors (N,) [dB], and its negative log likelihood with the prior's.
+    """Return the most probable density of errors (N,) [dB], and its negative log posterior.
 
     The variance [dB^2] of means of repeated measurements is in addition to the noise of the link.
     """
@@ -221,11 +218,11 @@ _MIXTURES = [
     np.stack([_fractions(np.array([direct]), *fractions)[:, 0] for fractions in chosen])
     for direct, chosen in ((True, _ALL_FRACTIONS[:1]), (False, _ALL_FRACTIONS))
 ]
-"""Fractions of noise alone, missed and blocked paths: LOS (1, 3), and NLOS (15, 3)."""
+"""Fractions of noise, missed and blocked paths: LOS (1, 3), NLOS (15, 3)."""
 
 
 def _log_densities(error_db: Floats, noise_db: float | Floats) -> Floats:
-    """Return the logarithms (3, ..., N) of the densities of noise alone, and with an exponential added either way."""
+    """Return the log densities (3, ..., N) of noise, and with an exponential added either way."""
     parts = [-0.5 * (error_db / noise_db) ** 2 - np.log(noise_db * math.sqrt(2.0 * math.pi))]
     for error, mean_db in ((error_db, MISSED_DB), (-error_db, BLOCKED_DB)):
         ratio = noise_db / mean_db
@@ -288,7 +285,7 @@ class Posterior(Shown):
 
 
 class MaterialTarget:
-    """Misfit of materials to measured gains (N,) [dB] of links with paths; `weight` is the power of the likelihood.
+    """Misfit of materials to measured gains (N,) [dB]; `weight` is the power of the likelihood.
 
     With `has_offset` all gains have an unknown offset, estimated from LOS links.
     """
@@ -319,7 +316,7 @@ class MaterialTarget:
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
 
     def slopes(self, point: Point) -> tuple[Floats, Floats]:
-        """Return gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms, by Sionna RT and Dr.Jit."""
+        """Return gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms."""
         link, count = self.paths.link, len(self.gain_db)
         power, slopes = self.paths.slopes(*point.values)
         total = np.maximum(np.bincount(link, weights=power, minlength=count), 1e-30)
@@ -361,7 +358,7 @@ def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: 
 
 
 def prior_loss(values: Floats) -> float:
-    """Return the negative logarithm of the prior density of log materials (2, M), up to a constant."""
+    """Return the negative log prior of log materials (2, M), up to a constant."""
     return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
 
 
@@ -460,7 +457,7 @@ def search(
 
 
 def _coarser_neighbours(cells: Floats, chosen: Bools) -> Bools:
-    """Return which cells (K,) touch a chosen one and are wider, and which are higher: a ridge may continue there."""
+    """Return which cells (K,) beside a chosen one are wider, and higher: a ridge may continue there."""
     distance = np.abs(cells[:2, :, None] - cells[:2, None, chosen])
     own, other = cells[2:, :, None], cells[2:, None, chosen]
     near = (distance < 0.51 * (own + other)).all(axis=0)
@@ -475,7 +472,7 @@ def _divided(cells: Floats, index_parts: int, log_parts: int) -> Floats:
 
 
 def _first_cells(thickness_m: float, fringe: float) -> Floats:
-    """Return cells of the plane: fine in the index where slabs interfere with themselves, coarse where they absorb."""
+    """Return cells of the plane: fine in the index where slabs interfere, coarse where they absorb."""
     scale = lossless_scale_s_m(2.0, thickness_m)
     levels = np.log(scale * np.array([0.03, 0.5, 1.4, 3.0, 6.0, 15.0, 50.0, 300.0, 1e4, 1e7]))
     edges = np.concatenate([levels[:1] - 2.0, 0.5 * (levels[1:] + levels[:-1]), levels[-1:] + 2.0])

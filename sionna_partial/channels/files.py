@@ -45,7 +45,7 @@ _AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
     **{"a": ("c", ((*_PAIR, "path"),)), "delay_s": ("f", (("link", "path"), (*_PAIR, "path")))},
     "h": ("c", ((*_PAIR, "frequency"), (*_PAIR, "tap"))),
 }
-"""Kinds of dtypes, and allowed axes, of the variables of channels."""
+"""Kinds of dtypes and allowed axes of variables."""
 
 _ATTRIBUTES = ("frequency_hz", "power_tolerance_db", "synthetic_array", "normalize_delays", "bandwidth_hz")
 

@@ -20,13 +20,13 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
 
 DECORRELATION_M = 1.0
-"""Decorrelation length of the field [m]: its correlation is exp(-(d / DECORRELATION_M)^2 / 2)."""
+"""Decorrelation length d0 of the field [m], with the correlation exp(-(d / d0)^2 / 2)."""
 
 KNOWN_WEIGHT = 0.1
 """Weight of a known cell; unknown cells have weight 1."""
 
 OWN_VARIANCE = 0.1
-"""Fraction of a latent's variance that no other link shares. All three are fitted by `benchmarks/joint_links.py`."""
+"""Fraction of a latent's variance that is not shared. `benchmarks/joint_links.py` fits all three."""
 
 _CELL_M, _MOST_CELLS = 0.35, 4096
 _POINTS = 48
@@ -35,17 +35,17 @@ _FEWEST_DRAWS, _LINKS_AT_ONCE = 64, 1000
 
 @dataclass(frozen=True, eq=False)
 class JointLatents:
-    """Standard normal latents of links on a map, correlated for links through the same unknown cells."""
+    """Standard normal latents of links, correlated for links through the same unknown cells."""
 
     partial: PartialMap
 
     def correlation(self, tx_m: Floats, rx_m: Floats) -> Floats:
-        """Return the correlation (L, L) of the latents of links between `tx_m` (L, 3) and `rx_m` (L, 3) [m]."""
+        """Return the correlation (L, L) of links between `tx_m` (L, 3) and `rx_m` (L, 3)."""
         smooth = np.concatenate([*self._smoothed(tx_m, rx_m)])
         return (1.0 - OWN_VARIANCE) * (smooth @ smooth.T) + OWN_VARIANCE * np.eye(len(smooth))
 
     def quantiles(self, tx_m: Floats, rx_m: Floats, count: int, seeds: list[list[int]]) -> Floats:
-        """Draw `count` quantiles (F, count, L) in (0, 1) from F fields, evenly spread for each link."""
+        """Draw `count` evenly spread quantiles (F, count, L) in (0, 1) from F fields."""
         if not len(tx_m):
             return np.zeros((len(seeds), count, 0))
         draws = max(count, _FEWEST_DRAWS)
@@ -60,7 +60,7 @@ class JointLatents:
     def draw(
         self, links: LinkPrediction, tx_m: Floats, rx_m: Floats, count: int, seed: list[int]
     ) -> tuple[States, Floats]:
-        """Draw states and gains (count, T, N) [dB] of predicted links (T, N) from `tx_m` (T, 3) to `rx_m` (N, 3)."""
+        """Draw states and gains (count, T, N) [dB] of predicted links (T, N)."""
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         quantiles = self.quantiles(*ends, count, [[*seed, 0], [*seed, 1]])
         return states_and_gains(links, *quantiles.reshape(2, count, len(tx_m), len(rx_m)))
@@ -84,7 +84,7 @@ class JointLatents:
         return KNOWN_WEIGHT + unknown.reshape(ny, step, nx, step).mean(axis=(1, 3)).ravel()
 
     def _smoothed(self, tx_m: Floats, rx_m: Floats) -> Iterator[Floats]:
-        """Return the weights on white noise in the cells of the field, of unit norm, some links at a time."""
+        """Return weights of unit norm on white noise in the cells of the field, some links at a time."""
         edge_m = self._step * self.partial.resolution_m
         along = (np.arange(_POINTS)[:, None] + 0.5) / _POINTS
         limit = np.array(self._shape)[::-1] - 1

@@ -1,4 +1,4 @@
-"""Channel responses of links with antenna arrays: impulse and frequency responses, taps, spreads and gains of beams."""
+"""Channel responses between antenna arrays: impulse and frequency responses, taps, spreads, beams."""
 
 import itertools
 import logging
@@ -30,19 +30,19 @@ BLOCK_BYTES = 4_000_000
 """Size of coefficients that are computed together, to fit caches [bytes]."""
 
 WORK_BYTES = 100_000_000
-"""Approximate memory of functions of delays, or of beams of paths, that are computed together [bytes]."""
+"""Approximate memory of functions of delays, or of beams, that are computed together [bytes]."""
 
 UPRIGHT = 1e-3
-"""Largest change of the direction's vertical part at which an edge counts as vertical."""
+"""Largest change of the direction's vertical part at a vertical edge."""
 
 FIRST_TAP, MORE_TAPS = -6, 6
-"""Default first tap, and number of taps after the longest path: the sinc filter is 5 % at the sixth tap."""
+"""Default first tap, and taps after the longest path: the sinc filter is 5 % at the sixth."""
 
 PATHS_AT_ONCE = 20_000
 """Largest number of paths with beams that are computed together."""
 
 _BEAM_BYTES, _PAIR_BYTES = 32, 48
-"""Memory of a beam of a path, and of a pair of beams of a link [bytes]."""
+"""Memory of a beam of a path, and of a pair of beams [bytes]."""
 
 MAX_WEIGHT = 1e6
 """Largest magnitude of a weight: powers have single precision."""
@@ -98,7 +98,7 @@ class ArrayPaths:
 
     @cached_property
     def first(self) -> Indices:
-        """Return the first path of each link, and the number of all paths: (links + 1,)."""
+        """Return the first path of each link, and the number of paths: (links + 1,)."""
         return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
 
     @property
@@ -118,7 +118,7 @@ class ArrayPaths:
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
 
     def spans(self, paths_at_once: int) -> Iterator[tuple[slice, slice, Indices]]:
-        """Yield slices of links, of their paths, and the first path of each link among these, with the end."""
+        """Yield slices of links and of their paths, and the first path of each link in the slice."""
         start = 0
         while start < self.links:
             stop = int(np.searchsorted(self.first, self.first[start] + paths_at_once, side="right")) - 1
@@ -150,12 +150,12 @@ class ArrayPaths:
         return Block(links, first, a.reshape(len(a), len(self.rx), len(self.tx)), delay_s)
 
     def _carrier(self, delay_s: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
-        """Return exp(-j 2 pi f delay); with delays of single precision it is rounded as in Sionna RT."""
+        """Return exp(-j 2 pi f delay); single precision is rounded as in Sionna RT."""
         per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.trace_settings.frequency_hz)
         return phasors(per_second * delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
-        """Return gains from pattern to pattern (P, K_rx, K_tx), and phases at the positions of both arrays."""
+        """Return gains between patterns (P, K_rx, K_tx), and phases at the antennas of both arrays."""
         radians = 2.0 * np.pi * self.paths.trace_settings.frequency_hz / SPEED_OF_LIGHT_M_S
         at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
         return self._gains(rows), at_rx, at_tx
@@ -173,7 +173,7 @@ class ArrayPaths:
         return at_rx_m, self.tx.advance_m(np.asarray(each.departure_rad[rows]), each.path_tx[rows])
 
     def _longer_m(self, rows: slice) -> Floats:
-        """Return the extra length of paths between antenna positions (P, A_rx, A_tx) over the centres [m].
+        """Return the extra length (P, A_rx, A_tx) [m] of paths between antennas over the centres.
 
         A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
         transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: the path is straight in
@@ -198,7 +198,7 @@ class ArrayPaths:
 
 
 def with_every_path(links: "TracedLinks") -> "TracedLinks":
-    """Return the links with the paths that the default tolerance omits, traced once for the same links."""
+    """Return the links with all paths that the default tolerance omits, traced once."""
     settings = links.trace_settings
     if links._partial is None:
         if settings.power_tolerance_db:
@@ -238,7 +238,7 @@ def _after_shortest(delay_s: Floats, first: Indices) -> Floats:
 
 @dataclass(frozen=True)
 class Block:
-    """Coefficients (P, antennas of rx, of tx) of the paths of some links, and delays of that shape or (P, 1, 1).
+    """Coefficients (P, A_rx, A_tx) of the paths of some links, and delays of that shape or (P, 1, 1).
 
     The paths of link i are `first[i]` to `first[i + 1]`.
     """
@@ -249,7 +249,7 @@ class Block:
     delay_s: Floats
 
     def fill(self, a: NDArray[np.complex64], delay_s: Floats) -> None:
-        """Fill arrays (links, paths, antennas of rx, of tx); the array of delays may be (links, paths)."""
+        """Fill arrays (links, paths, A_rx, A_tx); delays may be (links, paths)."""
         count = np.diff(self.first)
         link = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
@@ -308,7 +308,7 @@ class Unfolded:
         return cls(before, mirrored.transpose(0, 2, 1), to_tx_m, length_m[:, None] * leaving, split, upright)
 
     def longer_at_edges_m(self, split: Indices, rx_moved_m: Floats, tx_moved_m: Floats) -> Floats:
-        """Return the extra length (P, A_rx, A_tx) [m] of paths `split` for displaced ends (P or 1, 3, A)."""
+        """Return the extra length (P, A_rx, A_tx) [m] of paths `split` for displaced ends."""
 
         def from_edge(to_m: Floats, moved_m: Floats) -> tuple[Any, Any]:
             x, y, z = np.moveaxis(to_m[split, :, None] + moved_m, 1, 0)
@@ -396,13 +396,13 @@ def taps(
 
 
 _VALUE_BYTES, _AXIS_BYTES = 48, 40
-"""Memory of a value of a function of a delay, and of a value of an axis with its index [bytes]."""
+"""Memory of a value of a function of a delay, and of a value of an axis [bytes]."""
 
 
 def _filtered(
     arrays: ArrayPaths, kernel: Callable[[Floats, slice], NDArray[Any]], size: int, what: str, memory_gb: float
 ) -> NDArray[np.complex64]:
-    """Sum the paths of each link, weighted by `kernel` of their delay: (links, A_rx, A_tx, size)."""
+    """Sum the paths of each link, weighted by `kernel` of delays: (links, A_rx, A_tx, size)."""
     pairs = len(arrays.rx) * len(arrays.tx)
     delays = max(1, arrays.most if arrays.synthetic_array else pairs)
     at_once = min(size, max(1, WORK_BYTES // (_VALUE_BYTES * delays)))
@@ -545,7 +545,7 @@ def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.c
 def _factors(
     arrays: ArrayPaths, rows: slice, at_rx: NDArray[np.complex64], at_tx: NDArray[np.complex64]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return factors of receive beams (P, M, B) and transmit beams (P, M, C): powers are their products, summed over M.
+    """Return factors of receive (P, M, B) and transmit beams (P, M, C): power is the sum of products over M.
 
     Pattern k of the receiver excites a beam by u_k at the receiver and v_k at the transmitter. The power
     |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).

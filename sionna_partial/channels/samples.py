@@ -39,7 +39,7 @@ UNSEEN = 255
 MOST_DRAWS = 10_000
 
 RANGE_DB = 30.0
-"""Traced paths this much weaker than the strongest indirect one of an uncertain link are omitted [dB]."""
+"""Traced paths this much weaker than the strongest of an uncertain link are omitted [dB]."""
 
 _COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
 _NO_VERTICES = np.zeros((0, 1, 3))
@@ -89,7 +89,7 @@ class ChannelSamples(Shown):
 
     @cached_property
     def drawn(self) -> TracedLinks:
-        """Return all draws: the paths of draw k and transmitter t have transmitter number ``k * T + t``.
+        """Return all draws; draw k of transmitter t has transmitter number ``k * T + t``.
 
         Raises
         ------
@@ -237,7 +237,7 @@ def sample_channels(
 
 
 class _Draws:
-    """n draws of L links of all transmitters: `state` and `gain_db` (n, L), and their paths."""
+    """n draws of L links: `state` and `gain_db` (n, L), and their paths."""
 
     def __init__(
         self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
@@ -305,7 +305,7 @@ class _Draws:
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Return the paths of some draws: of certain links, surviving and direct ones, and of analogues."""
+        """Return the paths of some draws: certain links, surviving and direct paths, analogues."""
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
@@ -343,7 +343,7 @@ class _Draws:
         return paths[kept], at[kept], power[kept]
 
     def _analogues(self, draws: Indices, state: States, gain_db: Floats, survivors: Floats) -> Indices:
-        """Return analogues (D, U) of the U uncertain links in some draws; -1 in an outage."""
+        """Return analogues (D, U) of U uncertain links; -1 in outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):
             row, link = np.nonzero(state == each)

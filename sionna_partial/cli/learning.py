@@ -26,7 +26,7 @@ DEFAULT_HOMES = 100
 """Default number of procedural homes."""
 
 FIRST_SEED = 20_000
-"""Seed of the first procedural home, outside the training seeds of the shipped predictor (`make predictor`)."""
+"""First seed, outside the training seeds of the shipped predictor (`make predictor`)."""
 
 _DATASET_HELP = "Folder that `dataset` wrote, or several; homes may be in more than one."
 _STAGE_HELP = "Steps, such as --stage 0 --stage 50, or fractions observed, such as 0 and 0.25."

@@ -162,7 +162,7 @@ def in_options(message: str) -> str:
 
 
 class OnceCommand(TyperCommand):
-    """A command that groups its options in its help and refuses repeated options that are no lists."""
+    """A command with grouped options in its help, which refuses repeated options."""
 
     def format_options(self, ctx: Any, formatter: Any) -> None:
         """Write the options in their groups."""
@@ -238,7 +238,7 @@ def parse_material(text: str) -> Material:
 def read_measurements(
     path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None, access_point: str | None = None
 ) -> Any:
-    """Read the file of --measurements with the headers of --column; `tx` is the position for a file without one."""
+    """Read the file of --measurements with the headers of --column; `tx` is the default position."""
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
     if wrong is not None:
@@ -254,13 +254,13 @@ def read_measurements(
 
 
 def parse_antenna(text: str, azimuth_deg: float, downtilt_deg: float) -> Any:
-    """Return an antenna from the name of a pattern or the path of an MSI file, and its orientation."""
+    """Return an antenna from a pattern's name or an MSI file, and its orientation."""
     pattern = sp.load_antenna(text) if Path(text).suffix else text
     return sp.Antenna(pattern, azimuth_deg, downtilt_deg)
 
 
 def for_each(values: Sequence[Any], count: int) -> Sequence[Any]:
-    """Return the values of an option that is given once for all transmitters, or once for each."""
+    """Return values given once for all transmitters, or once for each."""
     if len(values) not in (1, count):
         raise typer.BadParameter(f"{len(values)} values for {count} transmitters: give one for all, or one for each.")
     return values if len(values) == count else [*values] * count
@@ -273,7 +273,7 @@ def settings_of(
     diffraction: Diffraction = True,
     through_walls: ThroughWalls = None,
 ) -> dict[str, Any]:
-    """Return settings of scene and trace by names of arguments, with diffraction where it is the default."""
+    """Return settings of scene and trace by argument name."""
     trace = TraceSettings(frequency, max_depth, None if diffraction else False, refraction=through_walls)
     return {
         "scene_settings": SceneSettings(material=parse_material(material) if material else None),

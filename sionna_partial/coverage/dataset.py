@@ -28,13 +28,13 @@ from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.tracing.stock import MapPlane, planar_radio_map, stock_gain_db
 
 WALL_PARTS = 6
-"""Number of parts of a cell along each axis, so that pictures show walls thinner than a cell."""
+"""Parts of a cell along each axis: pictures show walls thinner than a cell."""
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
 
 TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
-"""Positions [m] along the dimension "tx" of the maps of several transmitters."""
+"""Positions [m] along the dimension "tx"."""
 
 ROOM = "room"
 """Variable with the room of each receiver: flags, 0 for none."""
@@ -49,8 +49,7 @@ _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Required attributes and their lower limits."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
-"""Ranges of probabilities, gains (reflections may exceed 0 dB near the transmitter), standard deviations and lengths.
-"""
+"""Ranges of probabilities, gains (near the transmitter above 0 dB), standard deviations and lengths."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
@@ -232,7 +231,7 @@ def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
 
 
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
-    """Return P(path gain > threshold) (..., ny, nx), NaN where no receiver can be; threshold in [-150, 0] dB."""
+    """Return P(path gain > threshold) (..., ny, nx), NaN without receiver; threshold in [-150, 0] dB."""
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
     columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
     return LinkPrediction(**columns).probability_above(threshold_db)
@@ -260,7 +259,7 @@ class CoverageAccessor:
 
     @property
     def _coverage(self) -> xr.Dataset:
-        """Return the coverage map as it is now: xarray keeps the accessor when variables are assigned."""
+        """Return the present map: xarray keeps the accessor when variables are assigned."""
         inner = ("y", "x") if {"y", "x"} <= self._given.sizes.keys() else ()
         return self._given.transpose(..., *inner)
 
@@ -339,7 +338,7 @@ class CoverageAccessor:
         noise_figure_db: float = 7.0,
         bandwidth_hz: float = 80e6,
     ) -> xr.DataArray:
-        """Return the mean rate [bit/s] of one spatial stream with modulation and coding adapted to the SNR.
+        """Return the mean rate [bit/s] of one spatial stream with adaptive modulation and coding.
 
         Parameters
         ----------
@@ -479,7 +478,7 @@ class CoverageAccessor:
         return planar_radio_map(scene, plane, tx, np.stack([one["gain_mean_db"].to_numpy() for one in maps]))
 
     def stock_gain(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> xr.DataArray:
-        """Return the path gain [dB] that Sionna RT's `RadioMapSolver` finds in the exported scene, on the same grid.
+        """Return the path gain [dB] of Sionna RT's `RadioMapSolver` in the exported scene, on the same grid.
 
         Settings and transmitters are taken from the coverage. Compare with `partial_gain_db`, the trace of the same
         scene by this package: the solver averages power over cells, misses rays, and counts crossed walls in the depth.

@@ -67,10 +67,10 @@ POSITIONS = 8
 """Number of positions over which the coverage of an unknown transmitter is averaged."""
 
 LARGE_OFFSET_DB = 15.0
-"""Smallest offset between measurements and predictions that is logged as an offset of powers [dB]."""
+"""Smallest offset of measurements that is logged as an offset of powers [dB]."""
 
 UNSURE_P = 0.05
-"""Smallest probability of the less probable kind of measurements (powers or path gains) that is logged."""
+"""Smallest logged probability of the less probable kind of measurements (powers, path gains)."""
 
 LOCATING_FRACTION = 0.3
 """Fraction of the progress bar for finding a transmitter."""
@@ -212,7 +212,7 @@ def predict_map(
 
 @dataclass(frozen=True)
 class Receivers:
-    """Receivers on a regular grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
+    """Receivers on a grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
 
     x_m: Floats
     y_m: Floats
@@ -234,7 +234,7 @@ class Transmitter:
 
 @dataclass(frozen=True)
 class _Source:
-    """Possible positions (K, 3) [m] of a transmitter, their weights (K,) and assimilations, and the best estimate."""
+    """Possible positions (K, 3) [m] of a transmitter, their weights and assimilations, and the best estimate."""
 
     tx_m: Floats
     weights: Floats
@@ -253,10 +253,10 @@ class CoverageJob:
     receivers: str
     block: int
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
-    """Assimilated measurements of other transmitters, by the name of the transmitter they are used for."""
+    """Assimilated measurements of other transmitters, by the transmitter they are used for."""
 
     def coverage(self, transmitter: Transmitter, report: Progress) -> tuple[xr.Dataset, Floats]:
-        """Return the coverage map of a transmitter, and the probabilities (K,) of the materials of walls."""
+        """Return the coverage map of a transmitter, and the probabilities (K,) of wall materials."""
         model, measured, grid = self.model, transmitter.measured, transmitter.grid
         posterior = None
         if transmitter.position_m is None:
@@ -362,7 +362,7 @@ class CoverageJob:
     def _prior(
         self, tx_m: Floats, rx_m: Floats, antenna: Antenna, *, at_rx: bool = False
     ) -> tuple[LinkPrediction, Floats, Floats]:
-        """Predict links to receivers (N, 3) [m] without the antenna; also return its gain and P(indoor)."""
+        """Predict links to receivers (N, 3) [m] without antenna; also return antenna gain and P(indoor)."""
         parts_m = [rx_m[start : start + self.block] for start in range(0, max(len(rx_m), 1), self.block)]
         blocks = [self.model.links(tx_m, part_m, no_progress, antenna, at_rx=at_rx) for part_m in parts_m]
         antenna_db = np.concatenate([links.antenna_db for links in blocks])
@@ -479,7 +479,7 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
 
 
 def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
-    """Return the receivers; receivers too near a wall or a transmitter (T, 3) [m] are masked."""
+    """Return the receivers; those near a wall or transmitter (T, 3) [m] are masked."""
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     require_height(partial, "rx_height_m", rx_height_m)
     x_m, y_m = grid_axes(partial, spacing_m)
@@ -521,7 +521,7 @@ def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
 def coverage_map(
     partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Put the values (N,) of the valid receivers on their grid, and add the layers of the map."""
+    """Return values (N,) of valid receivers on the grid, with the layers of the map."""
     layers: dict[str, NDArray[Any]] = {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,
@@ -571,7 +571,7 @@ def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> 
 def _part_spans(
     centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
 ) -> list[tuple[Indices, Indices]]:
-    """Return the first map cell, and one after the last, that each part of the receivers' cells overlaps."""
+    """Return the first map cell, and one after the last, of each part of the receivers' cells."""
     edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
     step = spacing_m / resolution_m / WALL_PARTS
     return [

@@ -38,7 +38,7 @@ _NR_OVERHEAD = {"FR1": 0.14, "FR2": 0.18}
 
 
 class Band(NamedTuple):
-    """A frequency band and its channel bandwidths [Hz]: all of Wi-Fi, smallest and largest of NR."""
+    """A frequency band and its bandwidths [Hz]: all of Wi-Fi, smallest and largest of NR."""
 
     low_hz: float
     high_hz: float
@@ -54,7 +54,7 @@ BANDS = {
 """Bands (IEEE 802.11ax and 802.11be; 3GPP TS 38.104: FR1 and FR2)."""
 
 _NR_SHANNON = 0.6
-"""Fraction of the Shannon bound that a link reaches (3GPP TR 36.942, annex A: LTE up to 4.4 bit/s/Hz)."""
+"""Reached fraction of the Shannon bound (3GPP TR 36.942, annex A: LTE up to 4.4 bit/s/Hz)."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power
 
 
 class Scheme(NamedTuple):
-    """A modulation and coding scheme: the lowest SNR at which it is used, and its rate."""
+    """A modulation and coding scheme: lowest SNR and rate."""
 
     snr_db: float
     rate_bit_s: float

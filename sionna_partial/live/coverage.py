@@ -1,4 +1,4 @@
-"""LiveCoverage: messages of a robot -> coverage of its newest map, first coarse, then fine; without a transport."""
+"""LiveCoverage: messages of a robot -> coverage of its newest map, coarse, then fine."""
 
 import functools
 import logging
@@ -39,7 +39,7 @@ from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 LATE_S = 30.0
-"""Maps older than the last one by less are late and dropped; by more, the robot's clock was restarted [s]."""
+"""Maps older than the last by less are dropped; by more, the robot's clock was restarted [s]."""
 
 POSE_AGE_S = 2.0
 """Time for which the last pose of the robot is used [s]."""
@@ -51,7 +51,7 @@ MOST_POWERS = 500
 """Number of powers that are kept of a transmitter."""
 
 REPEATED_S, MOST_LINES = 60.0, 50
-"""Time for which a line is not logged again [s], and number of lines that are remembered."""
+"""Time for which a line is not repeated [s], and number of remembered lines."""
 
 _log = logging.getLogger(__name__)
 
@@ -180,7 +180,7 @@ class _Grid:
     def costs(
         self, coverage: xr.Dataset, threshold_db: float, max_cost: int
     ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the percentage of outage at the nearest receivers of free and of unknown cells, -1 elsewhere."""
+        """Return the percentage of outage of free and of unknown cells, -1 elsewhere."""
         valid = coverage["valid"].to_numpy() == 1
         percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
         apart, nearest = distance_transform_edt(~valid, return_indices=True)
@@ -367,7 +367,7 @@ class LiveCoverage:
             self._changed.notify_all()
 
     def step(self) -> bool:
-        """Answer the newest map if it or its measured powers are new; return whether this was so."""
+        """Answer the newest map if it or its powers are new; return whether it was."""
         with self._changed:
             now_s, grid = time.monotonic(), self._waiting
             if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
@@ -411,7 +411,7 @@ class LiveCoverage:
                 self._changed.notify_all()
 
     def _guarded(self, what: str, compute: Callable[..., None], *given: Any) -> None:
-        """Compute, and log failures; a failed coarse answer ("") is followed by the line of the final one."""
+        """Compute, and log failures; "" is a coarse answer, which the final one follows."""
         try:
             compute(*given)
         except _NewerMap:

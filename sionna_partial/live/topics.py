@@ -1,4 +1,4 @@
-"""Topics of a robot, from a recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back, without ROS."""
+"""Topics of a robot, by recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back, without ROS."""
 
 import json
 import logging
@@ -24,7 +24,7 @@ from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
 from sionna_partial.resources import optional_packages
 
 MOST_FRAMES = 1000
-"""Number of frames outside the robot's chain that are kept of `/tf` and of `/tf_static`."""
+"""Number of frames outside the robot's chain that are kept of each topic."""
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
 
@@ -37,7 +37,7 @@ TF_TYPE = "tf2_msgs/msg/TFMessage"
 HIGHEST_DOMAIN = 232
 
 MOST_AT_ONCE = 100
-"""Number of messages of a topic that are taken before those of the next one."""
+"""Number of messages of a topic that are taken before the next topic's."""
 
 POLL_S = 0.02
 """Time between two polls [s]."""
@@ -189,7 +189,7 @@ class Listener:
 
 
 def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) -> None:
-    """Replay the messages of a recording at `rate` times their speed; 0 waits for the answer to each map.
+    """Replay a recording at `rate` times its speed; 0 waits for the answer to each map.
 
     Raises
     ------
@@ -306,7 +306,7 @@ def _domain(given: int | None) -> int:
 
 
 def _qos(*, latched: bool, reliable: bool, depth: int) -> Any:
-    """Return the quality of service of nav2's maps if latched, else one that matches any publisher."""
+    """Return the quality of service of nav2's maps if latched, else one for any publisher."""
     from cyclonedds.core import Policy, Qos
     from cyclonedds.util import duration
 
@@ -329,7 +329,7 @@ def _store() -> Any:
 
 @cache
 def struct(kind: str) -> Any:
-    """Return the DDS type of a message type such as "nav_msgs/msg/OccupancyGrid", named as in ROS 2."""
+    """Return the DDS type of a message type, named as in ROS 2."""
     from cyclonedds.idl import make_idl_struct
 
     package, _, name = kind.split("/")

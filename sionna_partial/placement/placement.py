@@ -29,7 +29,7 @@ CLEARANCE_M, FINEST_M = 0.1, 0.05
 
 RECEIVER_SPACING_M, MAX_RECEIVERS = 0.5, 4000
 POSITION_SPACING_M, MAX_POSITIONS = 0.25, 500
-"""Spacings of receivers and of transmitter positions [m]; they grow if the grid has too many points."""
+"""Spacings of receivers and positions [m], and largest numbers, beyond which spacings grow."""
 
 NEGLIGIBLE = 0.02
 """Probability of being indoors below which a receiver is omitted."""
@@ -38,15 +38,14 @@ _INDOOR_POSITIONS = 8
 """Number of transmitter positions over which the probability of being indoors is averaged."""
 
 _UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
-"""Visibility is exp(-u / 4 m) with the unobserved length u, and 0.8 exp(-d / 4 m) of the value at distance d behind
-walls. Fitted to predicted coverage at -100 dB on homes that `benchmarks/placement.py` does not use."""
+"""Visibility is exp(-u / 4 m) with the unobserved length u, and 0.8 exp(-d / 4 m) of it at distance d behind walls.
+Fitted to predicted coverage at -100 dB."""
 
 RECEIVERS = 120
 """Largest number of receivers during the search."""
 
 STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
-"""Number of traced and of refined positions: fewest, most, and area for each [m^2]. Fewer than 6 starts would miss the
-best room of a small home."""
+"""Number of traced and of refined positions: fewest, most, and area for each [m^2]."""
 
 STEPS_M = (0.6, 0.25)
 """Distances of neighbours in the refinement [m]."""
@@ -59,10 +58,10 @@ OUTAGE["p_outage"] = 1.0
 _DIRECTIONS = np.array([[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]])
 
 SIMILARITY_PENALTY = 0.6
-"""Relative loss of score of a start that covers the same receivers as a chosen one."""
+"""Loss of score of a start that covers the same receivers as a chosen one."""
 
 FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
-"""The worst 5 % of the receivers count in full, others linearly less up to 15 %."""
+"""The worst 5 % of the receivers count fully, others linearly less up to 15 %."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,7 @@ class PlacementArea:
         return self.room.state_at(positions_m) == CellState.FREE
 
     def positions(self, seed: int) -> Floats:
-        """Return positions (C, 3) [m] on a grid with a random offset, or cell centres if the grid meets none."""
+        """Return positions (C, 3) [m] on a randomly offset grid, or cell centres if it has none."""
         rng = np.random.default_rng(seed)
         spacing_m = max(POSITION_SPACING_M, math.sqrt(self.size_m2 / MAX_POSITIONS))
         x0, y0, x1, y1 = self.room.bounds_m
@@ -112,7 +111,7 @@ class PlacementArea:
         return np.column_stack([cell_centres_m(self.room, chosen), np.full(len(chosen), self.height_m)])
 
     def thinned(self, count: int) -> "PlacementArea":
-        """Return the area with at most `count` receivers, drawn evenly by weight along the rows of the grid."""
+        """Return the area with at most `count` receivers, drawn evenly by weight."""
         if len(self.rx_m) <= count:
             return self
         order = _boustrophedon(self.rx_m)
@@ -122,7 +121,7 @@ class PlacementArea:
         return replace(self, rx_m=self.rx_m[weight > 0.0], weight=weight[weight > 0.0])
 
     def visibility(self, positions_m: Floats, range_m: float = math.inf) -> Floats:
-        """Return the visibility (C, N) in [0, 1] of receivers from positions (C, 3) [m], 0 beyond `range_m`."""
+        """Return the visibility (C, N) in [0, 1] of receivers from positions (C, 3), 0 beyond `range_m`."""
         walled, unobserved_m, distance_m = _lines(self.partial, positions_m, self.rx_m)
         seen = np.exp(-unobserved_m / _UNSEEN_LENGTH_M)
         seen *= np.where(walled, _WALL_FACTOR * np.exp(-distance_m / _WALL_LENGTH_M), distance_m <= range_m)
@@ -194,13 +193,13 @@ def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: floa
 
 
 def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m: float, z_m: float) -> Floats:
-    """Return positions (N, 3) on a grid between x and y limits at one height [m]."""
+    """Return positions (N, 3) on a grid at one height [m]."""
     x, y = np.meshgrid(np.arange(*x_m, spacing_m), np.arange(*y_m, spacing_m))
     return np.column_stack([x.ravel(), y.ravel(), np.full(x.size, z_m)])
 
 
 def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
-    """Return, for lines (A B,) from A to B points, whether they meet a wall, unobserved lengths and lengths [m]."""
+    """Return for lines (A B,) whether they meet a wall, unobserved lengths and lengths [m]."""
     start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
     walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
     return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
@@ -422,7 +421,7 @@ class Search:
     def links(
         self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress
     ) -> tuple[LinkPrediction, Bools]:
-        """Predict the links (P, N) from positions (P, 3) [m], and which are long enough; short ones are outages."""
+        """Predict links (P, N) from positions (P, 3) [m], and return which are long enough; others are outages."""
         frequency_hz = self.model.simulation.trace_settings.frequency_hz
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]
@@ -434,7 +433,7 @@ class Search:
         return LinkPrediction(**columns), far
 
     def values(self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress) -> Floats:
-        """Return the values (P, N) of receivers for positions (P, 3) [m]; a receiver at the transmitter has 0 dB."""
+        """Return values (P, N) for positions (P, 3) [m]; a receiver at the transmitter has 0 dB."""
         links, far = self.links(positions_m, area, report)
         return np.where(far, link_values(links, self.settings), 1.0 if self.settings.objective == "coverage" else 0.0)
 
@@ -447,14 +446,14 @@ class Search:
 
 
 def link_values(prediction: LinkPrediction, settings: PlacementSettings) -> Floats:
-    """Return the value of each link (N,) for the objective: P(gain > threshold), or the mean gain [dB]."""
+    """Return the values (N,) of links: P(gain > threshold), or mean gain [dB]."""
     if settings.objective == "percentile":
         return prediction.gain_mean_db
     return prediction.probability_above(settings.threshold_db)
 
 
 def placement_score(values: Floats, weight: Floats, settings: PlacementSettings) -> float:
-    """Return the objective of values (N,) with weights (N,), rounded because threads change the last bits."""
+    """Return the objective, rounded because threads change the last bits."""
     fraction = weight / weight.sum()
     if settings.objective == "coverage":
         return round(float(values @ fraction), 5)
@@ -464,7 +463,7 @@ def placement_score(values: Floats, weight: Floats, settings: PlacementSettings)
 
 
 def _counted(fraction: Floats) -> Floats:
-    """Return the integral of the weights of the worst receivers, up to a fraction of them."""
+    """Return the integral of the weights of the worst receivers."""
     falling = np.clip(fraction, FULL_FRACTION, LAST_FRACTION) - FULL_FRACTION
     width = LAST_FRACTION - FULL_FRACTION
     return np.minimum(fraction, FULL_FRACTION) + falling - falling**2 / (2.0 * width)

@@ -175,7 +175,7 @@ def place_transmitters(
 
 
 def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
-    """Return positions (C, 3) [m]: half of them good alone, the others each far from those before."""
+    """Return positions (C, 3) [m]: half good alone, others far from those before."""
     chosen_m, positions_m = search.starts(area, count // 2), area.positions(search.settings.seed)
     apart_m = np.linalg.norm(positions_m[:, None] - chosen_m, axis=2).min(axis=1)
     while len(chosen_m) < count and apart_m.max() > 0.0:
@@ -186,7 +186,7 @@ def _candidates(search: Search, area: PlacementArea, count: int) -> Floats:
 
 
 def _covered(search: Search, area: PlacementArea, candidates_m: Floats) -> Bools:
-    """Return whether candidates (C, 3) cover the receivers in draws (n, C, N) of all links."""
+    """Return whether candidates cover receivers in draws (n, C, N) of all links."""
     links, far = search.links(candidates_m, area)
     latents = JointLatents(area.partial)
     gain_db = latents.draw(links, candidates_m, area.rx_m, DRAWS, [search.settings.seed])[1]

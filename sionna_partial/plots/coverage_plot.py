@@ -53,7 +53,7 @@ _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc"
 
 @dataclass(frozen=True)
 class Layer:
-    """A quantity of a panel: picture (ny, nx) with its colour scale, or (ny, nx, 3); no label, no colour bar."""
+    """A quantity: picture (ny, nx) with its colour scale, or (ny, nx, 3); no label, no colour bar."""
 
     title: str
     picture: Callable[[xr.Dataset], NDArray[Any]]
@@ -177,7 +177,7 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
 def plot_comparison(
     coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
 ) -> Figure:
-    """Draw coverage maps of one area, a column for each title and a row for each layer (paper, Fig. 5).
+    """Draw coverage maps of one area: columns of titles, rows of layers (paper, Fig. 5).
 
     Walls that only the first map contains are grey in the others.
     """
@@ -209,7 +209,7 @@ def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) ->
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Return a title: transmitters, frequency, walls, and for a partial map the receivers that gains refer to."""
+    """Return a title with transmitters, frequency, walls and, for a partial map, receivers."""
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
         what = f"{what} for receivers that are indoors"
@@ -224,7 +224,7 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
 
 
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a page-wide figure with panels (rows, columns) of one scale; its colour bars take `keys_in`."""
+    """Make a page-wide figure with panels of one scale; its colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
     highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
     height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
@@ -237,7 +237,7 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw the colour bar of a scale, or the triangle of mixed state colours; link states are in the legend."""
+    """Draw a colour bar, or the triangle of mixed state colours; link states are in the legend."""
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         where: dict[str, Any] = {"location": "right", "pad": 0.05}
@@ -303,7 +303,7 @@ def extent_m(coverage: xr.Dataset | xr.DataArray) -> tuple[float, float, float, 
 
 
 def wall_cells(coverage: xr.Dataset) -> Bools:
-    """Return the walls in up to 6 x 6 parts of a cell, as fine as a picture can show."""
+    """Return the walls in up to 6 x 6 parts of a cell."""
     bits = coverage["wall_parts"].to_numpy()
     fine = next((parts for parts in (6, 3, 2) if max(bits.shape) * parts <= _MAX_PIXELS), 1)
     merge = WALL_PARTS // fine
@@ -319,7 +319,7 @@ def outside(coverage: xr.Dataset) -> Bools:
 
 
 def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
-    """Refine a picture to the size of `wall`, and fill cells without receiver from their nearest neighbour.
+    """Refine a picture to the size of `wall`, and fill cells without receiver by the nearest.
 
     Walls thinner than a cell would have a white border otherwise.
     """
@@ -336,7 +336,7 @@ def _hatched(coverage: xr.Dataset) -> Bools:
 
 
 def unobserved_area(coverage: xr.Dataset) -> tuple[Floats, Floats, Floats]:
-    """Return cell centres x (nx + 2,) and y (ny + 2,) with a border of one cell, and the hatched cells as 1."""
+    """Return cell centres x (nx + 2,) and y (ny + 2,) with a border, and hatched cells as 1."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
     return x, y, np.pad(_hatched(coverage), 1, mode="edge").astype(float)
@@ -363,7 +363,7 @@ def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
 
 
 def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequence[Layer]) -> None:
-    """Return the legend; walls that only the first of several maps contains are "not observed" in the others."""
+    """Draw the legend; walls of the first map alone are "not observed" in the others."""
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR)]
     located = any("p_transmitter" in coverage for coverage in coverages)
     if located:
@@ -394,7 +394,7 @@ def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, 
 def report_figure(
     coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
 ) -> Figure:
-    """Draw a page on the coverage of named transmitters: maps, covered area by received power, uncertainty."""
+    """Draw a page on the coverage of named transmitters: maps, covered area, uncertainty."""
     maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
     notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])

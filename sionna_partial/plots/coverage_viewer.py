@@ -1,4 +1,4 @@
-"""A coverage map as an HTML page: transmitters, layers, values under the pointer, P(gain > threshold)."""
+"""A coverage map as an HTML page."""
 
 import html
 import json
@@ -135,7 +135,7 @@ def _viewer(maps: Mapping[str, xr.Dataset]) -> Any:
 
 
 def radio_layers(servers: int) -> dict[str, Layer]:
-    """Return layers of a transmitter with its power, or of the strongest of several, by variable."""
+    """Return layers of a transmitter with its power, or of the strongest, by variable."""
     known = coverage_layers(THRESHOLD_DB)
     level = Normalize(-130.0, -30.0), "viridis", "dBm"
     ratio, numbers = (Normalize(-20.0, 50.0), "viridis", "dB"), Normalize(0, servers - 1)
@@ -226,7 +226,7 @@ def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
 def add_layer(
     plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str], side: Any = "right"
 ) -> list[Any]:
-    """Draw a layer of numbers or words with its colour bar, and return both; only the first layer is visible."""
+    """Draw a layer with its colour bar, and return both; only the first is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
 

@@ -227,7 +227,7 @@ def _arrow(heading_deg: float) -> MarkerPath:
 
 
 def _picture(state: States, truth: States) -> Floats:
-    """Return the colours of the cells (ny, nx, 3), with the walls that are not on the map."""
+    """Return the colours (ny, nx, 3), with walls that are not on the map."""
     picture = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN)])[state]
     picture[(state == CellState.UNKNOWN) & (truth == CellState.WALL)] = to_rgb(_UNSEEN_WALL)
     return picture

@@ -282,7 +282,7 @@ def _words(material: Material) -> str:
 
 
 def plot_stages(evaluation: "Evaluation") -> Figure:
-    """Draw accuracy and gain errors of indoor receivers against the stage of exploration (paper, Fig. 6).
+    """Draw accuracy and gain errors of indoor receivers by stage of exploration (paper, Fig. 6).
 
     Solid lines are test homes, the dashed line the predictor on its training homes.
     """

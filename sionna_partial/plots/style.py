@@ -83,7 +83,7 @@ def corners_m(cells: Bools, origin_m: tuple[float, float], resolution_m: float) 
 
 
 def sheet_columns(count: int, aspect: float) -> int:
-    """Return the number of columns of a sheet that is neither high nor wide, with few empty panels."""
+    """Return the columns of a nearly square sheet with few empty panels."""
 
     def fault(columns: int) -> float:
         rows = math.ceil(count / columns)
