@@ -437,6 +437,7 @@ class TestUploads:
             ("a.yaml b.yml", "cannot be read"),
             ("a.npz b.pgm", "cannot be read"),
             ("a.pgm b.pgm c.yaml", "cannot be read"),
+            ("a.pgm b.png c.yaml", "cannot be read"),
             ("a.zip", "zip cannot be read"),
             ("room.yaml", "room.yaml' alone is not a map: choose the YAML and the image"),
             ("room.pgm", "room.pgm' alone is not a map: choose the YAML and the image"),

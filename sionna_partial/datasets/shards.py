@@ -149,7 +149,7 @@ class LinkTable(Shown):
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
         features = LinkFeatures.concatenate([table.features for table in tables])
-        columns = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
+        columns: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
         complete_maps = {name: home for table in tables for name, home in table.complete_maps.items()}
         maps = {id(each): each for table in tables for each in table.maps}
         number = {key: index for index, key in enumerate(maps)}
