@@ -1,8 +1,8 @@
 """The unknown material of walls: candidates for the losses of crossings and reflections, prior and evidence.
 
 Paths do not depend on the material of the walls, only their powers do. A trace with drywall therefore gives the gains
-under every candidate, which adds a loss to every crossing and reflection. Its limits are
-coarse (`Limits.of`), as the candidates differ by much more (`benchmarks/through_walls.py --only material`).
+under every candidate, which adds a loss to every crossing and reflection. Its limits
+are coarse (`Limits.of`): candidates differ by much more (`benchmarks/through_walls.py --only material`).
 
 The prior of the loss of a wall is a mixture of log-normal distributions around the mean losses of common materials
 (`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Measured losses of one material scatter by a factor of
