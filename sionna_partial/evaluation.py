@@ -2,6 +2,7 @@
 
 import itertools
 import json
+import logging
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
@@ -23,6 +24,8 @@ from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
+
+_log = logging.getLogger(__name__)
 
 CONFIDENCE_BINS = 15
 """Equal-width bins of the confidence in the calibration error."""
@@ -533,12 +536,16 @@ def _baselines_folder(model: Predictor) -> Path:
 
 def _shipped(model: Predictor) -> dict[str, Predictor]:
     """Load the shipped predictors that are comparable to, and other than, `model`."""
-    here, every = LinkTraces.of_settings(model.settings), {name: warm_predictor(name) for name in ("paper", "map")}
-    return {
-        name: each
-        for name, each in every.items()
-        if here.is_like(LinkTraces.of_settings(each.settings)) and model.fingerprint != each.fingerprint
-    }
+    here, found = LinkTraces.of_settings(model.settings), {}
+    for name in ("paper", "map"):
+        try:
+            shipped = warm_predictor(name)
+        except PredictorError as error:  # older inputs: a training whose networks have others must not end here
+            _log.warning("the shipped predictor %r is no baseline: %s", name, error)
+            continue
+        if here.is_like(LinkTraces.of_settings(shipped.settings)) and model.fingerprint != shipped.fingerprint:
+            found[name] = shipped
+    return found
 
 
 def _rows(
