@@ -90,7 +90,7 @@ class Building(NamedTuple):
     @classmethod
     def opaque(cls, plan: Plan, room: Room, materials: Materials, max_depth: int) -> "Building":
         nothing = np.zeros((1, 1), np.bool_)
-        interior = Interior.of(nothing, nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
+        interior = Interior(nothing, np.zeros((2, 2), np.int64), nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
         return cls.of(plan, interior, room, materials, Limits(max_depth, max_depth, 0, 1.0, 0.0))
 
 
