@@ -38,6 +38,18 @@ def _star(*degrees: float) -> NDArray[np.float64]:
     return np.stack([np.zeros((len(angle), 2)), np.column_stack([np.cos(angle), np.sin(angle)])], axis=1)
 
 
+def _ways(found: Candidates, floor_face: int) -> list[tuple[tuple[float, ...], int, int]]:
+    """All numbers of each candidate, and how many walls mirror it before and after its edge; sorted."""
+    ways = []
+    columns = found.rx, found.kind, found.face, found.vertices_m, found.wedge
+    for rx, kind, face, vertices, wedge in zip(*columns, strict=True):
+        at, used = int(np.flatnonzero(kind == DIFFRACTION)[0]), kind != 0
+        wall = used & (kind != DIFFRACTION) & (face < floor_face)
+        row = (float(rx), float(wedge), *face[used].tolist(), *vertices[used].ravel().tolist())
+        ways.append((row, int(wall[:at].sum()), int(wall[at + 1 :].sum())))
+    return sorted(ways)
+
+
 def _sectors(walls: NDArray[np.float64], position: tuple[float, float] = (0.0, 0.0)) -> list[tuple[int, int]]:
     """Walls that bound the sectors in which the edge at one position diffracts, counterclockwise."""
     wedges = find_wedges(extrude(walls), open_ends=False)
@@ -109,6 +121,28 @@ class TestDiffractionCandidates:
         assert len(truth) > 200
         assert ways == truth
         assert len(found.rx) == len(truth)
+
+    @pytest.mark.parametrize("walls_a_side", [0, 1, 2])
+    def test_walls_on_each_side_are_limited_and_nothing_else_is(self, walls_a_side: int) -> None:
+        geometry, rx = extrude(ROOM), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4]])
+        limited = _ways(_join(geometry, rx, walls_a_side=walls_a_side), geometry.floor_face)
+        every = _ways(_join(geometry, rx), geometry.floor_face)
+        assert {before for _, before, _ in every} == {after for _, _, after in every} == {0, 1, 2}
+        assert limited == [way for way in every if max(way[1:]) <= walls_a_side]
+        assert max(max(way[1:]) for way in limited) == walls_a_side
+
+    @pytest.mark.parametrize(
+        ("tx", "wall"),
+        [((4.0, 1.0, 1.2), 0), ((1.07, 3.0, 1.2), 1), ((1.07, 1.93, 1.2), 1)],
+        ids=["below lights the level wall", "left lights the upright wall", "both are lit"],
+    )
+    def test_the_face_that_the_transmitter_lights_comes_first(self, tx: tuple[float, ...], wall: int) -> None:
+        geometry, position = extrude(CORNER), np.array(tx)
+        found = _join(geometry, np.array([[2.5, 0.5, 1.0]]), position, 1)
+        row = int(np.flatnonzero((found.vertices_m[:, 0, :2] == [3.0, 2.0]).all(axis=1))[0])
+        normal = found.wedges.normal[found.wedge[row]]
+        assert normal[0] @ (position[:2] - [3.0, 2.0]) > 0
+        assert found.wedges.face[found.wedge[row], 0] // 2 == wall
 
     def test_without_wedges_there_are_no_candidates(self) -> None:
         geometry = extrude(ROOM[:4])
