@@ -118,7 +118,7 @@ class Page:
         self.map_text = Div(name="map_text", sizing_mode="stretch_width")
         self.stroke = self._on(Select(title="Dragging on the map", name="stroke", value=""), lambda _: self.show())
         self.hint = Div(text=_AREA_HINT)
-        self.paint = Select(title="Material", name="paint", options=[*WALL_MATERIALS], value="concrete")
+        self.paint = Select(title="Material", name="paint", options=list[Any](WALL_MATERIALS), value="concrete")
         self.brush = Spinner(title="Brush [m]", name="brush", low=0.05, high=20, step=0.05, value=0.5)
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
@@ -398,8 +398,8 @@ class Page:
         self.stroke.options = options if is_measured else [(LENGTH, STROKES[LENGTH])]
         if self.stroke.value not in [kind for kind, _ in self.stroke.options]:
             self.stroke.value = self.stroke.options[0][0]
-        for model, kinds in ((self.brush, BRUSHES), (self.paint, PAINTS), (self.hint, (AREA,))):
-            model.visible = self.stroke.value in kinds
+        for model, users in ((self.brush, BRUSHES), (self.paint, PAINTS), (self.hint, (AREA,))):
+            model.visible = self.stroke.value in users
         self._once("unit", (is_measured,), lambda: self.picture.show_unit("m" if is_measured else "pixels"))
 
     def _show_transmitters(self) -> None:
