@@ -12,8 +12,7 @@ spread about the trace: on each floor, and on average over the other floors, as 
 
 Without a FOLDER, buildings are procedural: their powers are traced with other walls (`BUILDINGS`), and have a spatial
 process of 4 dB, fading of 4 dB and an offset of each transmitter. With --repeats, these are drawn several times, and
-the fraction of powers in the 90 % interval without given powers is printed instead: with four transmitters, whose
-offsets are unknown, the fraction of one draw has a standard deviation of 0.06 even if all distributions are exact.
+mean and scatter of the fraction of powers in the 90 % interval without given powers are printed instead.
 
 Baselines: path loss with fitted exponent; multi-wall (COST 231), whose loss per wall comes from the other transmitters
 of the floor; a Gaussian process about each of the two (Matern 3/2 over the receiver's position); the traced gain.
