@@ -1,4 +1,4 @@
-"""Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
+"""Networks of several transmitters: best server, SINR and rate, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -39,7 +39,6 @@ VARIABLES = {
     "rate_bit_s": _described("mean Shannon rate", "bit/s"),
     "handover_margin_db": _described("mean lead of the strongest transmitter over the next", "dB"),
 }
-"""Variables on (y, x), `p_best` on (tx, y, x), and their attributes."""
 
 _ATTRIBUTES = ("spacing_m", "bandwidth_hz", "load", "sinr_threshold_db")
 
@@ -128,7 +127,6 @@ def network_map(
 
 
 def require_network(network: xr.Dataset) -> None:
-    """Raise a SettingsError unless `network` is what `network_map` returns."""
     remedy = "give what network_map returned."
     require_type("network", network, xr.Dataset, remedy)
     wanted = {name: (("tx", "y", "x")[name != "p_best" :], "f") for name in VARIABLES}
