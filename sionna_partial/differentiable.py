@@ -1,6 +1,7 @@
 """Predicted distribution as a differentiable function of transmitter, materials, frequency and network weights.
 
-Paths and their derivatives are from `tracing`; features and networks are TensorFlow. Limits of the gradients:
+Paths and their derivatives are from `tracing`; features and networks are TensorFlow. Where links were traced, the
+distribution equals `Predictor.predict`. Limits of the gradients:
 
 - Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
   missing; one that becomes invalid loses its power in a step, which has no derivative.
@@ -69,6 +70,7 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
+"""Distance from a border of patches at which a segment runs along it [cells]."""
 
 WINDOW_STEP_M = CELLS_M[0] / 2
 
@@ -76,6 +78,7 @@ STEEPEST = 4.0
 """Largest ratio of the growth of a length and its smooth surrogate, for lines that touch a corner."""
 
 _NEAREST_M = 1e-6
+"""Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
 
 _LIMITS = {
     "tx_m": (-1e9, 1e9),

@@ -39,10 +39,10 @@ _NO_SPREAD_DB = 1e-6
 """Standard deviation below which a gain has no spread [dB]."""
 
 LEAST_PROBABILITY = 1e-4
-"""Smallest probability of the true link state in a likelihood."""
+"""Smallest probability of the true link state in a likelihood: a map with errors may exclude the true state."""
 
 LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
-"""Limits for the true gain in a likelihood [dB, 1/dB]."""
+"""Limits for the true gain in a likelihood [dB, 1/dB]: a trace on a map with errors is certain but may be wrong."""
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
@@ -78,7 +78,11 @@ ALWAYS_OUTAGE = "always outage"
 
 @dataclass(frozen=True)
 class Metrics:
-    """Figures of merit of one prediction of N links (`DEFINITIONS`), nan if undefined."""
+    """Figures of merit of one prediction of N links (`DEFINITIONS`), nan if undefined.
+
+    Undefined are all without links, `rmse_linked_db` if all links are in outage, and `coverage_90` of a prediction
+    without spread.
+    """
 
     links: int
     accuracy: float
@@ -113,7 +117,8 @@ class Reliability(Shown):
 class Calibration(Shown):
     """Calibration of link state and gain.
 
-    `gain_pit` (PIT_BINS,) is the histogram of the randomised probability integral transform of the true gains.
+    `gain_pit` (PIT_BINS,) is the histogram of the randomised probability integral transform of the true gains, uniform
+    for a calibrated prediction.
     """
 
     state: Reliability
@@ -158,9 +163,10 @@ def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
 
 
 def pit_fractions(prediction: LinkPrediction, link_state: States, gain_db: Floats, levels: Floats) -> Floats:
-    """Return the fractions of links (K,) whose randomised probability integral transform is below some levels (K,).
+    """Return the fractions of links (K,) whose probability integral transform is below some levels (K,) in [0, 1].
 
-    The transform is the predicted probability of a smaller gain, spread evenly over a mass such as an outage.
+    The transform is the predicted probability of a smaller gain, spread evenly over a probability mass such as an
+    outage (randomised, in expectation). A calibrated prediction returns the levels.
     """
     if len(link_state) == 0:
         return np.full(len(levels), np.nan)
@@ -187,7 +193,10 @@ def _mean(values: NDArray[Any]) -> float:
 
 @dataclass(frozen=True)
 class Majority:
-    """Equal prediction for every link: fractions, means and standard deviations [dB] of the training links by state."""
+    """Equal prediction for every link: fractions, means and standard deviations [dB] of the training links by state.
+
+    A state without links has the gain of an outage.
+    """
 
     fractions: tuple[float, ...]
     means_db: tuple[float, ...]
@@ -387,7 +396,7 @@ def evaluate(
     """Evaluate a predictor and baselines on the links of a data set, stage by stage.
 
     Homes in the predictor's card are training homes, all others test homes. For receivers drawn anywhere, the predictor
-    is evaluated with and without P(indoor).
+    is evaluated with and without P(indoor); a receiver in an observed cell is indoors for certain.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from sionna_partial.plots.style import figure_png
 from sionna_partial.resources import optional_packages
 
 TABLE_VARIABLES = tuple(name for name in ATTRIBUTES if name != "wall_parts")
-"""Variables in CSV and GeoTIFF."""
+"""Variables in CSV and GeoTIFF; only pictures need `wall_parts`."""
 
 MAX_BYTES, MAX_ARRAY_BYTES = 500_000_000, 4_000_000_000
 """Largest file that is read, and its largest arrays [bytes]."""
@@ -36,8 +36,10 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     ======== ==========================================================================================
     `.nc`    NetCDF 4 (CF conventions) of the whole Dataset.
     `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN without receiver; local
-             metres, no coordinate reference system. Bands of several transmitters are "transmitter:variable".
-    `.csv`   One row for each receiver, columns x_m, y_m and the variables, for several transmitters also tx.
+             metres, no coordinate reference system; settings as tags. Bands of several transmitters are
+             "transmitter:variable".
+    `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty without receiver. Several
+             transmitters have a first column tx.
     `.png`   The picture of `plot_coverage`.
     `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold),
              and the best server of several transmitters.

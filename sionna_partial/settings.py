@@ -187,11 +187,12 @@ class SceneSettings(Checked):
         Longest gap of UNKNOWN cells that is closed in a seen wall [m]. Gaps of FREE cells are closed up to two cells
         and 0.11 m.
     floor_extent : {"observed", "none"}
-        Extent of floor and ceiling.
+        Extent of floor and ceiling: the observed area, so that unknown cells reflect nothing, or none.
     ceiling : bool
         True for a ceiling above the floor.
     outline : {"lines", "cells"}
-        Walls as straight lines fitted to the wall cells, or as the staircase through their centres.
+        Walls as straight lines fitted to the wall cells, or as the staircase through their centres, without
+        `bridge_gap_m`.
     geometries : int or None
         Number of geometries, 1 to 16, over which powers of links without line of sight are averaged: the mapped
         outlines, and outlines with vertices moved at random by 3 cm. None is 3 on nearly complete maps with range noise
@@ -323,6 +324,7 @@ class SensorSettings(Checked):
         Fraction of rays without a reading [1], at random. With any error, rays that graze a wall have none.
     fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
         Mapper whose rule turns readings into walls (`FUSIONS`); "vacuum" also thins walls.
+        Without errors all give the true map.
 
     Raises
     ------
@@ -353,7 +355,7 @@ class SensorSettings(Checked):
 
 
 SHORT_LINK_M = 25.0
-"""Largest horizontal length [m]."""
+"""Largest horizontal length of a short link [m]."""
 
 MIXED_SENSORS = {
     "range_m": (3.0, 30.0),
@@ -392,7 +394,8 @@ class DatasetSettings(Checked):
         Sensor of the robot; "mixed" draws one for each home from `MIXED_SENSORS`: a camera for one home in three, else
         a turning lidar.
     short_link_fraction : float
-        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1].
+        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1]. In large buildings, most other links
+        are in outage.
     scene : SceneSettings
         Conversion of maps to scenes; drywall without a material.
     trace : TraceSettings

@@ -64,7 +64,7 @@ OUTAGE = "measured outage"
 _NO_MATERIAL = "that shows a material: measure links that walls reflect, and trace with max_depth of 1 or more."
 
 _REFLECTING = Material(10.0, 1.0)
-"""Material of the trace that finds paths."""
+"""Material of the trace that finds paths: no reflection is too weak."""
 
 
 @read_only
@@ -162,7 +162,7 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
         return best, np.sqrt((others - best[..., None]) ** 2 @ posterior.weight)
 
     def record(self) -> dict[str, Any]:
-        """Return the result as plain data, without the map and single links."""
+        """Return the result as plain data, without the map and the gains of single links."""
         plain = {name: np.asarray(getattr(self, name)).tolist() for name in _NUMBERS}
         rmse_db = {
             when: float(np.sqrt(np.mean((gain_db - self.gain_db)[self.used] ** 2)))
@@ -194,8 +194,8 @@ def calibrate_materials(
     """Estimate permittivity and conductivity of walls, floor and ceiling from measured path gains.
 
     Paths are traced once; Sionna RT evaluates their power for any material. The whole plane of permittivity and
-    conductivity is searched and refined by Newton's method. The result is the material whose reflection losses are
-    nearest to their posterior mean. The thickness is fixed.
+    conductivity is searched, so that the result does not depend on the start, and refined by Newton's method. The
+    result is the material whose reflection losses are nearest to their posterior mean. The thickness is fixed.
 
     Repeated measurements (both ends in the same cubes of 1 cm) are averaged. Links of a partial map are used if the
     line of sight, or half of the NLOS power, is in observed space; outages are not used (`docs/calibration.md`).

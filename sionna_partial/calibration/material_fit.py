@@ -100,6 +100,7 @@ class LinkPaths:
         return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
 
     def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
+        """Return |a|^2 (P,), and its derivatives (P, 2 M) by permittivities, then conductivities."""
         parameters = self._parameters(permittivity, conductivity_s_m)
         slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
         return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
@@ -150,6 +151,7 @@ class GainErrors:
     blocked_fraction: float
 
     def penalty(self) -> float:
+        """Return the negative logarithm of the prior, up to a constant."""
         spread = math.log(self.noise_db / EXPECTED_NOISE_DB) / NOISE_SPREAD
         return 0.5 * spread**2 + (self.missed_fraction + self.blocked_fraction) / MEAN_FRACTION
 
@@ -291,6 +293,7 @@ class MaterialTarget:
         return Point(values, self.weight * loss + prior_loss(values), errors)
 
     def offset_db(self, power: Floats) -> float:
+        """Return the median excess of measured over predicted gains of LOS links [dB]."""
         return float(np.median((self.gain_db - self.gains_db(power))[self.is_direct]))
 
     def errors_db(self, power: Floats) -> Floats:

@@ -103,6 +103,7 @@ class ArrayPaths:
 
     @property
     def work_bytes(self) -> int:
+        """Return the memory of the largest of the `blocks`."""
         coefficients = max(BLOCK_BYTES // 16, len(self.rx) * len(self.tx) * self.most)
         return coefficients * (32 if self.synthetic_array else 80)
 
@@ -250,8 +251,9 @@ class Block:
 class Unfolded:
     """Displacements of both ends of P paths, with the reflections unfolded.
 
-    `before` and `after` (P, 3, 3) map displacements of transmitter and receiver up to the point where a path is `split`
-    (P,): diffracted or scattered. From there `to_tx_m` and `to_rx_m` (P, 3) lead to the images of both ends.
+    `before` (P, 3, 3) maps displacements of the transmitter through all reflections, or up to the point where a path is
+    `split` (P,): diffracted or scattered. From there `to_tx_m` and `to_rx_m` (P, 3) lead to the images of both ends;
+    `after` maps displacements of the receiver; `upright` (P,): the edge is vertical.
     """
 
     before: Floats

@@ -28,6 +28,7 @@ from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.tracing.stock import MapPlane, planar_radio_map, stock_gain_db
 
 WALL_PARTS = 6
+"""Parts of a cell along each axis: pictures show walls thinner than a cell."""
 
 DISTRIBUTION = ("p_los", "p_nlos", "p_outage", "gain_mean_db", "gain_std_db")
 COMPONENTS = ("gain_los_mean_db", "gain_los_std_db", "gain_nlos_mean_db", "gain_nlos_std_db")
@@ -47,7 +48,7 @@ _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Required attributes and their lower limits."""
 
 _RANGES = {"1": (0.0, 1.0), "dB": (GAIN_FLOOR_DB, 10.0 + MAX_GAIN_DBI), "std": (0.0, 1e3), "m": (0.0, 1e15)}
-"""Ranges of probabilities, gains, standard deviations and lengths."""
+"""Ranges of probabilities, gains (near the transmitter above 0 dB), standard deviations and lengths."""
 
 _PLOT = "plots.coverage_plot:plot_coverage"
 
@@ -105,7 +106,7 @@ def link_columns(
 
 @cache
 def _versions() -> str:
-    """Return names and versions of the packages, cached."""
+    """Return names and versions of the packages; reading them takes memory, hence the cache."""
     versions = {}
     for package in ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "keras", "numpy", "xarray"):
         with suppress(PackageNotFoundError):
@@ -114,7 +115,7 @@ def _versions() -> str:
 
 
 def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, Any]:
-    """Return the global attributes, without time of day."""
+    """Return the global attributes; no time of day, so that equal input gives equal files."""
     partial, (trace_settings, scene_settings) = simulation.partial, simulation.resolved
     return {
         "Conventions": "CF-1.11",
@@ -385,7 +386,6 @@ class CoverageAccessor:
             On `floor`: "observed" (free cells), "all" (weighted by `p_indoor`; 1 in free cells) and the rooms of the
             map. `fraction` has at least that probability, `fraction_mean` is the mean probability, `area_m2` the size.
             Fractions are NaN on an empty floor. Several transmitters are on `tx`.
-
         """
         require_number("threshold_dbm", threshold_dbm, -400.0, 400.0)
         require_number("probability", probability, 0.0, 1.0)

@@ -105,15 +105,16 @@ def predict_map(
 ) -> xr.Dataset:
     """Predict link state and path gain, with their uncertainty, everywhere on a map.
 
-    The traced known part of the map and the unobserved lengths give distributions (paper, Section III). On a complete
-    map the trace is the prediction.
+    The known part of the map is traced. The predictor turns the traced links and the unobserved lengths into
+    distributions (paper, Section III). On a complete map the trace is the prediction.
 
     Probabilities and gains are conditional on an indoor receiver; `p_indoor` is its probability. With
     ``receivers="anywhere"`` they include outdoor receivers, which are in outage. On a complete map free cells are
     indoors, all others outdoors.
 
     Receivers within 1.1 cm of a wall or of the transmitter (or within wavelength / 4 pi, where Friis' formula exceeds 0
-    dB) have `valid` False and NaN, in NetCDF link states 255.
+    dB) have `valid` False and NaN in floating-point variables and link states; a NetCDF file stores these states as
+    255.
 
     Without `tx`, measurements locate the transmitter: `p_transmitter` is the posterior of its position, and
     probabilities and gains are averaged over 8 positions drawn from it.
@@ -139,12 +140,13 @@ def predict_map(
     trace_settings : TraceSettings, optional
     measurements : Measurements, mapping, data frame or path, optional
         Measured gains (see `Measurements`), which improve the prediction of other receivers (`Assimilation`). Gains of
-        transmitters farther than 0.5 m from `tx` are used only through walls, for their material and the offset of
-        powers. The attributes `wall_material` and `wall_loss_db` then contain probabilities and mean loss.
+        transmitters farther than 0.5 m from `tx` are not used where walls are opaque; through walls they contribute to
+        the material of walls and the offset of powers. Where the material is unknown, the attributes `wall_material`
+        and `wall_loss_db` contain its probabilities and the expected loss of a wall.
     receivers : {"indoor", "anywhere"}
         Receivers that probabilities and gains refer to.
     memory_gb : float
-        Memory limit of the process [GB].
+        Memory limit of the process [GB]. Receivers are traced and predicted in blocks that fit.
     progress : bool or callable, optional
         False shows none; a callable is called as ``progress(fraction_done, message)``. Default: a bar in terminals and
         notebooks after 2 s.
@@ -281,9 +283,11 @@ class CoverageJob:
         return coverage if posterior is None else with_posterior(coverage, posterior), weights
 
     def with_others(self, transmitters: Sequence[Transmitter], measurements: Any) -> CoverageJob:
-        """Return the job with the measurements of other transmitters, which give the prior of offset and loss of walls.
+        """Return the job with the measurements of other transmitters assimilated, each alone.
 
-        Other transmitters are assumed to have the antenna of the predicted one, in an unknown orientation.
+        They give the prior of offset and loss of walls, except where walls are opaque or the transmitter is unknown.
+        Transmitters that are not predicted are assumed to have the antenna of the predicted one, in an unknown
+        orientation.
         """
         settings = self.model.simulation.trace_settings
         sources_m = [each.position_m[None] for each in transmitters if each.position_m is not None]
@@ -541,6 +545,7 @@ def coverage_map(
 
 
 def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
+    """Return (ny, nx) bits: the parts of the cell that contain a wall."""
     walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
     walls = walls.cumsum(axis=1, dtype=np.int32)
     ny, nx = partial.shape
@@ -557,6 +562,7 @@ def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> 
 def _part_spans(
     centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
 ) -> list[tuple[Indices, Indices]]:
+    """Return the first map cell, and one after the last, of each part of the receivers' cells."""
     edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
     step = spacing_m / resolution_m / WALL_PARTS
     return [

@@ -39,6 +39,7 @@ VARIABLES = {
     "rate_bit_s": _described("mean Shannon rate", "bit/s"),
     "handover_margin_db": _described("mean lead of the strongest transmitter over the next", "dB"),
 }
+"""Variables on (y, x), `p_best` on (tx, y, x), and their attributes."""
 
 _ATTRIBUTES = ("spacing_m", "bandwidth_hz", "load", "sinr_threshold_db")
 

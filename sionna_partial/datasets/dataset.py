@@ -39,7 +39,7 @@ from sionna_partial.settings import DatasetSettings
 POLL_S = 1.0
 
 ANY_PORT = "127.0.0.1:0"
-"""Free address for dask's dashboard."""
+"""Address of dask's dashboard, whose usual port may be taken."""
 
 MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
 """Largest scheduler file, and largest index [bytes]."""
@@ -76,7 +76,7 @@ def build_dataset(
     `failed/<home>.json` for each failed home. Shards are written whole or not at all. The same call continues an ended
     run, with the same bytes. Homes may be added later. Changes of a map file are not noticed: build in a new folder.
 
-    Every home has a process of its own: one that raises, crashes or hangs fails alone, after a second try if its
+    Every home has a process of its own: one that raises, crashes or hangs fails alone. It is tried again if its
     process or worker died.
 
     Parameters

@@ -72,7 +72,7 @@ MAX_DRAWS = 1000
 _log = logging.getLogger(__name__)
 
 ATTEMPTS = 3
-"""Number of processes that may die over a home."""
+"""Number of processes that may die over a home: one may have been killed from outside."""
 
 IDLE_S = 60.0
 
@@ -85,6 +85,7 @@ TIMEOUT_LINE = "Timeout ("
 LAST_LINES = 20
 
 PACKAGES = ("sionna-partial", "sionna-rt", "mitsuba", "drjit", "numpy", "numba", "scipy", "shapely", "pyarrow")
+"""Packages whose versions may change the bytes of a data set."""
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 
@@ -111,7 +112,7 @@ class HomeSource:
 
 
 def home_sources(homes: Iterable[Home]) -> list[HomeSource]:
-    """Return the homes to build from; homes of a folder are sorted by name.
+    """Return the homes to build from, in order; homes of a folder are sorted by name.
 
     A map has the name of its file, or of its folder if the file is called map or scene.
     """
@@ -184,7 +185,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     errors mapped as a wall, or within `NEAREST_M` of its transmitter.
 
     The truth is outage for a receiver outside the free cells of the home (paper, "Indoor-Outdoor Estimation"), else the
-    trace on the complete home. The table is ordered by stage, then by transmitter.
+    trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered
+    by stage, then by transmitter.
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)
@@ -324,7 +326,7 @@ def _truth(
 
 
 def _strongest(links: TracedLinks, count: int) -> tuple[Floats, Floats, Floats]:
-    """Return the `CIR` (N, count) of the strongest paths."""
+    """Return the arrays (N, count) of `CIR` of the strongest paths, the strongest first."""
     response = links.cir(normalize_delays=False)
     gain, delay_s = response["a"].to_numpy()[:, 0, 0], response["delay_s"].to_numpy()
     order = np.argsort(-np.abs(gain), axis=1, kind="stable")[:, :count]
@@ -432,7 +434,7 @@ def allow_homes() -> None:
 
 
 def stop_homes() -> None:
-    """Kill all processes, with unfinished homes."""
+    """Kill the processes of all threads, with unfinished homes."""
     _stopped.set()
     for process in list(_alive):
         process.kill()

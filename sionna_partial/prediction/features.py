@@ -51,7 +51,7 @@ _OPAQUE_CELLS = 3.0
 """Length of a line in known walls that excludes LOS, unless it is traced on exact walls [cells]."""
 
 _BEYOND_CELLS = 2
-"""Margin around a map that connects the outside [cells]."""
+"""Margin around a map, so that walls that reach its border do not separate the outside [cells]."""
 
 
 @read_only

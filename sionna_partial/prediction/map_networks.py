@@ -39,7 +39,7 @@ Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
 Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
-"""In the order of `CELLS_M`."""
+"""Names of the networks; map networks in the order of `CELLS_M`."""
 
 MAP_FEATURES = 16
 
@@ -56,12 +56,15 @@ GAIN_WEIGHT = 0.05
 """Weight of the gain's score against the log-likelihood of the link state [1/dB]."""
 
 WIDENING, SEEN_WIDENING = 0.15, 0.5
-"""Relative increase of standard deviations on maps of full noise, and for links with both ends observed."""
+"""Relative increase of standard deviations on maps of full noise, and for links with both ends observed.
+
+Chosen for 90 % coverage of the 90 % intervals on procedural homes explored with range noise, drift and missed walls.
+"""
 
 _WIDTHS = ((16, 32, 48, 64), (8, 16, 24, 32))
 _HIDDEN_UNITS = 64
 _LOS_MOST_DB = 10.0
-"""Largest mean gain given LOS over free space [dB]."""
+"""Largest mean gain given LOS over free space [dB]: other paths add at most this power."""
 
 _LOS_OFFSET = -1.5
 _NLOS_DB, _NLOS_SCALE_DB = -25.0, 20.0

@@ -287,7 +287,7 @@ def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, An
 
 
 def layer(keras: ModuleType, kind: str, name: str, *arguments: Any, **options: Any) -> Any:
-    """Return a stock layer in single precision, whatever the user's global policy."""
+    """Return a stock layer in single precision, regardless of the user's global policy."""
     return getattr(keras.layers, kind)(*arguments, name=name, dtype="float32", **options)
 
 

@@ -57,7 +57,7 @@ if TYPE_CHECKING:
     import keras
 
 SHIPPED = ("map", "paper")
-"""The default first."""
+"""Names of the shipped predictors, the default first."""
 
 
 class TraceErrors(NamedTuple):
@@ -243,7 +243,10 @@ class LinkPrediction(Shown):
         return probability
 
     def amplified(self, change_db: ArrayLike) -> LinkPrediction:
-        """Return the distribution with gains higher by `change_db`, a number or (N,) [dB]; outages stay."""
+        """Return the distribution with gains higher by `change_db`, a number or (N,) [dB].
+
+        Outages stay, and no gain falls below -150 dB.
+        """
         has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
 
         def amplified(links: LinkPrediction) -> LinkPrediction:
@@ -254,7 +257,7 @@ class LinkPrediction(Shown):
         return self.mapped(amplified)
 
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
-        """Select links."""
+        """Select links by an index array, a mask (N,) or a slice."""
         return self.mapped(
             lambda links: LinkPrediction(*(getattr(links, column.name)[index] for column in fields(links)))
         )
@@ -271,7 +274,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
-        """Return the mixture of K distributions of the same links by weights (K,) or (K, N)."""
+        """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1."""
         if len(parts) == 1:
             return parts[0]
         p_all, means_db, stds_db = (np.stack(each) for each in zip(*(part.by_state for part in parts), strict=True))
@@ -595,7 +598,8 @@ class OtherPredictor:
 
     `predict` gets the `LinkFeatures` of the N uncertain links. It returns a `LinkPrediction`, or a mapping of (N,)
     arrays: `p_los`, `p_nlos`, `p_outage`, and `gain_mean_db`, `gain_std_db` of links with a path, or both
-    `gain_los_...` and `gain_nlos_...` [dB]. An optional `predict_indoor(phi)` returns P(indoor).
+    `gain_los_...` and `gain_nlos_...` [dB]. Without a method `predict_indoor(phi)`, the default predictor gives
+    P(indoor).
     """
 
     settings: PredictorSettings | None = None
@@ -675,7 +679,10 @@ def warm_predictor(asked: Predictor | str | PathLike[str] | None) -> Predictor: 
 @overload
 def warm_predictor(asked: Any) -> Predictor | OtherPredictor: ...
 def warm_predictor(asked: Any) -> Predictor | OtherPredictor:
-    """Return a user's model, or a shared `Predictor` whose files are read once per process until they change."""
+    """Return a user's model, or `Predictor.load` with files read once per process until they change.
+
+    Callers share the weights and must not change them.
+    """
     if not isinstance(asked, (str, PathLike, type(None), Predictor)) and callable(getattr(asked, "predict", None)):
         return OtherPredictor(asked)
     if not isinstance(asked, (str, PathLike, type(None))):

@@ -91,7 +91,7 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
 
 
 def shipped_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
-    """Return a file of the package after a check of its SHA-256."""
+    """Return a file of the package, after a check of its SHA-256; `make predictor` writes the list."""
     remedy = "install sionna-partial again."
     content = read_bytes(path, "path", PredictorError, most, remedy)
     lines = read_bytes(PREDICTORS_FOLDER / CHECKSUMS, "path", PredictorError, most, remedy).decode().splitlines()

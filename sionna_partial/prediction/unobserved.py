@@ -18,7 +18,7 @@ from sionna_partial.process import core_count, in_order, njit
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
 GRAZE = 1e-9
-"""Fraction of a line up to which cells are only grazed, by rounding."""
+"""Fraction of a line up to which cells are only grazed: lines between grid points meet corners, up to rounding."""
 
 _BORDER_CELLS = 1e-6
 """Distance within which a segment follows the border of cells [cells]."""
@@ -69,7 +69,7 @@ def lengths_in_unknown_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
 def walled_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
     """Return the lengths (N,) of segments in known wall cells, below the walls' tops [m]; ends are (N, 3) or (3,) [m].
 
-    A segment along the border of cells is in a wall if all of them are.
+    Outside the grid there is no known wall. A segment along the border of cells is in a wall if all of them are.
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m = np.zeros(len(end_m))

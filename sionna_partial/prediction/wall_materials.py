@@ -119,7 +119,10 @@ class Residuals(NamedTuple):
     covariance: Floats
 
     def log_evidence(self, noises_db: Floats) -> Floats:
-        """Return the log-likelihood (K, S, N), up to a constant, for `STDS_DB` and noises [dB]."""
+        """Return the log-likelihood (K, S, N), up to a constant, for `STDS_DB` and noises [dB].
+
+        The ratio of noise to process is assumed equal at all P.
+        """
         root = np.sqrt(self.size)
         values, vectors = np.linalg.eigh(self.correlation * root[:, None] * root)
         values = np.maximum(values, 1e-6)
@@ -149,4 +152,5 @@ def log_std_prior() -> Floats:
 
 
 def mean_square(values: Floats, weights: Floats) -> float:
+    """Return the root of the weighted mean square."""
     return math.sqrt(float(weights @ values**2 / weights.sum()))
