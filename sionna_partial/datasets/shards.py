@@ -456,7 +456,7 @@ def settings_for(
 def require_like(
     found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
 ) -> None:
-    """Raise a PredictorError for other traces than those of `whose` links; None passes."""
+    """Raise a PredictorError unless the links were traced like `whose` links; None passes."""
     if found is not None and not found.is_like(wanted):
         raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 
