@@ -1,4 +1,4 @@
-"""Checks of input, with errors that name the field, its value and the remedy; types of progress reports."""
+"""Checks of input; types of progress reports."""
 
 import itertools
 import math
@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
 Progress = Callable[[float, str], None]
-"""Called with the fraction of the work that is done, and a message."""
+"""Receiver of the fraction of the work that is done, and a message."""
 
 CountProgress = Callable[[int, int, str], None]
-"""Called with the number of items that are done, their total, and a message."""
+"""Receiver of the number of items that are done, their total, and a message."""
 
 _Settings = TypeVar("_Settings")
 
@@ -31,13 +31,11 @@ def no_progress(fraction: float, message: str) -> None:
 
 
 def reason_of(error: Exception) -> str:
-    """Return the message of an expected error; of any other error, its type and message."""
     known = isinstance(error, SionnaPartialError | OSError | MemoryError)
     return str(error) if known else f"this failed ({type(error).__name__}: {shown(str(error))})."
 
 
 def shown(value: object) -> str:
-    """Return a value as a short text of one line."""
     try:
         return " ".join(_short.repr(plain(value)).split())
     except ValueError:  # whole numbers of thousands of digits
@@ -45,13 +43,11 @@ def shown(value: object) -> str:
 
 
 def require(condition: bool, name: str, value: object, remedy: str) -> None:
-    """Raise a SettingsError that names the setting, its value and the remedy unless `condition` holds."""
     if not condition:
         raise SettingsError(f"{name} = {shown(value)} is not allowed: {remedy}")
 
 
 def require_number(name: str, value: object, low: float, high: float, *, open_low: bool = False) -> None:
-    """Raise a SettingsError unless `value` is a finite number in [low, high], or (low, high] with `open_low`."""
     number = number_of(value)
     inside = (low < number if open_low else low <= number) and number <= high
     meant = next((f"{number:g}e{power}" for power in (9, 6) if low <= number * 10**power <= high), None)
@@ -69,7 +65,7 @@ def require_whole(name: str, value: object, low: int, high: int) -> None:
 
 
 def require_names(name: str, values: Sequence[str]) -> None:
-    """Raise a SettingsError unless `values` are different texts, at least one, that can be names of files."""
+    """Require different texts, at least one, that can be names of files."""
     good = len(values) == len({*values}) > 0 and all(text and text.isprintable() for text in values)
     require(good, name, values, "give each a name of its own, of printable characters.")
 
@@ -92,7 +88,7 @@ def transmitter_names(count: int) -> list[str]:
 
 
 def plain(value: Any) -> Any:
-    """Return a NumPy scalar as a Python number, times as texts, and anything else as it is."""
+    """Return a NumPy scalar as a Python number, times as texts, anything else as it is."""
     if getattr(getattr(value, "dtype", None), "kind", "") in tuple("mM"):
         return str(value)
     return value.item() if getattr(value, "ndim", None) == 0 and hasattr(value, "item") else value
@@ -110,7 +106,6 @@ def number_of(value: object) -> float:
 def real_array(
     name: str, values: Any, error: type[SionnaPartialError], remedy: str, kinds: str = "iuf"
 ) -> "NDArray[Any]":
-    """Return an array of one of the dtype kinds; an `error` for ragged, masked, complex and other values."""
     import numpy as np
 
     parts = values if isinstance(values, list | tuple) else [values]
@@ -128,7 +123,6 @@ def real_array(
 
 
 def float_array(name: str, values: Any, error: type[SionnaPartialError], remedy: str) -> "NDArray[Any]":
-    """Return numbers as a float64 array: the entry of positions and other real quantities."""
     return real_array(name, values, error, remedy).astype("float64")
 
 
@@ -146,7 +140,6 @@ def are_stages(value: Any) -> bool:
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:
-    """Return `value`, or the default settings for None; raise a SettingsError if it is of another kind."""
     if value is None:
         return kind()
     require(isinstance(value, kind), name, value, f"give {kind.__name__}(...), or None for the default.")
@@ -165,7 +158,6 @@ class Within:
 class Checked:
     """Base of dataclasses whose fields are checked against their annotations.
 
-    Checked are ranges (`Annotated[float, Within(0, 1)]`, whole numbers for int), bool, text, Literal and dataclasses.
     NumPy numbers become Python numbers, so that settings can be written as JSON.
     """
 

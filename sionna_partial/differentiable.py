@@ -1,16 +1,13 @@
 """Predicted distribution as a differentiable function of transmitter, materials, frequency and network weights.
 
-`tracing` provides paths and their derivatives, which a `tf.custom_gradient` hands to TensorFlow; features and networks
-are TensorFlow. Where links were traced, the distribution equals `Predictor.predict`.
-
-Limits of the gradients:
+Paths and their derivatives are from `tracing`; features and networks are TensorFlow. Where links were traced, the
+distribution equals `Predictor.predict`. Limits of the gradients:
 
 - Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
   missing; one that becomes invalid loses its power in a step, which has no derivative.
-- The unobserved length of a line has a derivative that jumps from cell to cell. When the transmitter moves, lengths in
-  unknown cells and in walls are the traced lengths times the ratio of `SmoothLengths`; a length of 0 remains 0.
-- The outputs of the map networks are linear between positions 15 cm to each side of the transmitter. Their derivative
-  jumps where a receiver passes the centre of one of their cells.
+- When the transmitter moves, lengths in unknown cells and in walls are the traced lengths times the ratio of
+  `SmoothLengths`, as exact lengths have derivatives that jump; a length of 0 remains 0.
+- The outputs of the map networks are linear between positions 15 cm to each side of the transmitter.
 - On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
 
@@ -76,7 +73,6 @@ _BORDER_CELLS = 1e-6
 """Distance from a border of patches at which a segment runs along it [cells]."""
 
 WINDOW_STEP_M = CELLS_M[0] / 2
-"""Distance from the transmitter to further windows [m]."""
 
 STEEPEST = 4.0
 """Largest ratio of the growth of a length and its smooth surrogate, for lines that touch a corner."""
@@ -94,15 +90,11 @@ _LIMITS = {
 
 
 class SmoothLengths:
-    """Length of segments in cells of one kind, smooth in their ends.
+    """Length of segments in cells of one kind, with continuous derivatives by their ends.
 
-    The length of `unobserved_lengths_m` has derivatives that jump at the corners of cells. Here the mask of the cells
-    (1 in the kind, 0 elsewhere) is interpolated bilinearly between cell centres before it is integrated along the
-    segment, so that edges become ramps of one cell.
-
+    The mask of the cells is interpolated bilinearly between cell centres before it is integrated along the segment.
     Across a straight edge lengths remain equal. They differ by a fraction of a cell at corners and ends near an edge,
-    and by up to half of the length along an edge. First derivatives are continuous and exact; on lines through cell
-    centres they are the mean of both sides. Everything outside the grid is unknown.
+    and by up to half of the length along an edge. Everything outside the grid is unknown.
     """
 
     def __init__(self, partial: PartialMap, kind: CellState) -> None:
@@ -138,8 +130,7 @@ class SmoothLengths:
 def _even_patches(mask: Bools) -> NDArray[np.int32]:
     """Return the distance to the next uneven patch, diagonals included; 0 in uneven patches.
 
-    A patch lies between four cell centres. It is even if their cells have one state: the interpolation is constant
-    there.
+    A patch lies between four cell centres, and is even if their cells have one state.
     """
     around = mask[:-1, :-1].astype(np.int8) + mask[:-1, 1:] + mask[1:, :-1] + mask[1:, 1:]
     even = around % 4 == 0
@@ -154,8 +145,8 @@ def _fill_integrals(
 ) -> None:
     """Integrate the interpolated mask u over the parameter t of segments, from 0 at the start to 1 at the end.
 
-    Points (N, 2) are in cells from the centre of the mask's first cell. Zeros in `integrals` (N, 5) become the
-    integrals of u, (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
+    Points (N, 2) are in cells from the centre of the first cell; `integrals` (N, 5) become the integrals of u,
+    (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
     """
     for i in range(len(ends)):
         start_x, start_y, end_x, end_y = starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1]
@@ -184,7 +175,6 @@ def _aside(start: float, end: float) -> float:
 
 @njit(cache=True)
 def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment, sums: Floats) -> None:
-    """Add the integrals of u, du/dx, du/dy, t du/dx and t du/dy along a segment to `sums` (5,)."""
     ny, nx = even.shape
     here, leave, line_x, line_y = enter_grid(segment, ny, nx)
     sums[0] += mask[0, 0] * (1.0 - max(0.0, leave - here))
@@ -228,8 +218,7 @@ class LinkDistribution(LinkPrediction):
     def coverage(self, threshold_db: float, softness_db: float = 0.0) -> Any:
         """Return the probability (N,) that the gain exceeds a threshold above -150 dB [dB].
 
-        `softness_db` is the standard deviation of an additional Gaussian spread of the gain [dB]: without uncertainty,
-        the probability is a step that has no slope.
+        `softness_db` is an additional Gaussian spread of the gain [dB]: without spread, the probability is a step.
         """
         covered = tf.zeros_like(self.p_los)
         for probability, mean_db, std_db in (
@@ -249,20 +238,19 @@ class DifferentiableScene:
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        Map of the building. The predictor of a link model is loaded again, so that its weights may change.
+        Map of the building. The predictor of a link model is loaded again, as its weights may change.
     predictor : None, "map", "paper", path or Predictor
         As in `predict_map`.
     trace_settings : TraceSettings, optional
         Without diffuse reflection, and on meshes without diffraction.
     scene_settings : SceneSettings, optional
-        Where the material of walls is unknown, complete links are averaged over its candidates, unless a call gives
-        constants of materials.
+        For an unknown material, complete links are averaged over candidates, unless a call gives constants.
 
     Raises
     ------
     MapError, SettingsError, PredictorError, BackendError
-        As `predict_map`; also for paths that only rays find, or for paths through walls on an incomplete map with a
-        predictor that was not trained on such paths.
+        As `predict_map`; also for paths that only rays find, or paths through walls on an incomplete map with a
+        predictor trained without them.
 
     Examples
     --------
@@ -309,12 +297,12 @@ class DifferentiableScene:
 
     @property
     def materials(self) -> tuple[str, ...]:
-        """Return the names of the M radio materials, in the order of arguments."""
+        """Names of the M radio materials, in the order of arguments."""
         return self.simulation.materials
 
     @property
     def weights(self) -> list[Any]:
-        """Return the variables of the networks."""
+        """Variables of the networks."""
         names = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
@@ -365,9 +353,7 @@ class DifferentiableLinks:
         thickness_m: Any = None,
         frequency_hz: Any = None,
     ) -> LinkDistribution:
-        """Evaluate the distribution without a new trace.
-
-        Arguments that are not given keep their traced values and take no time for derivatives.
+        """Evaluate the distribution without a new trace; arguments that are not given keep their traced values.
 
         Parameters
         ----------
@@ -427,7 +413,6 @@ class DifferentiableLinks:
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
-        """Return mean and standard deviation (N,) [dB] of the traced gain over unknown materials."""
         extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
         if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
             materials = WallMaterials.at(float(self.base.frequency_hz))
@@ -491,7 +476,6 @@ class DifferentiableLinks:
 
     @cached_property
     def _windows(self) -> NDArray[np.float32]:
-        """Return windows around the transmitter and around positions to the right, left, top and bottom."""
         steps_m = WINDOW_STEP_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
         return map_windows(self._scene.partial, self.base.tx_m[:2] + steps_m).astype(np.float32)
 
@@ -499,9 +483,8 @@ class DifferentiableLinks:
 class _Legs:
     """The straight legs of the Q indirect paths, and their lengths in unknown cells.
 
-    `paths` (Q,) are numbers of paths, `rx` (Q,) their receivers, `unobserved_m` (Q,) their traced lengths in unknown
-    cells [m], `strongest` (N,) the strongest path to each receiver, -1 for none. Legs join nodes, numbered in this
-    order: transmitter, receivers, vertices path by path.
+    `strongest` (N,) is the strongest path to each receiver, -1 for none. Legs join nodes in this order: transmitter,
+    receivers, vertices path by path.
     """
 
     def __init__(self, partial: PartialMap, paths: PathSet) -> None:
@@ -538,7 +521,7 @@ def _gain_db(power: Any) -> Any:
 
 
 def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return power (P,) and vertices (P, D, 3), 0 where there are none, for `given` `PARAMETERS`."""
+    """Return power (P,) and vertices (P, D, 3), 0 where there are none."""
 
     @tf.custom_gradient
     def evaluate(*tensors: Any) -> tuple[tuple[Any, Any], Callable[..., list[Any]]]:
@@ -575,15 +558,12 @@ def _pulled(slopes: Floats, upstream: Any) -> Any:
 
 
 def _once_only(slopes: Any) -> Any:
-    """Return derivatives that TensorFlow cannot differentiate again: a part would be missing."""
+    """Refuse second derivatives: a part would be missing."""
     return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
 
 
 def moved_lengths_m(lengths: SmoothLengths, exact_m: Floats, base: tuple[Floats, Floats], ends: tuple[Any, Any]) -> Any:
-    """Return lengths (N,) that change in proportion to smooth ones when the segments move.
-
-    `exact_m` [m] are the lengths at the ends `base` (N, 3), and `ends` are the present ones [m]. Lengths of 0 remain 0.
-    """
+    """Return lengths (N,) [m] that change from `exact_m` in proportion to smooth ones when the segments move."""
 
     @tf.custom_gradient
     def smooth_m(start: Any, end: Any) -> tuple[Any, Callable[[Any], list[Any]]]:

@@ -24,13 +24,12 @@ WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
 
 
 def later(name: str) -> Any:
-    """Return a function such as "plots.style:plot_map" that is imported when it is called."""
+    """Return a function such as "plots.style:plot_map", imported when it is called."""
     with optional_packages():
         return resolve_name(f"sionna_partial.{name}")
 
 
 def picture_html(line: str, plot: str, value: object) -> str:
-    """Return HTML of a line and of a figure of a value."""
     png = later("plots.style:figure_png")(later(plot)(value), width_px=THUMBNAIL_PX)
     return f'<code>{escape(line)}</code><br><img src="data:image/png;base64,{b64encode(png).decode()}">'
 
@@ -78,7 +77,7 @@ class Pictured(Shown):
 
 @contextmanager
 def reporting(progress: Progress | bool | None, *, command: bool = False) -> Iterator[Progress]:
-    """Open the receiver of progress reports: a callable itself, none for False, else a bar with the time left.
+    """Open the receiver of progress reports: a callable itself, none for False, else a bar.
 
     The bar appears after 2 s in terminals and notebooks; a `command` shows it after 0.1 s, and prints a line a minute
     without a terminal.
@@ -116,13 +115,12 @@ def counting(progress: CountProgress | bool | None, unit: str, *, command: bool 
 
 
 def part_of(report: Progress, low: float, high: float) -> Progress:
-    """Return a receiver for a part of the work, from one fraction to another."""
     return lambda fraction, message: report(low + (high - low) * fraction, message)
 
 
 @contextmanager
 def _bar(progress: object, command: bool, **options: Any) -> Iterator[Any]:
-    """Open a bar of tqdm that remains when the work is done, and vanishes before an error."""
+    """Open a bar of tqdm, which vanishes before an error."""
     require(progress is None or isinstance(progress, bool), "progress", progress, "give True, False or a callable.")
     shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
     drawn = sys.stderr.isatty() or hasattr(shell, "kernel")

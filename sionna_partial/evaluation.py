@@ -71,7 +71,7 @@ ENDS_SEEN = {"both": 2, "one": 1, "none": 0}
 """Number of ends of a link in observed cells."""
 
 WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
-"""Predictions for receivers anywhere: as if all were indoors, and by `LinkPrediction.anywhere`."""
+"""Predictions for receivers anywhere."""
 
 ALWAYS_OUTAGE = "always outage"
 
@@ -144,7 +144,6 @@ def measure(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> 
 
 
 def calibration(prediction: LinkPrediction, link_state: States, gain_db: Floats) -> Calibration:
-    """Return the calibration of link state and gain."""
     fractions = pit_fractions(prediction, link_state, gain_db, np.linspace(0.0, 1.0, PIT_BINS + 1))
     return Calibration(reliability(prediction, link_state), np.diff(fractions))
 
@@ -155,7 +154,6 @@ def gain_errors_db(prediction: LinkPrediction, link_state: States, gain_db: Floa
 
 
 def reliability(prediction: LinkPrediction, link_state: States) -> Reliability:
-    """Compare confidence and accuracy of the link state by bins."""
     confidence = np.max([prediction.p_outage, prediction.p_los, prediction.p_nlos], axis=0)
     bins = np.minimum((confidence * CONFIDENCE_BINS).astype(np.intp), CONFIDENCE_BINS - 1)
     links = np.bincount(bins, minlength=CONFIDENCE_BINS)
@@ -223,7 +221,7 @@ class Majority:
 
 @dataclass(frozen=True, eq=False)
 class Baselines(Shown):
-    """Baselines fitted to the training links of a predictor; `distance` uses the distance alone."""
+    """Baselines fitted to the training links of a predictor."""
 
     majority: Majority
     distance: Predictor
@@ -239,7 +237,7 @@ class Baselines(Shown):
         return cls(Majority.fit(links.link_state, links.gain_db), distance)
 
     def save(self, folder: Path) -> None:
-        """Write `majority.json`, `distance.keras` and its card into a folder."""
+        """Write the files into a folder."""
         self.distance.save(folder / DISTANCE_FILE)
         rows = zip(LinkState, self.majority.fractions, self.majority.means_db, self.majority.stds_db, strict=True)
         content = {
@@ -266,10 +264,7 @@ class Baselines(Shown):
 
 
 def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
-    """Return the features of N links on an empty map, where only the distance is known.
-
-    `frequency_hz` applies to features without a frequency.
-    """
+    """Return the features of N links on an empty map, where only the distance is known."""
     frequency_hz = phi.frequency_hz or frequency_hz
     gain_db = np.maximum(free_space_gain_db(phi.distance_m, frequency_hz), GAIN_FLOOR_DB)
     state = np.full(len(phi), LinkState.LOS)
@@ -277,10 +272,7 @@ def nothing_seen(phi: LinkFeatures, frequency_hz: float) -> LinkFeatures:
 
 
 def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
-    """Return the LOS probability of 3GPP TR 38.901 V18.0.0, Table 7.4.2-1, "Indoor - Mixed/Open office".
-
-    The distance (N,) is horizontal [m]; `office` is one of `OFFICES`.
-    """
+    """Return the LOS probability of 3GPP TR 38.901 V18.0.0, Table 7.4.2-1, at horizontal distances (N,) [m]."""
     d = distance_m
     if office == "mixed":
         near, far = np.exp(-(d - 1.2) / 4.7), 0.32 * np.exp(-(d - 6.5) / 32.6)
@@ -290,10 +282,9 @@ def indoor_los_probability(distance_m: Floats, office: str) -> Floats:
 
 
 def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, Floats]:
-    """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", LOS and NLOS.
+    """Return the path gain [dB] of 3GPP TR 38.901 V18.0.0, Table 7.4.1-1, "InH - Office", at distances (N,) [m].
 
-    The distance (N,) is three-dimensional [m]; the model covers 1 to 150 m and 0.5 to 100 GHz, and is extended to 1 cm
-    here. There is no shadow fading.
+    The model covers 1 to 150 m and 0.5 to 100 GHz, and is extended to 1 cm here. There is no shadow fading.
     """
     decades, frequency = np.log10(np.maximum(distance_m, 0.01)), np.log10(frequency_hz / 1e9)
     los_db = 32.4 + 17.3 * decades + 20.0 * frequency
@@ -302,10 +293,7 @@ def indoor_gain_db(distance_m: Floats, frequency_hz: float) -> dict[LinkState, F
 
 
 def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkPrediction:
-    """Predict with the indoor model of 3GPP TR 38.901, which depends on distance alone, and has no outage.
-
-    The gain has the shadow fading of Table 7.4.1-1. Both ends are assumed at the same height.
-    """
+    """Predict with the indoor model of 3GPP TR 38.901, which has no outage; both ends have the same height."""
     p_los = indoor_los_probability(phi.distance_m, office)
     gains_db = indoor_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
     nothing = np.zeros(len(phi))
@@ -318,7 +306,6 @@ def tr38901_indoor(phi: LinkFeatures, frequency_hz: float, office: str) -> LinkP
 def baseline_predictions(
     baselines: Baselines, paper: Predictor | None, phi: LinkFeatures, frequency_hz: float
 ) -> Mapping[str, LinkPrediction]:
-    """Predict N links with every baseline, the paper's predictor first."""
     distance = baselines.distance
     return ({} if paper is None else {"paper": paper.predict(phi)}) | {
         "distance only": distance.predict(nothing_seen(phi, frequency_hz)),
@@ -337,7 +324,6 @@ class Row:
     homes : {"test", "train"}
         The predictor was trained on "train" homes.
     receivers : {"indoor", "anywhere"}
-        Receivers drawn indoors, or from the whole map area.
     stage : float
         Exploration steps; below 1, the wanted observed fraction.
     ends_seen : {"all", "both", "one", "none"}
@@ -357,10 +343,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Difference:
-    """Predictor minus baseline on the same links: mean and standard error of the paired differences over test homes.
-
-    The error is nan for one home.
-    """
+    """Predictor minus baseline on the same links: mean and standard error over test homes, nan for one home."""
 
     receivers: str
     stage: float
@@ -432,9 +415,8 @@ def evaluate(
 
     Raises
     ------
-    PredictorError
-        If the data set or a predictor cannot be read; if the data set has no links, or was traced with other settings
-        than the predictor's; or if the predictor was trained on all homes.
+        If the data set or a predictor cannot be read, the data set has no links or other traces than the predictor's,
+        or the predictor was trained on all homes.
 
     Examples
     --------
@@ -500,14 +482,12 @@ def mean_and_error(values: Floats) -> tuple[float, float]:
 
 
 def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> dict[str, LinkPrediction]:
-    """Return the predictions for receivers anywhere, from the predictions for receivers indoors."""
     p_indoor = np.where(links.context.rx_seen, 1.0, model.predict_indoor(links.features))
     outage = indoors.anywhere(np.zeros(len(links)))
     return {WITH_INDOOR: indoors.anywhere(p_indoor), WITHOUT_INDOOR: indoors, ALWAYS_OUTAGE: outage}
 
 
 def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, ...]) -> Iterator[str]:
-    """Yield remarks on the homes that the baselines were trained on."""
     fitted = others["distance only"]
     those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
     yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
@@ -535,7 +515,6 @@ def _baselines_folder(model: Predictor) -> Path:
 
 
 def _shipped(model: Predictor) -> dict[str, Predictor]:
-    """Load the shipped predictors that are comparable to, and other than, `model`."""
     here, found = LinkTraces.of_settings(model.settings), {}
     for name in ("paper", "map"):
         try:

@@ -36,16 +36,16 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     ======== ==========================================================================================
     `.nc`    NetCDF 4 (CF conventions) of the whole Dataset.
     `.tif`   GeoTIFF, one float32 band for each variable, named by its description, NaN without receiver; local
-             metres, no coordinate reference system; settings as tags. Bands of several transmitters are named
+             metres, no coordinate reference system; settings as tags. Bands of several transmitters are
              "transmitter:variable".
     `.csv`   One row for each receiver, columns x_m, y_m and the variables; empty without receiver. Several
              transmitters have a first column tx.
     `.png`   The picture of `plot_coverage`.
-    `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold)
-             with a slider, and for several transmitters a choice and the best server.
+    `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold),
+             and the best server of several transmitters.
     `.yaml`  ROS map_server map in `raw` mode with a `.pgm`: occupancy 0 to 98 is the probability of outage in
-             percent; unknown (-1) without receiver and in unknown cells. A static layer of nav2 keeps a robot where
-             it has a link (`docs/live.md`). One transmitter; for several, save `network_map`.
+             percent; unknown (-1) without receiver and in unknown cells (`docs/live.md`). One transmitter; for
+             several, save `network_map`.
     ======== ==========================================================================================
 
     Parameters
@@ -125,7 +125,7 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     network : xarray.Dataset
         From `network_map`.
     path : path-like
-        Path of the file, which is replaced if it exists.
+        Path of the file.
 
     Raises
     ------
@@ -242,7 +242,6 @@ def _encode_table(table: Any) -> bytes:
 
 
 def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
-    """Write the YAML and PGM of a probability, both or none."""
     spacing_m = float(coverage.attrs["spacing_m"])
     corner_m = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
     quantity = {"quantity": f"probability of outage in percent, at most {MAX_COST}; 255 where unknown or no receiver"}
@@ -263,4 +262,3 @@ _ENCODERS: dict[str, Callable[[xr.Dataset], bytes]] = {
 }
 
 FORMATS = (*_ENCODERS, ".yaml")
-"""Suffixes that `save_coverage` accepts."""

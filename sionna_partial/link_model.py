@@ -37,7 +37,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
 
 KEPT_BLOCKS = 8
-"""Number of blocks of links, and of windows of transmitters, in the cache; 20 MB in all."""
+"""Number of cached blocks of links, and of windows of transmitters."""
 
 _LEAST_DEPTH = 2
 """Smallest `max_depth` for which the networks were trained."""
@@ -48,8 +48,7 @@ _log = logging.getLogger(__name__)
 class PredictedLinks(NamedTuple):
     """Features and prediction of N indoor receivers, P(indoor), and whether each link meets nothing unknown (N,).
 
-    `prediction` excludes the gain `antenna_db` (N,) of the transmitter's antenna, as measurements are compared without
-    it.
+    `prediction` excludes the gain `antenna_db` (N,) of the transmitter's antenna.
     """
 
     phi: LinkFeatures
@@ -66,7 +65,7 @@ class PredictedLinks(NamedTuple):
 
 
 class LinkModel:
-    """Predictions of any links on one map. Later calls reuse the loaded scene, the compiled kernels and recent links.
+    """Predictions of any links on one map. Later calls reuse the scene, the kernels and recent links.
 
     Every function that predicts on a map also accepts a link model: ``sp.place_transmitter(model)``.
 
@@ -82,7 +81,7 @@ class LinkModel:
     Attributes
     ----------
     simulation : Simulation
-        The trace, with `partial`, `trace_settings` and `scene_settings`.
+        The trace, with `partial` and settings.
     asked : None, str, path or Predictor
         The argument `predictor`.
 
@@ -148,11 +147,11 @@ class LinkModel:
 
     @property
     def predictor_of_map(self) -> AnyPredictor | None:
-        """The predictor; None on a complete map, where the trace from a known cell is the prediction."""
+        """The predictor; None on a complete map."""
         return None if self.partial.is_complete else self.predictor
 
     def update(self, partial: PartialMap) -> None:
-        """Replace the map, for instance after the robot has seen more; settings, networks and kernels are kept.
+        """Replace the map; settings, networks and kernels are kept.
 
         Raises
         ------
@@ -169,7 +168,7 @@ class LinkModel:
 
     @cached_property
     def _every_path(self) -> Simulation:
-        """Simulation without a tolerance, for antennas at receivers, which no selection of paths considers."""
+        """Simulation without a tolerance, for antennas at receivers."""
         settings = replace(self.simulation.trace_settings, power_tolerance_db=0.0)
         return Simulation(self.partial, settings, self.simulation.scene_settings)
 
@@ -209,7 +208,7 @@ class LinkModel:
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         """Return features and predictions of links, and whether each is complete.
 
-        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m], checked positions.
+        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m].
         """
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
@@ -243,8 +242,7 @@ class LinkModel:
     def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
         """Predict links from their features; complete links keep their trace.
 
-        Through walls, traces have residuals, too. For an unknown material of walls, the result is the mixture over its
-        candidates. Networks predict with the traced material.
+        For an unknown material of walls, the result is the mixture over its candidates.
         """
         features, prior = [phi], np.ones(1)
         if phi.path_power is not None:
@@ -258,7 +256,7 @@ class LinkModel:
     def _predict_under(
         self, features: Sequence[LinkFeatures], complete: Bools, traced: LinkFeatures
     ) -> list[LinkPrediction]:
-        """Predict links under each candidate; networks predict from the features as traced."""
+        """Predict links under each candidate; networks use the traced features."""
         traces = [LinkPrediction.of_trace(phi) for phi in features]
         if complete.all():
             return traces
@@ -282,10 +280,7 @@ class LinkModel:
         *,
         at_rx: bool = False,
     ) -> PredictedLinks:
-        """Trace and predict the links from (3,) to (N, 3) [m], checked positions; the latest blocks are kept.
-
-        With `at_rx` the antenna is at the receivers.
-        """
+        """Trace and predict the links from (3,) to (N, 3) [m]; the latest blocks are kept."""
         antenna = Antenna.of(antenna)
         if antenna.uniform_gain_dbi:
             return self.links(tx_m, rx_m, report).amplified(antenna.uniform_gain_dbi)
@@ -315,7 +310,7 @@ class LinkModel:
         return found
 
     def _complete(self, tx_m: Floats, rx_m: Floats) -> Bools:
-        """Return whether each link from (3,) to (N, 3) [m] meets nothing unknown: its trace is the prediction."""
+        """Return whether each link meets nothing unknown."""
         return is_enclosed(self.partial, np.broadcast_to(tx_m, rx_m.shape), rx_m)
 
 
@@ -325,7 +320,7 @@ def _drop_oldest(kept: dict[Any, Any]) -> None:
 
 
 def warn_of_other_traces(model: Predictor, settings: TraceSettings, scene_settings: SceneSettings) -> None:
-    """Warn if a predictor is used on traces of another kind than it was trained on."""
+    """Warn if a predictor was trained on other traces."""
     trained = model.settings
     if trained.through_walls != settings.through_walls:
         then, now = (f"{'through' if kind.through_walls else 'on opaque'} walls" for kind in (trained, settings))
@@ -349,7 +344,7 @@ def link_model_of(
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> LinkModel:
-    """Return a given link model, which keeps its predictor and settings, or make one of a map."""
+    """Return a given link model, or make one of a map."""
     if not isinstance(scene, LinkModel):
         return LinkModel(scene, predictor, trace_settings, scene_settings)
     given = {"predictor": predictor, "trace_settings": trace_settings, "scene_settings": scene_settings}

@@ -1,4 +1,4 @@
-"""Frozen dataclasses of settings, checked when built."""
+"""Settings: frozen dataclasses, checked when built."""
 
 import functools
 import inspect
@@ -55,16 +55,13 @@ HomeKind = Literal["apartment", "house", "office", "floor", "hall", "warehouse"]
 HOME_KINDS = get_args(HomeKind)
 
 NetworkKind = Literal["paper", "paths", "map"]
-"""Inputs of a predictor: the paper's features; also the walls along each path; also the map around the transmitter."""
+"""Inputs of a predictor."""
 
 Objective = Literal["coverage", "percentile"]
-"""Objective of a placement: mean predicted coverage, or gain of the worst tenth of the receivers."""
 
 Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
-"""Mappers whose rule makes a map of noisy readings."""
 
 Policy = Literal["random", "coverage"]
-"""Rule by which an exploring robot chooses frontiers."""
 
 Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
 Fraction = Annotated[float, Within(0.0, 1.0)]
@@ -80,9 +77,8 @@ _Result = TypeVar("_Result")
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
-    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default is the paper's layered drywall at
-    28 GHz, at every frequency; the conductivity of ``Material.named("drywall")`` decreases below 28 GHz, so that a wall
-    loses 10 dB less at 5 GHz.
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default is the paper's drywall at 28 GHz,
+    at every frequency; ``Material.named("drywall")`` loses 10 dB less at 5 GHz.
 
     Parameters
     ----------
@@ -95,7 +91,7 @@ class Material(Checked):
     itu : str or None
         Name of an ITU material (a key of `ITU_BANDS_GHZ`).
     conductivity_exponent : float
-        Exponent b of the conductivity's factor (f / 28 GHz)^b at a frequency f. Ignored for an ITU material.
+        Exponent b of the conductivity's factor (f / 28 GHz)^b. Ignored for an ITU material.
 
     Raises
     ------
@@ -131,8 +127,7 @@ class Material(Checked):
     def named(cls, name: str) -> "Material":
         """Return a wall material with its usual thickness.
 
-        Names are the keys of `WALL_MATERIALS`, and other materials of ITU-R P.2040-3 with a thickness of 10 cm. Sources
-        and measured losses: `docs/walls.md`.
+        Names are the keys of `WALL_MATERIALS`, and other materials of ITU-R P.2040-3 (10 cm). Sources: `docs/walls.md`.
 
         Examples
         --------
@@ -166,9 +161,7 @@ WALL_MATERIALS = {
     "door": Material(itu="chipboard", thickness_m=0.04),
     "metal": Material(itu="metal", thickness_m=0.005),
 }
-"""Wall materials with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less below; coated
-glass has the conductivity of its metal film.
-"""
+"""Wall materials with their usual thickness. Drywall has the paper's constants at 28 GHz and loses less below."""
 
 
 def material_name(material: Material) -> str:
@@ -189,8 +182,7 @@ class SceneSettings(Checked):
     ----------
     material : Material, str or None
         Material of walls, floor and ceiling, or of parts of a mesh without one; or a name for `Material.named`. None is
-        the map's material. If the map has none, the trace has drywall, and predictions through walls average over the
-        candidates of `WallMaterials`.
+        the map's material; without one, drywall is traced, and predictions through walls average over `WallMaterials`.
     bridge_gap_m : float
         Longest gap of UNKNOWN cells that is closed in a seen wall [m]. Gaps of FREE cells are closed up to two cells
         and 0.11 m.
@@ -199,12 +191,13 @@ class SceneSettings(Checked):
     ceiling : bool
         True for a ceiling above the floor.
     outline : {"lines", "cells"}
-        Walls as few straight lines fitted to the wall cells, or as the staircase through their centres, without
+        Walls as straight lines fitted to the wall cells, or as the staircase through their centres, without
         `bridge_gap_m`.
     geometries : int or None
         Number of geometries, 1 to 16, over which powers of links without line of sight are averaged: the mapped
         outlines, and outlines with vertices moved at random by 3 cm. None is 3 on nearly complete maps with range noise
-        (`PartialMap.wall_noise` above 0.05) and opaque walls, and 1 elsewhere. Gradients, channels, meshes, links with
+        (`PartialMap.wall_noise` above 0.05) and opaque walls, else 1. Gradients, channels, meshes, links with a folder
+        and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
         a folder and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
 
     Raises
@@ -246,29 +239,26 @@ class TraceSettings(Checked):
         One diffraction at a vertical edge: by exact beams on floor plans, by shooting rays on meshes, which is slow.
         None is True on floor plans and False on meshes.
     diffraction_walls : int
-        Largest number of wall reflections before the diffraction, and after it, on floor plans: 0, 1 or 2.
+        Largest number of wall reflections before, and after, the diffraction on floor plans: 0, 1 or 2.
     open_ends : bool
         True if walls of a floor plan also diffract at ends where observation stopped.
     power_tolerance_db : float or None
         Largest change of the power of a link's indirect paths by leaving out weak paths [dB], 0 to 1; 0 keeps every
-        path. None is 0.1 for powers and predictions, and 0 for channels (`TracedLinks.cir` and others), which are sums
-        of fields: links that were traced with None are traced again for them.
+        path. None is 0.1 for powers and predictions, and 0 for channels, for which links are traced again.
     refraction : bool or None
-        True if paths go through walls. None is True below 24 GHz, and False from there on, where the paper assumes
-        opaque walls.
+        True if paths go through walls. None is True below 24 GHz only, as the paper assumes opaque walls.
     max_walls : int
         Largest number of walls that a path goes through, 1 to 16, besides `max_depth`.
     wall_depth_m : float
-        Largest depth of one wall [m], 0 to 10. Successive faces on a path within it, without a free cell between them,
-        have the loss of one slab, as have the two faces of a closed body of a mesh. At 0 every face is a slab, as in
-        the exported scene.
+        Largest depth of one wall [m], 0 to 10. Successive faces within it, without a free cell between them, have the
+        loss of one slab, as have the two faces of a closed body of a mesh. At 0 every face is a slab, as in the
+        exported scene.
     diffuse_reflection : bool
-        Diffuse reflections. All paths are then found by shooting rays (Sionna RT's candidate generator), which is
-        slower.
+        Diffuse reflections. All paths are then found by shooting rays, which is slower.
     samples_per_tx : int
         Number of rays, where rays are shot.
     seed : int
-        Seed of the rays where rays are shot.
+        Seed of the rays.
 
     Raises
     ------
@@ -318,24 +308,22 @@ class SensorSettings(Checked):
     Parameters
     ----------
     range_noise_m : float
-        Standard deviation of range readings [m], independent between rays, at most 1. It makes walls ragged.
+        Standard deviation of range readings [m], independent between rays, at most 1.
     drift_m_per_m : float
-        Odometry drift per metre travelled [1], at most 1, in one random direction. Later walls are displaced, and walls
-        that are seen again may appear twice.
+        Odometry drift per metre travelled [1], at most 1, in one random direction; displaces later walls.
     missed_wall_fraction : float
-        Fraction of squares of half a metre in which walls return no reading [1], like glass, mirrors and black
-        surfaces. Their cells stay unknown, and nothing is seen through them.
+        Fraction of squares of half a metre in which walls return no reading [1], like glass. Their cells stay unknown.
     field_of_view_deg : float
         Horizontal angle around the heading [degree], in (0, 360]. The default is the camera of Active Neural SLAM
         (Chaplot et al., ICLR 2020, Section 4); a turning lidar has 360.
     range_m : float
-        Largest range [m], in (0, 100]; by default the 64 cells of 0.05 m of Active Neural SLAM.
+        Largest range [m], in (0, 100]; the default is from Active Neural SLAM.
     heading_noise_deg : float
         Standard deviation of the assumed heading [degree], independent between pictures, at most 180.
     missed_return_fraction : float
         Fraction of rays without a reading [1], at random. With any error, rays that graze a wall have none.
     fusion : {"slam_toolbox", "gmapping", "cartographer", "vacuum"}
-        Mapper whose rule and default parameters turn readings into walls (`FUSIONS`); "vacuum" also thins walls.
+        Mapper whose rule turns readings into walls (`FUSIONS`); "vacuum" also thins walls.
         Without errors all give the true map.
 
     Raises
@@ -378,10 +366,8 @@ MIXED_SENSORS = {
     "heading_noise_deg": (0.0, 0.5),
     "missed_return_fraction": (0.0, 0.1),
 }
-"""Ranges of the sensors of a data set with `sensor="mixed"`.
-
-Uniform distributions for the logarithm of the range, the field of view of cameras and the mapper; squares of uniform
-numbers for errors.
+"""Ranges of the sensors for `sensor="mixed"`: uniform logarithm of the range, field of view and mapper; squares of
+uniform numbers for errors.
 """
 
 
@@ -392,13 +378,12 @@ class DatasetSettings(Checked):
     Parameters
     ----------
     links_per_home : int
-        Number of links at each stage with receivers drawn from the free cells of the complete home, at least
-        `transmitters_per_home`; as many more have receivers drawn from the whole map area.
+        Number of links at each stage with receivers in free cells of the complete home, at least
+        `transmitters_per_home`; as many more have receivers anywhere in the map area.
     transmitters_per_home : int
-        Number of transmitters in free cells of the complete home, each with its own receivers.
+        Number of transmitters in free cells of the complete home.
     stages : tuple of int, or of float
-        Increasing exploration steps; or, all in [0, 1), observed fractions of the home's free area, which are
-        comparable between buildings.
+        Increasing exploration steps; or, all in [0, 1), observed fractions of the home's free area.
     seed : int
         Seed of positions and robot, combined with the home's name.
     tx_height_m, rx_height_m : float
@@ -406,15 +391,14 @@ class DatasetSettings(Checked):
     margin_m : float
         Margin of the map area around the known cells of the complete home [m].
     sensor : SensorSettings or "mixed"
-        Sensor of the robot; "mixed" draws one for each home from `MIXED_SENSORS`: a camera of 60 to 120 degrees for one
-        home in three, else a turning lidar.
+        Sensor of the robot; "mixed" draws one for each home from `MIXED_SENSORS`: a camera for one home in three, else
+        a turning lidar.
     short_link_fraction : float
-        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1]. In large buildings, most uniformly
-        drawn links are in outage.
+        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1]. In large buildings, most other links
+        are in outage.
     scene : SceneSettings
         Conversion of maps to scenes; drywall without a material.
     trace : TraceSettings
-        Settings of the traces.
     cir_paths : int
         Number of paths in the impulse responses of the complete map, the strongest of each link; 0 stores none.
 
@@ -465,8 +449,8 @@ class PredictorSettings(Checked):
     Parameters
     ----------
     networks : {"paper", "paths", "map"}
-        "paper" has the paper's networks, "paths" adds a network on the walls along paths, "map" adds it and networks on
-        the map around the transmitter. "paths" and "map" need features with a context (`link_features`).
+        "paths" adds a network on the walls along paths, "map" also networks on the map around the transmitter; both
+        need features with a context (`link_features`).
     frequency_hz : float
         Carrier frequency of the links [Hz].
     diffraction : bool
@@ -480,8 +464,7 @@ class PredictorSettings(Checked):
     learning_rate : float
         First learning rate of Adam, which falls to 0 along a cosine.
     minimum_links : int
-        A network of the paper with fewer links is not trained: it returns mean and standard deviation of its links and
-        a prior.
+        A network of the paper with fewer links is not trained: it returns moments of its links and a prior.
     seed : int
         Seed of initial weights and batches.
     through_walls : bool
@@ -519,14 +502,14 @@ class PlacementSettings(Checked):
     ----------
     objective : {"coverage", "percentile"}
         "coverage" maximises the weighted mean over receivers of P(gain > threshold). "percentile" maximises the mean
-        predicted gain [dB] of the worst tenth, with -150 dB for an outage: sorted by mean gain, receivers count in full
-        up to 5 % of the weight, and linearly less up to 15 %.
+        predicted gain [dB] of the worst tenth: sorted by mean gain, receivers count in full up to 5 % of the weight,
+        and linearly less up to 15 %; an outage has -150 dB.
     threshold_db : float
         Path gain above which a receiver is covered [dB], in (-150, 0].
     tx_height_m, rx_height_m : float
         Heights below the ceiling [m].
     seed : int
-        Seed of the grid of candidate positions. Equal seeds give equal bytes.
+        Seed of the grid of candidate positions.
 
     Raises
     ------
@@ -548,7 +531,7 @@ class PlacementSettings(Checked):
 
 
 def takes_settings(function: Callable[_Parameters, _Result]) -> Callable[_Parameters, _Result]:
-    """Let a function reject a setting given as an argument, naming the settings class for it."""
+    """Let a function reject a setting given as an argument, naming its class."""
     parameters = inspect.signature(function).parameters
     kinds: dict[str, Any] = {"trace_settings": TraceSettings, "scene_settings": SceneSettings}
     holders = {

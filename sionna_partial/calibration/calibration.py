@@ -194,16 +194,14 @@ def calibrate_materials(
     """Estimate permittivity and conductivity of walls, floor and ceiling from measured path gains.
 
     Paths are traced once; Sionna RT evaluates their power for any material. The whole plane of permittivity and
-    conductivity is searched, so that the result does not depend on the start, and refined by Newton's method with
-    derivatives from Dr.Jit. The result is the material whose reflection losses are nearest to their posterior mean. The
-    thickness is fixed.
+    conductivity is searched, so that the result does not depend on the start, and refined by Newton's method. The
+    result is the material whose reflection losses are nearest to their posterior mean. The thickness is fixed.
 
     Repeated measurements (both ends in the same cubes of 1 cm) are averaged. Links of a partial map are used if the
-    line of sight, or half of the NLOS power, is in observed space; outages are not used. `docs/calibration.md` explains
-    likelihood, prior and limits.
+    line of sight, or half of the NLOS power, is in observed space; outages are not used (`docs/calibration.md`).
 
-    `predict_map` with measurements does not need a calibration below 24 GHz, as it averages over materials. Calibrate
-    with a hundred or more path gains if reflections matter, or for channels and gradients.
+    `predict_map` with measurements averages over materials below 24 GHz and needs no calibration. Calibrate with a
+    hundred or more path gains if reflections matter, or for channels and gradients.
 
     Parameters
     ----------
@@ -317,7 +315,6 @@ class _Fit:
 
 
 def _has_offset(target: MaterialTarget, start: Sequence[Material]) -> bool:
-    """Return whether LOS links are off by more than reflections can change their gains."""
     if target.is_direct.sum() < FEWEST_DIRECT:
         message = "%d links in line of sight do not show an offset of all measured gains: calibrate with path gains"
         _log.warning(message, target.is_direct.sum())
@@ -397,7 +394,7 @@ class MeasuredBuilding:
     ) -> LinkPaths:
         """Find the paths of the measured links that may have relevant power.
 
-        The ends that are fewer transmit, except with diffraction, which is not reciprocal in Sionna RT.
+        The fewer ends transmit, except with diffraction, which is not reciprocal in Sionna RT.
         """
         traced = [*self.start.values()]  # what reflects all lets nothing through
         if not trace_settings.through_walls:
@@ -430,7 +427,6 @@ class MeasuredBuilding:
 
 
 def require_positions(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
-    """Check that radios can be at the measured positions, and that there are enough."""
     partial.require_positions("tx", measured.tx, least=0)
     partial.require_positions("rx", measured.rx, least=0)
     distance_m, limit_m = np.linalg.norm(measured.tx - measured.rx, axis=1), nearest_m(frequency_hz)
@@ -455,7 +451,6 @@ def start_materials(
 
 
 def custom_material(material: Material, frequency_hz: float) -> Material:
-    """Return a material with constants instead of formulas."""
     permittivity, conductivity_s_m = constants_of(material, frequency_hz)
     return Material(float(permittivity), float(conductivity_s_m), material.thickness_m)
 

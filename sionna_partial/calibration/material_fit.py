@@ -1,11 +1,8 @@
 """Posterior of materials, given measured gains: errors of gains, prior, search and descent.
 
-Most links deviate by normal noise [dB]. Links without line of sight may be stronger, because of paths that the map does
-not show, or weaker, because of obstacles: an exponential is added.
-
-Slabs of low loss interfere with themselves: over the refractive index, the loss of a reflection has fringes of half a
-wavelength over the thickness. The plane of index and conductivity is therefore searched on cells finer than the fringes
-before a descent; relevant cells are divided for integration.
+Links deviate by normal noise [dB]; an exponential is added for NLOS links with unmapped paths or obstacles. Slabs of
+low loss interfere with themselves: the plane of index and conductivity is searched on cells finer than the fringes
+before a descent.
 """
 
 import itertools
@@ -25,7 +22,6 @@ from sionna_partial.tracing.power import VACUUM_F_M, reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
 MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)
-"""Candidates for the parameters of GainErrors."""
 
 MISSED_DB, BLOCKED_DB = 8.0, 12.0
 """Mean excess of links with missed paths, mean loss of links with blocked paths [dB]."""
@@ -47,7 +43,6 @@ PRIOR_MEDIAN, PRIOR_SPREAD = np.array([[2.5], [0.15]]), np.array([[0.9], [1.8]])
 between 1.4 and 16, and 0.004 and 5 S/m, around the building materials of ITU-R P.2040-3 at 28 GHz."""
 
 IMPEDANCE_OHM = 376.73
-"""Impedance of the vacuum."""
 
 LOWEST_GAIN_DB = -300.0
 """Predicted gain of a link whose paths all vanish [dB]."""
@@ -68,7 +63,6 @@ MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
 """Number of fringes that are searched, of steps in each, and of fringes that are descended to the end."""
 
 CELLS_A_REPORT = 64
-"""Number of cells between reports of progress."""
 
 KEPT_FRACTION = 0.96
 """Fraction of a link's power on the kept paths, for all `EXTREMES`."""
@@ -96,16 +90,13 @@ class LinkPaths:
 
     @property
     def is_direct(self) -> Bools:
-        """Return whether each path (P,) is the line of sight."""
         return self.paths.is_direct
 
     def of_links(self, chosen: Bools) -> "LinkPaths":
-        """Return the paths of the links in a mask (N,), renumbered."""
         kept = chosen[self.link]
         return LinkPaths(self.paths.kept(kept), self.columns, (np.cumsum(chosen) - 1)[self.link[kept]])
 
     def power(self, permittivity: Floats, conductivity_s_m: Floats) -> Floats:
-        """Return |a|^2 of each path (P,) for M relative permittivities and conductivities [S/m]."""
         return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
 
     def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
@@ -193,7 +184,7 @@ _PENALTIES = np.array([each.penalty() for each in _ALL_ERRORS])
 def fit_errors(error_db: Floats, is_direct: Bools, variance: ArrayLike = 0.0) -> tuple[GainErrors, float]:
     """Return the most probable density of errors (N,) [dB], and its negative log posterior.
 
-    The variance [dB^2] of means of repeated measurements is in addition to the noise of the link.
+    `variance` [dB^2], of means of repeated measurements, is in addition to the noise of the link.
     """
     noise_db = np.sqrt(NOISES_DB[:, None] ** 2 + np.asarray(variance))
     densities = np.exp(np.maximum(_log_densities(error_db, noise_db), -700.0))
@@ -247,13 +238,12 @@ class Point:
 
     @property
     def logs(self) -> Floats:
-        """Return the logarithms (2, M) of permittivity less 1, and of conductivity [S/m]."""
         return np.log(self.values - LOSSLESS)
 
 
 @dataclass(frozen=True)
 class Posterior(Shown):
-    """Posterior of one material: K values with weights that sum to 1, all (K,)."""
+    """Posterior of one material: K values with weights that sum to 1."""
 
     permittivity: Floats
     conductivity_s_m: Floats
@@ -261,7 +251,7 @@ class Posterior(Shown):
 
     @property
     def values(self) -> Floats:
-        """Return permittivity and conductivity (2, K)."""
+        """Permittivity and conductivity (2, K)."""
         return np.stack([self.permittivity, self.conductivity_s_m])
 
     def deviation(self, values: Floats, best: float) -> float:
@@ -298,7 +288,6 @@ class MaterialTarget:
         self.is_direct[paths.link[paths.is_direct]] = True
 
     def at(self, values: Floats) -> Point:
-        """Evaluate materials (2, M)."""
         error_db = self.errors_db(self.paths.power(*values))
         errors, loss = fit_errors(error_db, self.is_direct, self.variance)
         return Point(values, self.weight * loss + prior_loss(values), errors)
@@ -308,15 +297,13 @@ class MaterialTarget:
         return float(np.median((self.gain_db - self.gains_db(power))[self.is_direct]))
 
     def errors_db(self, power: Floats) -> Floats:
-        """Return measured less predicted gains, without the offset (N,) [dB]."""
         return self.gain_db - self.gains_db(power) - (self.offset_db(power) if self.has_offset else 0.0)
 
     def gains_db(self, power: Floats) -> Floats:
-        """Return the gains (N,) [dB] from the power of the paths (P,)."""
         return np.maximum(link_gains_db(power, self.paths.link, len(self.gain_db)), LOWEST_GAIN_DB)
 
     def slopes(self, point: Point) -> tuple[Floats, Floats]:
-        """Return gradient (2 M,) and curvature (2 M, 2 M) of the loss over the logarithms."""
+        """Return gradient (2 M,) and curvature (2 M, 2 M) over the logarithms."""
         link, count = self.paths.link, len(self.gain_db)
         power, slopes = self.paths.slopes(*point.values)
         total = np.maximum(np.bincount(link, weights=power, minlength=count), 1e-30)
@@ -332,9 +319,9 @@ class MaterialTarget:
 
 
 def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: int = 30) -> tuple[list[Point], Floats]:
-    """Minimise the loss by Newton's method with damping (Levenberg and Marquardt).
+    """Minimise the loss by damped Newton steps (Levenberg and Marquardt).
 
-    Returns the start and all steps that reduced the loss, and the curvature (2 M, 2 M) at the last.
+    Return the start and all steps that reduced the loss, and the last curvature (2 M, 2 M).
     """
     steps, damping = [start], 1e-3
     gradient, curvature = target.slopes(start)
@@ -358,12 +345,10 @@ def descend(target: MaterialTarget, start: Point, report: Progress, most_steps: 
 
 
 def prior_loss(values: Floats) -> float:
-    """Return the negative log prior of log materials (2, M), up to a constant."""
     return 0.5 * float(((np.log((values - LOSSLESS) / PRIOR_MEDIAN) / PRIOR_SPREAD) ** 2).sum())
 
 
 def prior_posterior() -> Posterior:
-    """Return the prior of a material as a posterior."""
     spread = np.linspace(-3.0, 3.0, 31)
     values = LOSSLESS + PRIOR_MEDIAN * np.exp(PRIOR_SPREAD * np.reshape(np.meshgrid(spread, spread), (2, -1)))
     weight = np.outer(np.exp(-0.5 * spread**2), np.exp(-0.5 * spread**2)).ravel()
@@ -386,7 +371,6 @@ class _Plane:
         self._points: dict[tuple[float, float], Point] = {}
 
     def evaluate(self, cells: Floats, begin: float, end: float) -> Floats:
-        """Evaluate cells, with progress from `begin` to `end`."""
         values = np.repeat(self._start.values[None], cells.shape[1], axis=0)
         values[:, 0, self._which], values[:, 1, self._which] = cells[0] ** 2, np.exp(cells[1])
         for first in range(0, len(values), CELLS_A_REPORT):
@@ -403,7 +387,6 @@ class _Plane:
         return np.array([each.loss for each in self.points(cells)])
 
     def fractions(self, cells: Floats) -> Floats:
-        """Return the fraction (K,) of the posterior in each cell, measured in log(permittivity - 1)."""
         loss = self.losses(cells)
         area = cells[2] * cells[3] * 2.0 * cells[0] / (cells[0] ** 2 - 1.0)
         mass: Floats = np.exp(loss.min() - loss) * area

@@ -31,7 +31,6 @@ from sionna_partial.resources import optional_packages
 from sionna_partial.tracing.links import TracedLinks
 
 Layout = Literal["sionna", "deepmimo"]
-"""Names and axes of the arrays in a file."""
 
 SUFFIXES = (".zarr", ".nc", ".h5")
 
@@ -45,12 +44,11 @@ _AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
     **{"a": ("c", ((*_PAIR, "path"),)), "delay_s": ("f", (("link", "path"), (*_PAIR, "path")))},
     "h": ("c", ((*_PAIR, "frequency"), (*_PAIR, "tap"))),
 }
-"""Kinds of dtypes and allowed axes of variables."""
 
 _ATTRIBUTES = ("frequency_hz", "power_tolerance_db", "synthetic_array", "normalize_delays", "bandwidth_hz")
 
 CHUNK_BYTES = 50_000_000
-"""Size of the coefficients that are written together [bytes]."""
+"""Size of coefficients that are written together [bytes]."""
 
 MAX_BYTES = 2**44
 """Largest file that is opened [bytes]; only used parts are read."""
@@ -80,7 +78,7 @@ def save_channels(
     Parameters
     ----------
     channels : TracedLinks or xarray.Dataset
-        Links, whose impulse responses are computed block by block, or the result of `cir`, `cfr` or `taps`.
+        Links, whose responses are computed block by block, or the result of `cir`, `cfr` or `taps`.
     path : path-like
         A new `.zarr` folder, or a `.nc` or `.h5` file.
     layout : {"sionna", "deepmimo"}
@@ -130,7 +128,6 @@ def save_channels(
 
 
 def checked_target(path: str | os.PathLike[str], layout: str) -> Path:
-    """Check suffix, layout and folder of a target."""
     require_choice("layout", layout, get_args(Layout))
     target = output_path(path)
     if target.suffix not in SUFFIXES:
@@ -195,7 +192,6 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
-    """Return impulse responses (tx, rx, rx_ant, tx_ant, path) that are computed when they are written."""
     each, receivers = arrays.paths, len(arrays.paths.rx)
     path_bytes = 8 * len(arrays.rx) * len(arrays.tx) * (1 if arrays.synthetic_array else 2)
     at_once = max(1, CHUNK_BYTES // max(1, arrays.most * path_bytes))
@@ -230,7 +226,6 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
 
 
 def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
-    """Return the result of `cir`, `cfr` or `taps` with transmitters and receivers on separate axes."""
     require(not options, "options", ", ".join(options), "these channels are computed: give them to cir, cfr or taps.")
     axes = _checked_axes(channels)
     tx, rx = (np.unique(channels[name]) for name in ("tx", "rx"))

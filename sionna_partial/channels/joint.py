@@ -1,8 +1,7 @@
 """Gaussian latents of links, correlated where links cross the same unknown cells.
 
-A latent is a weighted sum of a Gaussian field over the plane along the direct line, as in the network shadowing model
-of Agrawal and Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Transactions on Wireless
-Communications, 2009); unknown cells weigh most.
+A latent is a weighted sum of a Gaussian field along the direct line, as in the network shadowing model of Agrawal and
+Patwari (Correlated Link Shadow Fading in Multi-Hop Wireless Networks, IEEE Trans. Wireless Communications, 2009).
 """
 
 import math
@@ -26,7 +25,7 @@ KNOWN_WEIGHT = 0.1
 """Weight of a known cell; unknown cells have weight 1."""
 
 OWN_VARIANCE = 0.1
-"""Fraction of a latent's variance that is not shared. `benchmarks/joint_links.py` fits all three."""
+"""Fraction of a latent's variance that is not shared (`benchmarks/joint_links.py`)."""
 
 _CELL_M, _MOST_CELLS = 0.35, 4096
 _POINTS = 48
@@ -35,12 +34,11 @@ _FEWEST_DRAWS, _LINKS_AT_ONCE = 64, 1000
 
 @dataclass(frozen=True, eq=False)
 class JointLatents:
-    """Standard normal latents of links, correlated for links through the same unknown cells."""
+    """Standard normal latents of links."""
 
     partial: PartialMap
 
     def correlation(self, tx_m: Floats, rx_m: Floats) -> Floats:
-        """Return the correlation (L, L) of links between `tx_m` (L, 3) and `rx_m` (L, 3)."""
         smooth = np.concatenate([*self._smoothed(tx_m, rx_m)])
         return (1.0 - OWN_VARIANCE) * (smooth @ smooth.T) + OWN_VARIANCE * np.eye(len(smooth))
 
@@ -67,7 +65,6 @@ class JointLatents:
 
     @cached_property
     def _step(self) -> int:
-        """Return the edge of a cell of the field, in cells of the map."""
         edge_m = max(_CELL_M, math.sqrt(self.partial.state.size / _MOST_CELLS) * self.partial.resolution_m)
         return max(1, math.ceil(edge_m / self.partial.resolution_m))
 
@@ -119,7 +116,6 @@ def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -
 
 
 def _evenly_spread(shared: Floats, rng: np.random.Generator, count: int) -> Floats:
-    """Return the quantiles (count, L) of latents with this shared part (L, draws)."""
     latent = math.sqrt(1.0 - OWN_VARIANCE) * shared
     latent += math.sqrt(OWN_VARIANCE) * rng.standard_normal(latent.shape, np.float32)
     rank = latent.argsort(axis=1).argsort(axis=1)[:, :count]

@@ -30,7 +30,7 @@ BLOCK_BYTES = 4_000_000
 """Size of coefficients that are computed together, to fit caches [bytes]."""
 
 WORK_BYTES = 100_000_000
-"""Approximate memory of functions of delays, or of beams, that are computed together [bytes]."""
+"""Memory of functions of delays, or of beams, that are computed together [bytes]."""
 
 UPRIGHT = 1e-3
 """Largest change of the direction's vertical part at a vertical edge."""
@@ -39,7 +39,6 @@ FIRST_TAP, MORE_TAPS = -6, 6
 """Default first tap, and taps after the longest path: the sinc filter is 5 % at the sixth."""
 
 PATHS_AT_ONCE = 20_000
-"""Largest number of paths with beams that are computed together."""
 
 _BEAM_BYTES, _PAIR_BYTES = 32, 48
 """Memory of a beam of a path, and of a pair of beams [bytes]."""
@@ -70,7 +69,6 @@ class ArrayPaths:
         synthetic_array: bool = True,
         normalize_delays: bool = True,
     ) -> "ArrayPaths":
-        """Check the arguments of `TracedLinks.cir`."""
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
             require_bool(name, value)
         paths = with_every_path(paths)
@@ -88,12 +86,10 @@ class ArrayPaths:
 
     @property
     def links(self) -> int:
-        """Return the number of links, T N."""
         return len(self.paths.tx.reshape(-1, 3)) * len(self.paths.rx)
 
     @property
     def antennas(self) -> str:
-        """Return the numbers of antennas as text."""
         return f"{len(self.rx)} x {len(self.tx)} antennas"
 
     @cached_property
@@ -103,7 +99,6 @@ class ArrayPaths:
 
     @property
     def most(self) -> int:
-        """Return the largest number of paths of a link."""
         return int(np.diff(self.first).max(initial=0))
 
     @property
@@ -113,7 +108,6 @@ class ArrayPaths:
         return coefficients * (32 if self.synthetic_array else 80)
 
     def empty(self, links: int) -> tuple[NDArray[np.complex64], Floats]:
-        """Return arrays for `Block.fill`: 0 and NaN."""
         shape = links, self.most, len(self.rx), len(self.tx)
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
 
@@ -128,12 +122,10 @@ class ArrayPaths:
             start = stop
 
     def blocks(self) -> Iterator["Block"]:
-        """Compute the coefficients of some links at a time."""
         for span in self.spans(max(1, BLOCK_BYTES // (16 * len(self.tx) * len(self.rx)))):
             yield self.block(*span)
 
     def block(self, links: slice, rows: slice, first: Indices) -> "Block":
-        """Compute the coefficients of one of the `spans`."""
         delay_s = np.asarray(self.paths.delay_s[rows])[:, None, None]
         if self.synthetic_array:
             delay_s = _after_shortest(delay_s, first) if self.normalize_delays else delay_s
@@ -175,9 +167,9 @@ class ArrayPaths:
     def _longer_m(self, rows: slice) -> Floats:
         """Return the extra length (P, A_rx, A_tx) [m] of paths between antennas over the centres.
 
-        A path of reflections is a straight line from the image of the transmitter, which moves by M dt if the
-        transmitter moves by dt. At a vertical edge the point of diffraction follows both ends: the path is straight in
-        the unfolded half planes. Other edges and diffuse reflections keep their points.
+        A path of reflections is a straight line from the image of the transmitter. At a vertical edge the point of
+        diffraction follows both ends: the path is straight in the unfolded half planes. Other edges and diffuse
+        reflections keep their points.
         """
         unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
         rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
@@ -228,7 +220,6 @@ def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
 
 
 def _after_shortest(delay_s: Floats, first: Indices) -> Floats:
-    """Return delays (P, ., .) after the shortest of each link."""
     reached, count = np.flatnonzero(np.diff(first)), np.diff(first)
     if not len(reached):
         return delay_s
@@ -249,7 +240,6 @@ class Block:
     delay_s: Floats
 
     def fill(self, a: NDArray[np.complex64], delay_s: Floats) -> None:
-        """Fill arrays (links, paths, A_rx, A_tx); delays may be (links, paths)."""
         count = np.diff(self.first)
         link = np.repeat(np.arange(len(count)), count)
         number = np.arange(len(link)) - np.repeat(self.first[:-1], count)
@@ -275,7 +265,6 @@ class Unfolded:
 
     @classmethod
     def of(cls, paths: "TracedLinks", rows: slice) -> "Unfolded":
-        """Walk along paths from the transmitter."""
         types, vertices_m = np.asarray(paths.interactions[rows]), np.asarray(paths.vertices_m[rows])
         rx_m = paths.rx[paths.path_rx[rows]]
         here_m, (count, depth) = paths.tx.reshape(-1, 3)[paths.path_tx[rows]], types.shape
@@ -423,7 +412,6 @@ def _filtered(
 
 
 def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
-    """Return a Dataset of variables with transmitters and receivers, and the settings as attributes."""
     each, count = arrays.paths, len(arrays.paths.rx)
     tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
     tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
@@ -438,7 +426,6 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
 
 
 def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: float, work_bytes: int) -> None:
-    """Raise a MemoryLimitError if all links with working memory take more than `memory_gb`."""
     require_number("memory_gb", memory_gb, 0.0, 1e6, open_low=True)
     size_gb = (arrays.links * link_bytes + work_bytes) / 1e9
     if size_gb > memory_gb:
@@ -531,7 +518,6 @@ def beam_gains(
 
 
 def _weights(name: str, codebook: ArrayLike, antennas: Antennas) -> NDArray[np.complex64]:
-    """Return the weights (beams, patterns, positions) of a codebook (beams, antennas)."""
     count = len(antennas)
     remedy = f"give (beams, {count}) weights up to {MAX_WEIGHT:g}, one for each antenna, as dft_codebook does."
     weights = real_array(name, codebook, SettingsError, remedy, kinds="iufc")

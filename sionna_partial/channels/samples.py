@@ -53,8 +53,8 @@ _STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
 class ChannelSamples(Shown):
     """n draws of the channels of links, from `sample_channels`.
 
-    A draw is one possible building: links through the same unseen space are correlated. Powers, delays and angles are
-    drawn; phases through unseen space are uniform. Paths are computed on request, and are the same each time.
+    A draw is one possible building: links through the same unseen space are correlated. Phases through unseen space are
+    uniform. Paths are computed on request, and are the same each time.
 
     Parameters
     ----------
@@ -71,7 +71,6 @@ class ChannelSamples(Shown):
     _draws: _Draws = field(repr=False)
 
     def __len__(self) -> int:
-        """Return the number of draws n."""
         return len(self.link_state)
 
     def links(self, draw: int) -> TracedLinks:
@@ -109,19 +108,19 @@ class ChannelSamples(Shown):
         return replace(traced, tx=tx_m, **columns)
 
     def cir(self, **options: Any) -> xr.Dataset:
-        """Return channel impulse responses (see `TracedLinks.cir`) along a first dimension "draw"."""
+        """Return `TracedLinks.cir` along a first dimension "draw"."""
         return self._by_draw(self.drawn.cir(**self._tiled(options)))
 
     def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> xr.Dataset:
-        """Return channel frequency responses (see `TracedLinks.cfr`) along a first dimension "draw"."""
+        """Return `TracedLinks.cfr` along a first dimension "draw"."""
         return self._by_draw(self.drawn.cfr(frequencies_hz, **self._tiled(options)))
 
     def beam_gains(self, codebook: ArrayLike, rx_codebook: ArrayLike | None = None, **options: Any) -> xr.Dataset:
-        """Return gains of pairs of beams (see `TracedLinks.beam_gains`) along a first dimension "draw"."""
+        """Return `TracedLinks.beam_gains` along a first dimension "draw"."""
         return self._by_draw(self.drawn.beam_gains(codebook, rx_codebook, **self._tiled(options)))
 
     def spreads(self) -> xr.Dataset:
-        """Return delay and angular spreads (see `TracedLinks.spreads`) along a first dimension "draw".
+        """Return `TracedLinks.spreads` along a first dimension "draw".
 
         Examples
         --------
@@ -168,9 +167,10 @@ def sample_channels(
     """Draw states, gains and paths of links on a partial map n times.
 
     State and gain of each link are drawn from the distribution of `predict_map`; with 64 draws or more, states occur as
-    often as predicted. Shared spatial latents (`JointLatents`) make a draw one possible building: links behind the same
-    unseen wall fail together. Given state and gain, a draw contains the traced paths in observed space, others with a
-    learned probability, and analogues from procedural homes (`PathModel`). On a complete map every draw is the trace.
+    often as predicted. Shared spatial latents (`JointLatents`) make a
+    draw one possible building: links behind the same unseen wall fail together. Given state and gain, a draw contains
+    the traced paths in observed space, others with a learned probability, and analogues from procedural homes
+    (`PathModel`). On a complete map every draw is the trace.
 
     Parameters
     ----------
@@ -237,8 +237,6 @@ def sample_channels(
 
 
 class _Draws:
-    """n draws of L links: `state` and `gain_db` (n, L), and their paths."""
-
     def __init__(
         self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
     ) -> None:
@@ -280,12 +278,10 @@ class _Draws:
         self._latest: tuple[int, dict[str, NDArray[Any]]] = -1, {}
 
     def all_paths(self) -> dict[str, NDArray[Any]]:
-        """Return the columns of `TracedLinks` for all draws."""
         ordered = [self._ordered(block) for block in self._blocks]
         return self._with_vertices({name: np.concatenate([each.pop(name) for each in ordered]) for name in _COLUMNS})
 
     def paths_of(self, draw: int) -> dict[str, NDArray[Any]]:
-        """Return the columns of `TracedLinks` for one draw."""
         number = int(self._block_of_draw[draw])
         if self._latest[0] != number:
             self._latest = number, self._ordered(self._blocks[number])
@@ -305,7 +301,6 @@ class _Draws:
         return {name: np.concatenate([getattr(part, name) for part in parts]).take(order, axis=0) for name in _COLUMNS}
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
-        """Return the paths of some draws: certain links, surviving and direct paths, analogues."""
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
         yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
         state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
@@ -343,7 +338,6 @@ class _Draws:
         return paths[kept], at[kept], power[kept]
 
     def _analogues(self, draws: Indices, state: States, gain_db: Floats, survivors: Floats) -> Indices:
-        """Return analogues (D, U) of U uncertain links; -1 in outage."""
         analogue = np.full(survivors.shape, -1)
         for each in (LinkState.LOS, LinkState.NLOS):
             row, link = np.nonzero(state == each)
@@ -353,7 +347,6 @@ class _Draws:
         return analogue
 
     def _of_analogues(self, draws: Indices, analogue: Indices, power: Floats, rng: np.random.Generator) -> SolvedPaths:
-        """Return paths of analogues (D, U) with total power (D, U), mirrored at random."""
         row, link = np.nonzero(power > 0.0)
         chosen, mirror = analogue[row, link], rng.choice([-1.0, 1.0], len(row))
         first, count = self._model.first[chosen], np.diff(self._model.first)[chosen]
@@ -376,7 +369,6 @@ class _Draws:
     def _copies(
         self, draw: Indices, paths: Indices, scale: Floats | None, rng: np.random.Generator | None
     ) -> SolvedPaths:
-        """Return traced paths in some draws, with a random phase through unseen space."""
         columns = {name: getattr(self.traced, name).take(paths, axis=0) for name in _COLUMNS}
         if rng is not None and scale is not None:
             turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)

@@ -43,7 +43,6 @@ ANTENNA = "tx_antenna"
 """Antenna: attribute for one transmitter, coordinate along "tx" for several."""
 
 _OF_ALL = ("observed", "cell_state", "wall_parts", ROOM)
-"""Variables that do not depend on the transmitter."""
 
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
 """Required attributes and their lower limits."""
@@ -55,7 +54,6 @@ _PLOT = "plots.coverage_plot:plot_coverage"
 
 
 def flags(meanings: Mapping[str, int], kind: type[np.integer[Any]] = np.uint8) -> dict[str, Any]:
-    """Return the CF attributes of a variable with flags."""
     return {"flag_values": np.array([*meanings.values()], dtype=kind), "flag_meanings": " ".join(meanings)}
 
 
@@ -94,7 +92,6 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
 def link_columns(
     phi: LinkFeatures, prediction: LinkPrediction, p_indoor: Floats, *, anywhere: bool
 ) -> dict[str, NDArray[Any]]:
-    """Return the values (N,) of the variables that depend on the links."""
     if anywhere:
         prediction = prediction.anywhere(p_indoor)
     columns = {name: getattr(prediction, name) for name in (*DISTRIBUTION, *COMPONENTS)} | {
@@ -141,7 +138,6 @@ def provenance(simulation: Simulation, model: AnyPredictor | None) -> dict[str, 
 
 
 def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.Dataset:
-    """Add the posterior of the transmitter position."""
     axes = {
         f"tx_{name}": (f"tx_{name}", values, {"long_name": f"{name} of the transmitter", "units": "m"})
         for name, values in (("x", posterior.x_m), ("y", posterior.y_m))
@@ -153,7 +149,6 @@ def with_posterior(coverage: xr.Dataset, posterior: TransmitterPosterior) -> xr.
 
 
 def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
-    """Join the maps of several transmitters along "tx"."""
     positions_m = np.array([each.attrs.pop("transmitter_m") for each in maps])
     antennas = "tx", [each.attrs.pop(ANTENNA) for each in maps]
     coordinates: dict[str, Any] = {
@@ -222,7 +217,6 @@ def _require_values(coverage: xr.Dataset) -> None:
 
 
 def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
-    """Return the coverage of each transmitter by name, "" for a single one; see `require_coverage`."""
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         return {"": require_coverage(coverage)}
     names = [str(name) for name in coverage["tx"].to_numpy()]
@@ -392,14 +386,6 @@ class CoverageAccessor:
             On `floor`: "observed" (free cells), "all" (weighted by `p_indoor`; 1 in free cells) and the rooms of the
             map. `fraction` has at least that probability, `fraction_mean` is the mean probability, `area_m2` the size.
             Fractions are NaN on an empty floor. Several transmitters are on `tx`.
-
-        Examples
-        --------
-        >>> import sionna_partial as sp
-        >>> cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]
-        >>> coverage = sp.predict_map(sp.map_from_array(cells, resolution_m=1.0), (1.5, 1.5, 1.5), spacing_m=0.5)
-        >>> coverage.radio.area(-67.0, eirp_dbm=20.0).fraction.sel(floor="observed").item()
-        1.0
         """
         require_number("threshold_dbm", threshold_dbm, -400.0, 400.0)
         require_number("probability", probability, 0.0, 1.0)
@@ -454,9 +440,9 @@ class CoverageAccessor:
         return LinkPrediction(**columns).probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
 
     def radio_map(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> Any:
-        """Return the mean path gain as a radio map of Sionna RT, for `scene.preview`, `scene.render` and `show`.
+        """Return the mean path gain as a radio map of Sionna RT; cells without receiver or in outage are empty.
 
-        Cells without receiver or in outage are empty. The transmitters of the coverage replace those in the scene.
+        The transmitters of the coverage replace those in the scene.
 
         Parameters
         ----------
@@ -480,8 +466,8 @@ class CoverageAccessor:
     def stock_gain(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> xr.DataArray:
         """Return the path gain [dB] of Sionna RT's `RadioMapSolver` in the exported scene, on the same grid.
 
-        Settings and transmitters are taken from the coverage. Compare with `partial_gain_db`, the trace of the same
-        scene by this package: the solver averages power over cells, misses rays, and counts crossed walls in the depth.
+        Settings and transmitters are taken from the coverage. Compare with `partial_gain_db`: the solver averages power
+        over cells, misses rays, and counts crossed walls in the depth.
 
         Parameters
         ----------
@@ -541,7 +527,6 @@ class CoverageAccessor:
 
 
 def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
-    """Return the position of the transmitter, or the number of transmitters, as text."""
     if len(maps) > 1:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()

@@ -1,4 +1,4 @@
-"""predict_map: grid of receivers -> blocks of links -> mean over positions, measurements -> xarray.Dataset."""
+"""predict_map: receivers on a grid -> links -> mean over positions, measurements -> xarray.Dataset."""
 
 from __future__ import annotations
 
@@ -57,20 +57,18 @@ from sionna_partial.tracing.antennas import Antenna, AntennaPattern
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
 RECEIVERS = ("indoor", "anywhere")
-"""Receivers that probabilities and gains refer to: indoors (default), or anywhere."""
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
-"""Antennas of transmitters: one for all, or one each."""
 
 POSITIONS = 8
 """Number of positions over which the coverage of an unknown transmitter is averaged."""
 
 LARGE_OFFSET_DB = 15.0
-"""Smallest offset of measurements that is logged as an offset of powers [dB]."""
+"""Smallest offset of measurements that is logged [dB]."""
 
 UNSURE_P = 0.05
-"""Smallest logged probability of the less probable kind of measurements (powers, path gains)."""
+"""Smallest logged probability of the less probable kind of measurements."""
 
 LOCATING_FRACTION = 0.3
 """Fraction of the progress bar for finding a transmitter."""
@@ -83,7 +81,6 @@ BLOCK_RECEIVERS = (500, 8_000)
 """Smallest and largest size of a block."""
 
 MAX_RECEIVERS = 2_000_000
-"""Largest number of receivers of a coverage map."""
 
 _WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
@@ -111,15 +108,15 @@ def predict_map(
     The known part of the map is traced. The predictor turns the traced links and the unobserved lengths into
     distributions (paper, Section III). On a complete map the trace is the prediction.
 
-    Probabilities and gains are conditional on an indoor receiver, as in the paper; `p_indoor` is the probability of
-    that. With ``receivers="anywhere"`` they include outdoor receivers, which are in outage. On a complete map free
-    cells are indoors, all others outdoors.
+    Probabilities and gains are conditional on an indoor receiver; `p_indoor` is its probability. With
+    ``receivers="anywhere"`` they include outdoor receivers, which are in outage. On a complete map free cells are
+    indoors, all others outdoors.
 
     Receivers within 1.1 cm of a wall or of the transmitter (or within wavelength / 4 pi, where Friis' formula exceeds 0
-    dB) have `valid` False and NaN in floating-point variables and link states. A NetCDF file stores these link states
-    as 255, its `_FillValue`.
+    dB) have `valid` False and NaN in floating-point variables and link states; a NetCDF file stores these states as
+    255.
 
-    Without `tx`, the transmitter is located by measurements: `p_transmitter` is the posterior of its position, and
+    Without `tx`, measurements locate the transmitter: `p_transmitter` is the posterior of its position, and
     probabilities and gains are averaged over 8 positions drawn from it.
 
     Parameters
@@ -223,7 +220,7 @@ class Receivers:
 
 @dataclass(frozen=True)
 class Transmitter:
-    """A transmitter to predict; `position_m` (3,) is None if measurements locate it."""
+    """A transmitter to predict, at `position_m` (3,) or located by measurements (None)."""
 
     name: str
     position_m: Floats | None
@@ -256,7 +253,6 @@ class CoverageJob:
     """Assimilated measurements of other transmitters, by the transmitter they are used for."""
 
     def coverage(self, transmitter: Transmitter, report: Progress) -> tuple[xr.Dataset, Floats]:
-        """Return the coverage map of a transmitter, and the probabilities (K,) of wall materials."""
         model, measured, grid = self.model, transmitter.measured, transmitter.grid
         posterior = None
         if transmitter.position_m is None:
@@ -403,7 +399,6 @@ def _transmitters(
     rx_height_m: float,
     spacing_m: float,
 ) -> tuple[list[str] | None, list[Transmitter]]:
-    """Check the transmitters and read their measurements; names are None for a single one."""
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     names: list[str] | None = None
     positions_m: list[Floats | None] = [None]
@@ -437,7 +432,6 @@ def transmitter_positions(
 
 
 def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]:
-    """Return the antenna of each transmitter; `names` is None for one."""
     if names is None or isinstance(tx_antenna, (Antenna, AntennaPattern, str, type(None))):
         return [Antenna.of(tx_antenna)] * len(names or [""])  # type: ignore[arg-type]
     remedy = f"give one antenna for all transmitters, or one for each of {', '.join(names)}."
@@ -448,7 +442,6 @@ def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]
 
 
 def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: float) -> int:
-    """Return the number of receivers of a block, or raise a MemoryLimitError."""
     count, (fewest, most) = len(receivers.rx_m), BLOCK_RECEIVERS
     kept_gb = LIBRARIES_GB + (CELL_BYTES * partial.state.size + RECEIVER_BYTES * receivers.valid.size) / 1e9
     needed_gb = kept_gb + WORK_BYTES * min(count, fewest) / 1e9
@@ -504,7 +497,6 @@ def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m
 
 
 def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
-    """Return x (nx,) and y (ny,) [m] of the cell centres on the map."""
     low = partial.resolution_m / 10
     require_number("spacing_m", spacing_m, low, 1e6)
     x0, y0, x1, y1 = partial.bounds_m
@@ -521,7 +513,6 @@ def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
 def coverage_map(
     partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
 ) -> xr.Dataset:
-    """Return values (N,) of valid receivers on the grid, with the layers of the map."""
     layers: dict[str, NDArray[Any]] = {
         "observed": receivers.cell_state != CellState.UNKNOWN,
         "valid": receivers.valid,

@@ -54,7 +54,7 @@ BANDS = {
 """Bands (IEEE 802.11ax and 802.11be; 3GPP TS 38.104: FR1 and FR2)."""
 
 _NR_SHANNON = 0.6
-"""Reached fraction of the Shannon bound (3GPP TR 36.942, annex A: LTE up to 4.4 bit/s/Hz)."""
+"""Fraction of the Shannon bound (3GPP TR 36.942, annex A)."""
 
 
 @dataclass(frozen=True)
@@ -68,12 +68,10 @@ class LinkBudget(Checked):
 
     @property
     def noise_dbm(self) -> float:
-        """Return thermal noise plus noise figure [dBm]."""
         return NOISE_DENSITY_DBM_HZ + 10.0 * math.log10(self.bandwidth_hz) + self.noise_figure_db
 
 
 def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power_dbm") -> Floats:
-    """Return the powers (count,) of transmitters [dBm]."""
     remedy = f"give one power [dBm], or one for each of the {count} transmitters, from -200 to 200."
     found = float_array(name, powers_dbm, SettingsError, remedy)
     allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())

@@ -1,4 +1,4 @@
-"""Networks of several transmitters: coverage maps -> best server, SINR and rate, with their uncertainty."""
+"""Networks of several transmitters: best server, SINR and rate, with their uncertainty."""
 
 from __future__ import annotations
 
@@ -128,7 +128,6 @@ def network_map(
 
 
 def require_network(network: xr.Dataset) -> None:
-    """Raise a SettingsError unless `network` is what `network_map` returns."""
     remedy = "give what network_map returned."
     require_type("network", network, xr.Dataset, remedy)
     wanted = {name: (("tx", "y", "x")[name != "p_best" :], "f") for name in VARIABLES}

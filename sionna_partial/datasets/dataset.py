@@ -1,4 +1,4 @@
-"""Homes -> data set: a folder of shards, built by dask workers on one machine or a cluster, in one or several runs."""
+"""Homes -> data set: a folder of shards, built by dask workers in one or several runs."""
 
 import hashlib
 import json
@@ -37,13 +37,12 @@ from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
 from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0
-"""Time between checks for new workers [s]."""
 
 ANY_PORT = "127.0.0.1:0"
 """Address of dask's dashboard, whose usual port may be taken."""
 
 MAX_SCHEDULER_BYTES, MAX_INDEX_BYTES = 1_000_000, 4_000_000_000
-"""Largest scheduler file, and largest index of a data set [bytes]."""
+"""Largest scheduler file, and largest index [bytes]."""
 
 LEFTOVERS = (".tmp-", NEW_FOLDER)
 
@@ -74,35 +73,32 @@ def build_dataset(
     """Build a data set of the links of many homes, on all cores or on a dask cluster.
 
     The folder gets `dataset.json` (settings, homes, versions), `shards/<home>.parquet` for each home, and
-    `failed/<home>.json` for each home that failed. Shards are written whole or not at all. The same call continues an
-    ended run, with the same bytes as an unbroken run. Homes may be added later. Changes of a map file are not noticed:
-    build from it in a new folder.
+    `failed/<home>.json` for each failed home. Shards are written whole or not at all. The same call continues an ended
+    run, with the same bytes. Homes may be added later. Changes of a map file are not noticed: build in a new folder.
 
-    Every home has a process of its own: one that raises, crashes or hangs fails alone. It is tried again if its process
-    or worker died.
+    Every home has a process of its own: one that raises, crashes or hangs fails alone. It is tried again if its
+    process or worker died.
 
     Parameters
     ----------
     folder : path-like
-        Folder of the data set. With a `scheduler`, all workers must share it under the same path; otherwise the run
-        ends with an error.
+        Folder of the data set. All workers of a `scheduler` must share it under the same path.
     homes : iterable of int, (int, str) or path-like
         Seeds of `make_home`, pairs of a seed and a kind, and complete maps or folders of them (`home_sources`).
     settings : DatasetSettings, optional
     scheduler : str, optional
         Address of a dask scheduler (tcp://host:8786), or path of a scheduler file. Default: this machine.
     workers : int, optional
-        Number of homes that this machine makes at a time; default: its usable cores.
+        Number of homes at a time on this machine; default: its usable cores.
     home_time_limit_s : float
         Time limit of a home [s].
     progress : bool or callable, optional
-        False for none, or a callable ``progress(homes_done, homes, message)``. Default: a bar in terminals and
-        notebooks after 2 s.
+        As in `predict_map`, but a callable is called as ``progress(homes_done, homes, message)``.
 
     Returns
     -------
     DatasetReport
-        `folder`, the names of `built` and `skipped` homes, `failed` (name to reason), and `elapsed_s`.
+        Names of `built` and `skipped` homes, reasons of the `failed`, and `elapsed_s`.
 
     Raises
     ------
@@ -111,8 +107,7 @@ def build_dataset(
     MapError
         If there is no home, or a path does not exist.
     OutputError
-        If the folder cannot be written, has other content or is being written by another run, or a worker cannot see it
-        or make homes.
+        If the folder cannot be written, has other content or another run, or a worker cannot see it or make homes.
     BackendError
         If the scheduler cannot be reached.
 
@@ -188,7 +183,7 @@ def _results(
 def _prepare(
     folder: Path, sources: list[HomeSource], settings: DatasetSettings, home_time_limit_s: float
 ) -> list[HomeTask]:
-    """Write or check `dataset.json`, remove the remains of killed runs, and return the tasks."""
+    """Write or check `dataset.json`, remove remains of killed runs, and return the tasks."""
     path, versions = folder / INDEX_FILE, installed_versions()
     homes = [source.record for source in sources]
     index = {"versions": versions, "settings": settings_record(settings), "homes": homes}
@@ -205,7 +200,6 @@ def _prepare(
 
 
 def _require_same(folder: Path, index: dict[str, Any]) -> None:
-    """Refuse a folder with other content than an earlier run of the same settings, versions and homes."""
     path = folder / INDEX_FILE
     if not path.exists():
         names = [entry.name for entry in folder.iterdir()] if folder.is_dir() else []
@@ -228,7 +222,7 @@ def _require_same(folder: Path, index: dict[str, Any]) -> None:
 
 
 def _differences(earlier: dict[str, Any], now: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
-    """Yield the name, the old and the new value of each difference; new homes are none."""
+    """Yield name, old and new value of each difference; new homes are none."""
     for part in ("settings", "versions"):
         before, after = (dict(_leaves(index[part], part)) for index in (earlier, now))
         for name in sorted(before.keys() | after.keys()):

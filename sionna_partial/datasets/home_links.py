@@ -1,9 +1,8 @@
 """Homes of a data set: a robot explores a home, and links are traced on each of its maps and on the home.
 
-Each home is made in a process of its own, which serves one home after the other, so that libraries load and compile
-once; it ends with its worker, or after an idle time. Pools of concurrent.futures and pebble, and dask's Nanny, would
-start a user's script without a `__main__` guard again in each process, and lack a time limit per home and the last
-lines of a dead process.
+Each home is made in a process of its own, which serves one home after the other, so that libraries load once. Pools of
+concurrent.futures and pebble, and dask's Nanny, start a user's script without a `__main__` guard again, and lack a time
+limit per home and the last lines of a dead process.
 """
 
 import contextlib
@@ -76,10 +75,9 @@ ATTEMPTS = 3
 """Number of processes that may die over a home: one may have been killed from outside."""
 
 IDLE_S = 60.0
-"""Idle time after which a process ends [s]."""
 
 GRACE_S = 60.0
-"""Time beyond a home's limit for a process to start and end by itself [s]."""
+"""Time beyond a home's limit to start and end [s]."""
 
 TIMEOUT_LINE = "Timeout ("
 """First words that faulthandler writes at a time-out."""
@@ -106,12 +104,10 @@ class HomeSource:
 
     @property
     def record(self) -> dict[str, object]:
-        """Entry of the home in a data set."""
         kind = {"kind": self.kind} if self.kind else {}
         return {"name": self.name, "seed" if isinstance(self.origin, int) else "path": self.origin, **kind}
 
     def load(self) -> PartialMap:
-        """Make or read the home."""
         return make_home(self.origin, self.kind) if isinstance(self.origin, int) else load_map(self.origin)
 
 
@@ -184,14 +180,13 @@ class _Positions:
 def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTable:
     """Trace the links of a complete home on the robot's map at every stage, and on the complete home.
 
-    Half of a transmitter's receivers are in free cells of the home, half (`anywhere`) in any cell of the map area
-    (bounding box of the known cells with `margin_m`) that is no wall; of each half, `short_link_fraction` within
-    `SHORT_LINK_M`. No receiver is in a cell that a robot with errors mapped as a wall, or within `NEAREST_M` of its
-    transmitter.
+    Half of a transmitter's receivers are in free cells of the home, half (`anywhere`) in any cell of the map area that
+    is no wall; of each half, `short_link_fraction` within `SHORT_LINK_M`. No receiver is in a cell that a robot with
+    errors mapped as a wall, or within `NEAREST_M` of its transmitter.
 
     The truth is outage for a receiver outside the free cells of the home (paper, "Indoor-Outdoor Estimation"), else the
-    trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered by
-    stage, then by transmitter.
+    trace on the complete home. Positions and robot depend on `name` and the settings only. The table is ordered
+    by stage, then by transmitter.
     """
     require_map("home", home)
     home = map_area(closed_home(home, name), settings.margin_m)
@@ -313,7 +308,7 @@ def points_in(cells: Bools, count: int, home: PartialMap, height_m: float, rng: 
 def _truth(
     home: PartialMap, positions: _Positions, settings: DatasetSettings
 ) -> tuple[Bools, States, Floats, dict[str, Floats]]:
-    """Return whether receivers (N,) are inside, their link state, path gain [dB] and impulse response `CIR`."""
+    """Return inside (N,), link state, path gain [dB] and impulse response `CIR` of receivers."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
     links = _traced(home, positions.tx_m, indoors, settings)
@@ -350,7 +345,7 @@ def _traced(
 
 
 def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSettings) -> list[LinkFeatures]:
-    """Return the features on each map, for all transmitters; equal maps are traced once."""
+    """Return the features on each map; equal maps are traced once."""
     features: list[LinkFeatures] = []
     for index, partial in enumerate(maps):
         if index and partial == maps[index - 1]:
@@ -374,7 +369,6 @@ class HomeTask:
 
     @property
     def metadata(self) -> dict[str, object]:
-        """Metadata of the shard."""
         sensor, settings = asdict(home_sensor(self.source.name, self.settings)), settings_record(self.settings)
         return {"home": self.source.record, "sensor": sensor, "settings": settings, "versions": self.versions}
 
@@ -388,7 +382,6 @@ class HomeTask:
         return all(notes.get(name) == value for name, value in self.metadata.items())
 
     def make(self) -> None:
-        """Make the home's links and write its shard."""
         table = home_links(self.source.load(), self.source.name, self.settings)
         write_shard(table, shard_path(self.folder, self.source.name), self.metadata)
 
@@ -402,12 +395,10 @@ class HomeResult:
 
 
 def settings_record(settings: DatasetSettings) -> dict[str, object]:
-    """Return settings as JSON has them."""
     return asdict(settings) | {"stages": list(settings.stages)}
 
 
 def installed_versions() -> dict[str, str]:
-    """Return the installed versions of `PACKAGES`."""
     return {package: version(package) for package in PACKAGES}
 
 
@@ -452,7 +443,6 @@ def stop_homes() -> None:
 
 
 def serve(descriptor: int) -> None:
-    """Make homes for the worker at the other end of a pipe."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     faulthandler.enable()
     threading.Thread(target=_end_with_worker, daemon=True).start()
@@ -541,7 +531,6 @@ def _take_idle() -> _HomeProcess | None:
 
 
 def _fault_of_worker(task: HomeTask) -> str:
-    """Return the reason why no home can be made here, or an empty string."""
     where = f"the worker on {socket.gethostname()}"
     index = Path(task.folder) / INDEX_FILE
     remedy = "give a folder on a file system that all workers share."
@@ -582,6 +571,6 @@ def _fault_of_libraries() -> str:
 
 
 def _end_with_worker() -> None:
-    """End when the worker's end of a pipe closes, as it does when the worker dies."""
+    """End when the worker's end of a pipe closes."""
     os.read(sys.stdin.fileno(), 1)
     end_process(1)

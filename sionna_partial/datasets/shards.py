@@ -31,15 +31,13 @@ from sionna_partial.prediction.map_networks import FEATURES, columns_of, feature
 from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
-"""Files and folders of a data set: settings and homes, shards, notes on homes that failed."""
 
 FORMAT = "sionna-partial links 4"
-"""Name and version of the format, in the metadata of shards."""
 
 _MAX_LINKS, _MAX_CELLS, _MAX_BYTES = 10_000_000, 100_000_000, 4_000_000_000
 
 _MAX_NAME_BYTES = 200
-"""Length above which names of homes are shortened for files, where systems allow 255 [bytes]."""
+"""Length above which names are shortened for files [bytes]."""
 
 _PREFIX = "sionna_partial."
 
@@ -53,9 +51,9 @@ _TYPES = {
 COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
 
 CIR = ("path_gain_re", "path_gain_im", "path_delay_s")
-"""Columns of the impulse response between isotropic antennas on the complete map, the strongest path first.
+"""Impulse response between isotropic antennas on the complete map, the strongest path first.
 
-Complex baseband gain [1], 0 where there is no path, and absolute delay [s], NaN where there is none.
+Complex baseband gain [1], 0 without path, and absolute delay [s], NaN without path.
 """
 
 _NAMES = (
@@ -75,7 +73,7 @@ def _fields(cir_paths: int) -> list[pa.Field]:
 
 @dataclass(frozen=True, eq=False)
 class LinkTable(Shown):
-    """N links; a link is a transmitter and a receiver at one stage of exploration of a home.
+    """N links, each at one stage of exploration of a home.
 
     Parameters
     ----------
@@ -84,14 +82,13 @@ class LinkTable(Shown):
     stage : (N,) float64 array
         Steps of exploration; below 1, the wanted observed fraction of the home's free area.
     features : LinkFeatures
-        Features of the trace on the partial map, with their context.
+        Features on the partial map.
     maps : tuple of M PartialMap
         The partial maps.
     map_index : (N,) int64 array
         Index of each link's map.
     link_state, gain_db : (N,) arrays
-        LinkState and omnidirectional path gain [dB] on the complete map; outage for a receiver that is not inside
-        (paper, "Indoor-Outdoor Estimation").
+        LinkState and omnidirectional path gain [dB] on the complete map; outage for a receiver that is not inside.
     inside, anywhere : (N,) bool arrays
         True for a receiver in a free cell of the complete map, and for a receiver drawn from the whole map area.
     observed_fraction : (N,) float64 array
@@ -132,11 +129,11 @@ class LinkTable(Shown):
 
     @cached_property
     def phi(self) -> LinkFeatures:
-        """Features with windows, which are drawn at the first access."""
+        """Features with windows, drawn at the first access."""
         return self.features.with_windows(self.maps, self.map_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
-        """Select links by an index array, a mask (N,) or a slice."""
+        """Select links."""
         features = self.__dict__.get("phi", self.features).take(index)  # with windows, if drawn
         columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
         cir = {name: values[index] for name, values in self.cir.items()}
@@ -144,7 +141,7 @@ class LinkTable(Shown):
 
     @classmethod
     def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
-        """Join links, one part after the other, with impulse responses if all have as many paths."""
+        """Join links, with impulse responses if all have as many paths."""
         tables = list(parts)
         if not tables:
             raise PredictorError("parts is empty: give at least one LinkTable.")
@@ -171,7 +168,6 @@ Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
 
 
 def stage_name(stage: float) -> str:
-    """Return the name of a stage: "50 steps", or "25 % observed"."""
     return f"{stage:g} steps" if stage >= 1 or stage == 0 else f"{100 * stage:g} % observed"
 
 
@@ -189,9 +185,7 @@ def _columns(table: LinkTable) -> dict[str, Any]:
 def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mapping[str, object]) -> None:
     """Write links as a Parquet file, whole or not at all; equal links and metadata give equal bytes.
 
-    Columns are named as in `LinkTable`, with units; positions have a column per axis (`tx_x_m`), and the partial trace
-    has `partial_link_state` and `partial_gain_db`. Frequency, maps and `metadata` are JSON in the file's metadata, with
-    the prefix `sionna_partial.`; `map_index` is the index of a link's map.
+    Positions have a column per axis (`tx_x_m`); frequency, maps and `metadata` are JSON in the file's metadata.
     """
     maps = {
         "partial": [_packed(each) for each in table.maps],
@@ -211,7 +205,6 @@ def write_shard(table: LinkTable, path: str | os.PathLike[str], metadata: Mappin
 
 
 def read_shard(path: str | os.PathLike[str]) -> LinkTable:
-    """Read the links of a shard."""
     notes = shard_metadata(path)
     try:
         file = pq.ParquetFile(path, page_checksum_verification=True)
@@ -230,7 +223,6 @@ def read_shard(path: str | os.PathLike[str]) -> LinkTable:
 
 
 def shard_metadata(path: str | os.PathLike[str]) -> dict[str, object]:
-    """Read the metadata of a shard."""
     with open_regular(path, "path", PredictorError, _MAX_BYTES):
         pass
     try:
@@ -292,7 +284,6 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
 
 
 def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
-    """Read `dataset.json`: settings, homes and versions."""
     remedy = "give a folder that `sionna-partial dataset` wrote."
     path = input_path(folder, "folder", PredictorError, remedy) / INDEX_FILE
     if not os.path.exists(path):
@@ -310,7 +301,6 @@ def read_index(folder: str | os.PathLike[str]) -> dict[str, Any]:
 
 
 def shard_path(folder: str | os.PathLike[str], name: str) -> Path:
-    """Return the path of a home's shard."""
     return Path(folder) / SHARDS_FOLDER / f"{file_stem(name)}.parquet"
 
 
@@ -397,7 +387,7 @@ class LinkTraces:
 
     @classmethod
     def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
-        """Return the traces that a predictor was trained on."""
+        """Return the traces of a predictor's training links."""
         return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
 
     def __str__(self) -> str:
@@ -411,10 +401,7 @@ class LinkTraces:
 
 
 def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
-    """Return the links of data sets and their traces, which are None for a table.
-
-    A home may be in several folders, explored anew in each.
-    """
+    """Return the links of data sets and their traces, None for a table; a home may be in several folders."""
     if isinstance(dataset, LinkTable):
         links, traces = dataset, None
     else:
@@ -460,7 +447,6 @@ def settings_for(
     passes: int = PredictorSettings.passes,
     seed: int = PredictorSettings.seed,
 ) -> PredictorSettings:
-    """Return settings for a training on such links; None takes the defaults."""
     known = traces or LinkTraces.of_settings(PredictorSettings())
     return PredictorSettings(
         networks, known.frequency_hz, known.diffraction, passes, seed=seed, through_walls=known.through_walls
@@ -470,7 +456,7 @@ def settings_for(
 def require_like(
     found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
 ) -> None:
-    """Raise a PredictorError for links traced otherwise than `whose` links; None passes."""
+    """Raise a PredictorError unless the links were traced like `whose` links; None passes."""
     if found is not None and not found.is_like(wanted):
         raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
 

@@ -45,7 +45,7 @@ SEEN_M = 1e-3
 """Largest unobserved length of a path in observed space [m]."""
 
 _ASIDE_CELLS = 1.5
-"""Offset of the parallel lines that must also meet a known wall: the uncertainty of a map [cells]."""
+"""Offset of the parallel lines in `_crosses_wall` [cells]."""
 
 _OPAQUE_CELLS = 3.0
 """Length of a line in known walls that excludes LOS, unless it is traced on exact walls [cells]."""
@@ -66,18 +66,17 @@ class LinkContext(Shown):
     tx_seen, rx_seen : (N,) bool arrays
         True in observed cells.
     complete : (N,) bool array
-        True if the map is complete and one end is in an observed cell: the trace is the truth.
+        The map is complete and one end is observed: the trace is the truth.
     nearly_complete : (N,) bool array
-        True if the map is nearly complete and both ends are in observed cells: the trace is close to the truth.
+        The map is nearly complete and both ends are observed: the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
         Range noise of the map's walls, 0 (exact) to 1.
     possible : (N, 3) bool array
-        True for each possible LinkState, at least one.
+        Possible LinkStates, at least one.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
-        Gain of the indirect paths, attenuated by unobserved space [dB], at least -150; the first column has all paths,
-        the last only paths in observed space.
+        Gain of the indirect paths, attenuated by unobserved space [dB], at least -150.
     strongest_unobserved_m : (N,) float64 array
         Unobserved length of the strongest indirect path [m]; the distance if there is none.
     windows : (W, *WINDOWS) uint8 array, optional
@@ -85,7 +84,7 @@ class LinkContext(Shown):
     straight_gain_db : (N,) float64 array
         Gain of the direct path through known walls [dB], at least -150.
     straight_walls : (N,) float64 array
-        Number of known walls that it crosses; 0 without a direct path.
+        Number of these walls.
     wall_loss_db : (N,) float64 array
         From `mean_wall_loss_db` [dB].
     window_index : (N,) int array
@@ -124,10 +123,7 @@ class LinkContext(Shown):
         unobserved_distance_m: Floats,
         **traced: Any,
     ) -> "LinkContext":
-        """Compute the context of links on their maps, without windows.
-
-        `map_index` (N,) is the map of each link; the other arrays are as in `LinkFeatures` and `LinkContext`.
-        """
+        """Compute the context of links on the maps `map_index` (N,), without windows."""
         count = len(map_index)
         tx_seen, rx_seen, complete, nearly = (np.zeros(count, dtype=bool) for _ in range(4))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
@@ -146,12 +142,12 @@ class LinkContext(Shown):
         return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
 
     def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkContext":
-        """Return the context with windows of the maps given to `on_maps`."""
+        """Return the context with windows of the maps."""
         keys, window_index = transmitters(map_index, self.tx_m)
         return replace(self, windows=draw_windows(maps, keys), window_index=window_index)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
-        """Select links by an index array, a mask (N,) or a slice; the windows are shared."""
+        """Select links; the windows are shared."""
         return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, windows=self.windows)
 
     @classmethod
@@ -261,13 +257,11 @@ def path_unobserved_m(
 
 
 def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
-    """Return `path_unobserved_m` of selected paths (P,) of traced links."""
     tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
     return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)
 
 
 def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
-    """Return the fraction (P,) of power that passes unobserved space of an attenuation length [m]."""
     return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
 
 
@@ -276,13 +270,12 @@ def _possible_states(
 ) -> Bools:
     """Return the possible link states (N, 3) on a map.
 
-    - A direct line across a known wall has no LOS. It crosses one if the parallel lines 1.5 cells to its left and right
-      both meet known walls, and it does so itself (`walled_m`) or is blocked in the trace; at a corner or along a face,
-      one of the three stays clear. Posts are narrower, and outlines of noisy walls leak: three cells in known walls
-      also exclude LOS, unless it is traced along exact walls.
+    - A direct line across a known wall has no LOS. It crosses one if both parallel lines 1.5 cells aside meet known
+      walls, and it does so itself (`walled_m`) or is blocked in the trace; at a corner or along a face, one line stays
+      clear. Outlines of noisy walls leak: three cells in known walls also exclude LOS, unless traced along exact walls.
     - A wholly observed direct line (`seen`) without walls has LOS as traced.
-    - Regions are separated by known walls, with gaps of two cells or less closed. If the ends are in different regions,
-      or in a wholly observed one, a traced outage is certain; a wholly observed region has no other outage.
+    - Known walls, with gaps of up to two cells closed, separate regions. If the ends are in different regions, or in a
+      wholly observed one, a traced outage is certain; a wholly observed region has no other outage.
 
     Mesh cells do not give the heights of surfaces: only the second rule applies.
     """
@@ -307,7 +300,6 @@ def _possible_states(
 
 
 def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
-    """Return whether the lines `_ASIDE_CELLS` to either side of direct lines (N,) both meet known walls."""
     crosses = np.zeros((2, len(rx_m)), dtype=bool)
     for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
         starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
@@ -361,9 +353,9 @@ class LinkFeatures(Shown):
     gain_db : (N,) or (T, N) float64 array
         Omnidirectional path gain traced on the partial map [dB], at least -150.
     context : LinkContext, optional
-        Walls and space around the links, from `link_features`, in flat order; unused by the paper's predictor.
+        Walls and space around the links in flat order; unused by the paper's predictor.
     frequency_hz : float, optional
-        Carrier frequency of the trace [Hz]. None is the frequency of the predictor.
+        Carrier frequency of the trace [Hz]; by default the predictor's.
     path_power : (N, C + 1, R + 1) float64 array, optional
         Power by crossings of and reflections at walls of unknown material.
 
@@ -419,7 +411,7 @@ class LinkFeatures(Shown):
         return self if self.distance_m.ndim == 1 else self.take(slice(None))
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
-        """Select links by an index array, a mask or a slice of the flat order."""
+        """Select links of the flat order."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
         path_power = None if self.path_power is None else self.path_power[index]
@@ -451,7 +443,7 @@ class LinkFeatures(Shown):
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkFeatures"]) -> "LinkFeatures":
-        """Join links, one part after the other."""
+        """Join links."""
         if not parts:
             raise PredictorError("parts is empty: give at least one LinkFeatures.")
         frequencies_hz = {part.frequency_hz for part in parts}
@@ -477,7 +469,6 @@ _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in
 
 
 def context_of(phi: LinkFeatures) -> LinkContext:
-    """Return the context, which must exist."""
     assert phi.context is not None
     return phi.context
 
@@ -493,7 +484,6 @@ def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
 
 
 def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """Return finite numbers as an array of the given shape, or raise a PredictorError."""
     count = " x ".join(map(str, shape))
     try:
         numbers = np.asarray(values, dtype=np.float64)
@@ -506,7 +496,6 @@ def link_numbers(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats
 
 
 def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> States:
-    """Return link states as a uint8 array of the given shape, or raise a PredictorError."""
     states = link_numbers(name, values, shape)
     known = ", ".join(f"{state.name} {state.value}" for state in LinkState)
     require_each(np.isin(states, [*LinkState]), name, states, f"use LinkState: {known}.")
@@ -576,8 +565,7 @@ def features_of_paths(
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] during the trace, without keeping paths.
 
-    `blocks` are from `Simulation.blocks`, `windows` from `map_windows`; without windows there is no context. With
-    `material_unknown`, the features have the power of paths by their interactions with walls of unknown material.
+    `blocks` are from `Simulation.blocks`. Without `windows` there is no context.
     """
     limits = (settings[0].max_walls, settings[0].max_depth) if material_unknown else ()
     sums = LinkSums(1, len(rx_m), *limits)
@@ -603,7 +591,6 @@ def _features(
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:
-    """Raise a PredictorError for the first bad value."""
     if not good.all():
         index = np.unravel_index(int(np.argmin(good)), np.shape(values))
         where = ", ".join(map(str, index))

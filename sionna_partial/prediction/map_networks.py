@@ -1,9 +1,8 @@
-"""The networks that read maps and paths, as Keras 3 models: inputs, two map networks, a link network, training.
+"""Networks that read maps and paths, as Keras 3 models.
 
-The map networks are U-Nets (Ronneberger, Fischer and Brox 2015) that read the near and the far window around the
-transmitter and return `MAP_FEATURES` numbers per cell, less their output for an empty window: unobserved space adds
-nothing. The numbers fade to 0 at the border of each window. The link network reads the features of a link and these
-numbers at its receiver. It returns P(link state), and mean and log-variance of the gain given LOS and given NLOS.
+Map networks are U-Nets (Ronneberger, Fischer and Brox 2015) that return `MAP_FEATURES` numbers per cell of the near and
+the far window, less their output for an empty window: unobserved space adds nothing. The link network reads the
+features of a link and these numbers at its receiver.
 """
 
 import functools
@@ -90,11 +89,7 @@ FEATURES: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in ("strongest_unobserved_m", "straight_gain_db", "straight_walls", "wall_loss_db")},
     **dict.fromkeys(("tx_seen", "rx_seen", "possible", "walled_m"), ()),
 }
-"""Features of links by their names in `LinkFeatures` or `LinkContext`, and their columns in data sets.
-
-Features without columns follow from the map and the positions. Besides the networks, the mean wall losses and
-multi-wall models read them.
-"""
+"""Features of links by their names in `LinkFeatures` or `LinkContext`, and their columns in data sets, if stored."""
 
 Values = Mapping[str, Any]
 """Features by name, with `free_db`, the free-space gain, and `near_m`, the distance but at least 10 cm."""
@@ -158,19 +153,18 @@ CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
         **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
     },
 )
-"""Inputs and outputs of the networks besides the paper's, for "paper", "paths" and "map"."""
+"""For "paper", "paths" and "map": inputs and outputs of the added networks."""
 
 
 def feature_values(phi: LinkFeatures) -> dict[str, Any]:
-    """Return all features of links with a context, by name."""
     return {name: getattr(phi if hasattr(phi, name) else phi.context, name) for name in FEATURES}
 
 
 def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleType = np) -> Any:
     """Return the inputs (N, len(LINK_INPUTS)) of the link network.
 
-    `values` are from `feature_values`, or tensors; `ops` is NumPy, or keras.ops for tensors. `shift_db` is the
-    free-space gain at `frequency_hz` less that at the links' frequency.
+    `shift_db` is the free-space gain at `frequency_hz` less the one at the links' frequency; `ops` is NumPy or
+    keras.ops.
     """
     gains_db = {name: shifted_gain_db(values[name], shift_db, ops) for name in ("gain_db", "indirect_gain_db")}
     free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops)
@@ -180,32 +174,27 @@ def link_inputs(values: Values, frequency_hz: float, shift_db: Any, ops: ModuleT
 
 
 def columns_of(phi: LinkFeatures) -> dict[str, Floats]:
-    """Return the columns (N,) in data sets of links with a context."""
     values = feature_values(phi)
     stored = ((columns, np.atleast_2d(values[name].T)) for name, columns in FEATURES.items() if columns)
     return {name: column for columns, rows in stored for name, column in zip(columns, rows, strict=True)}
 
 
 def features_of_columns(columns: Mapping[str, Floats]) -> dict[str, Any]:
-    """Return the features by name from their columns."""
     stored = {name: [columns[column] for column in own] for name, own in FEATURES.items() if own}
     return {name: np.column_stack(values) if len(values) > 1 else values[0] for name, values in stored.items()}
 
 
 def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]:
-    """Return the inputs of the link network for links with a context."""
     inputs: Floats = link_inputs(feature_values(phi), frequency_hz, phi.free_space_shift_db(frequency_hz))
     return inputs.astype(np.float32)
 
 
 def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
-    """Return the horizontal offsets (N, 2) of receivers from their transmitters [m]."""
     context = context_of(phi)
     return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
 
 
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
-    """Build the untrained networks by name."""
     keras, start = import_keras(), kernel_starts(seed)
     networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
     for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
@@ -214,7 +203,6 @@ def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Mo
 
 
 def kernel_starts(seed: int) -> Callable[[], Any]:
-    """Return a function that yields the initial values of successive kernels."""
     keras, seeds = import_keras(), itertools.count(1000 * seed + 1)
     return lambda: keras.initializers.GlorotUniform(seed=next(seeds))
 
@@ -228,10 +216,7 @@ def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[
 
 
 def u_net(keras: Any, start: Callable[[], Any], image: Any, widths: tuple[int, ...]) -> Any:
-    """Return the output (B, H, W, widths[0]) of a U-Net for images (B, H, W, C).
-
-    H and W are multiples of 2 ** (len(widths) - 1); `start` returns the initial values of a kernel.
-    """
+    """Return the output (B, H, W, widths[0]) of a U-Net for images (B, H, W, C); `start` yields initial kernels."""
 
     def convolved(x: Any, units: int, name: str) -> Any:
         options = {"padding": "same", "use_bias": False, "kernel_initializer": start()}
@@ -262,20 +247,17 @@ def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.M
 
 
 def kind_of(networks: Networks) -> NetworkKind:
-    """Return the kind of the networks."""
     return "map" if reads_maps(networks) else "paths" if LINK_NETWORK in networks else "paper"
 
 
 def reads_maps(networks: Networks) -> bool:
-    """Return whether there are map networks."""
     return MAP_NETWORKS[0] in networks
 
 
 def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> list[Any]:
     """Return the outputs of the map networks for windows (B, *WINDOWS) in [0, 255], less those for an empty window.
 
-    One tensor (B, WINDOW_CELLS, WINDOW_CELLS, MAP_FEATURES) per map network. In training, values are normalised by the
-    statistics of this batch.
+    In training, values are normalised by the statistics of this batch.
     """
     if not reads_maps(networks):
         return []
@@ -305,11 +287,7 @@ class MapReader:
 
 
 def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
-    """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters.
-
-    `maps` are from `read_maps`, `links` (B, R, len(LINK_INPUTS)) from `link_inputs`, `offsets_m` (B, R, 2) from
-    `receiver_offsets_m`.
-    """
+    """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters."""
     at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
     links = tf.concat([links, *at_receivers], axis=-1)
     outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
@@ -326,10 +304,7 @@ def _interpolated(maps: Any, offsets: Any) -> Any:
 
 
 def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
-    """Return log-probabilities (..., 3), and means [dB] and log-variances (..., 2) given LOS and NLOS.
-
-    `outputs` (..., LINK_OUTPUTS) are from the link network, `free_db` (...) is the free-space gain [dB].
-    """
+    """Return log-probabilities (..., 3), and means [dB] and log-variances (..., 2) given LOS and NLOS."""
     los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
     means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
@@ -340,8 +315,7 @@ def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
 def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
-    `outputs` are (N, LINK_OUTPUTS), `free_db` is (N,). Standard deviations grow with the range noise of the map, which
-    the networks do not notice.
+    Standard deviations grow with the range noise of the map, which the networks do not notice.
     """
     widening = 1.0 + excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
@@ -358,10 +332,7 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
 def evaluate_context_networks(
     networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
 ) -> tuple[Floats, Floats, Floats]:
-    """Return the `distribution` of N links with a context.
-
-    `read` is the cached reader of these networks.
-    """
+    """Return the `distribution` of N links with a context."""
     inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
     for maps, links in _by_window(networks, context_of(phi), read):
@@ -374,7 +345,6 @@ def evaluate_context_networks(
 
 
 def _by_window(networks: Networks, context: LinkContext, read: MapReader | None) -> Iterator[tuple[list[Any], Indices]]:
-    """Yield the map networks' outputs around each transmitter, and its links; without map networks, all links once."""
     if not reads_maps(networks):
         yield [], np.arange(len(context))
         return
@@ -399,10 +369,7 @@ def fit_context_networks(
     *,
     progress: Progress | None = None,
 ) -> dict[str, "keras.Model"]:
-    """Fit the networks of `settings` to links with a context, and their true states and gains [dB] (N,).
-
-    Windows are turned and mirrored at random. Equal links and settings give equal weights.
-    """
+    """Fit the networks of `settings` to links with a context, with windows turned and mirrored at random."""
     networks = context_networks(settings.seed, with_map=settings.networks == "map")
     examples = _Examples(phi, link_state, gain_db, settings)
     steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
@@ -420,7 +387,7 @@ def fit_context_networks(
 
 
 class _Examples:
-    """Training links by window; columns have the names of the arguments of a gradient step."""
+    """Training links by window."""
 
     def __init__(self, phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> None:
         self._used, links = _links_by_window(context_of(phi))
@@ -465,7 +432,6 @@ def turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
 
 
 def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
-    """Return offsets (R, 2) from the centre of a window turned by `turned` [m]."""
     x, y = offsets_m.T
     x = -x if turn & 1 else x
     y = -y if turn & 2 else y
@@ -493,7 +459,6 @@ def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
 
 
 def adam_w(weights: Sequence[Any], steps: int) -> Any:
-    """Return the optimizer for a number of gradient steps."""
     keras = import_keras()
     rate = keras.optimizers.schedules.CosineDecay(LEARNING_RATE, steps)
     optimizer = keras.optimizers.AdamW(rate, weight_decay=WEIGHT_DECAY)
@@ -504,8 +469,7 @@ def adam_w(weights: Sequence[Any], steps: int) -> Any:
 def _crps(errors_db: Any, stds_db: Any) -> Any:
     """Continuous ranked probability score of Gaussians [dB] (Gneiting and Raftery 2007, Eq. 21).
 
-    Gains have longer tails than Gaussians. Unlike the likelihood, this score does not widen the 90 % interval to cover
-    them.
+    Unlike the likelihood, it does not widen the 90 % interval to cover the long tails of gains.
     """
     z = errors_db / stds_db
     density = tf.exp(-0.5 * z**2) / math.sqrt(2.0 * math.pi)

@@ -1,9 +1,7 @@
-"""The networks of the paper's predictor, as Keras 3 models: architecture, evaluation, training by likelihood.
+"""Networks of the paper's predictor, side by side in one Keras 3 model.
 
-One functional model has all of them side by side. Its inputs are the features of `GAIN_INPUTS` in their own units, each
-(N, 1). Its outputs by name are P(link state) given each partial link state (N, 3), mean and log-variance of the gain
-for the four rows of the paper's table (N, 2), and P(indoor) given each partial link state (N, 1). Inputs are scaled and
-clamped to the range of the training links; only the anchor, the traced or the free-space gain, is extrapolated.
+Inputs are scaled and clamped to the range of the training links; only the anchor, the traced or the free-space gain, is
+extrapolated.
 """
 
 import itertools
@@ -37,7 +35,7 @@ NEAREST_M = 0.01
 STATE_INPUTS = ("distance_m", "unobserved_distance_m")
 GAIN_INPUTS = (*STATE_INPUTS, "gain_db")
 INDOOR_INPUTS = ("unobserved_distance_m",)
-"""Unscaled inputs of the paper's networks; the traced link state selects the network."""
+"""Unscaled inputs of the paper's networks."""
 
 STD_RANGE_DB = (0.3, 40.0)
 
@@ -59,7 +57,6 @@ def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleTy
 
 
 def gain_at_1m_db(frequency_hz: float) -> float:
-    """Return the free-space gain at 1 m [dB]."""
     return 20.0 * math.log10(SPEED_OF_LIGHT_M_S / (4.0 * math.pi * frequency_hz))
 
 
@@ -67,7 +64,7 @@ def gain_at_1m_db(frequency_hz: float) -> float:
 class GainNetwork:
     """Network for the gain given a link state and partial link states: one row of the paper's table.
 
-    Without training links, gain minus anchor has the mean `prior_offset_db` and the standard deviation `prior_std_db`.
+    Untrained, gain minus anchor has the mean `prior_offset_db` and the standard deviation `prior_std_db`.
     """
 
     name: str
@@ -96,7 +93,7 @@ GAIN_NETWORKS = (
     GainNetwork("gain_nlos_given_nlos_outage", LinkState.NLOS, _NOT_LOS, GAIN_INPUTS, 20, -20.0, 15.0),
     GainNetwork("gain_nlos_given_los", LinkState.NLOS, (LinkState.LOS,), ("distance_m",), 10, -20.0, 15.0),
 )
-"""Gain networks of the paper (tab:path_loss_network). An outage has the gain -150 dB and needs none."""
+"""Gain networks of the paper (tab:path_loss_network). An outage needs none."""
 
 STATE_NETWORKS = {state: f"state_given_{state.name.lower()}" for state in LinkState}
 """Multinomial logistic classifiers of the link state by partial link state (paper, Section III-D)."""
@@ -111,11 +108,10 @@ OUTPUT_WIDTHS = {
 }
 
 _BACKEND, _DATA_FORMAT = "tensorflow", "channels_last"
-"""Settings of Keras that our networks need."""
 
 
 def import_keras() -> ModuleType:
-    """Import Keras after libLLVM, which must precede TensorFlow; raise a BackendError for another backend."""
+    """Import Keras after libLLVM, which must precede TensorFlow."""
     load_llvm()
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     os.environ.setdefault("TF_ENABLE_ONEDNN_OPTS", "0")
@@ -152,7 +148,7 @@ tf: Any = _TensorFlow()
 
 
 def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike) -> "keras.Model":
-    """Build a logistic classifier on clamped inputs: softmax or, for one event, sigmoid; `bias` (K,) are logits."""
+    """Build a logistic classifier on clamped inputs: softmax or, for one event, sigmoid."""
     keras = import_keras()
     count = np.size(bias)
     tensors, scaled = _scaled_inputs(inputs, ranges)
@@ -166,10 +162,7 @@ def logistic(name: str, inputs: tuple[str, ...], ranges: Ranges, bias: ArrayLike
 def gain_network(
     row: GainNetwork, ranges: Ranges, offset_db: float, std_db: float, frequency_hz: float, seed: int
 ) -> "keras.Model":
-    """Build a gain network with constant offset and spread [dB] until it is trained.
-
-    Its output (N, 2) is mean [dB] and natural logarithm of the variance [dB^2].
-    """
+    """Build a gain network (N, 2): mean [dB] and natural logarithm of the variance [dB^2]; constant until trained."""
     keras = import_keras()
     tensors, hidden = _scaled_inputs(row.inputs, ranges)
     for number in (1, 2):
@@ -193,7 +186,7 @@ def gain_network(
 
 
 def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
-    """Put the networks of `OUTPUT_WIDTHS` and any others, with inputs of their own, side by side in one model."""
+    """Put the networks of `OUTPUT_WIDTHS` and any others, with own inputs, side by side in one model."""
     keras = import_keras()
     inputs = {name: keras.Input((1,), name=name, dtype="float32") for name in GAIN_INPUTS}
     outputs = {name: networks[name]({key: inputs[key] for key in networks[name].input}) for name in OUTPUT_WIDTHS}
@@ -205,17 +198,14 @@ def assemble(networks: Mapping[str, "keras.Model"]) -> "keras.Model":
 
 
 def own_input(name: str) -> str:
-    """Return the name of the input of a network with an input of its own."""
     return f"input_of_{name}"
 
 
 def parts(model: "keras.Model") -> dict[str, "keras.Model"]:
-    """Return the networks of `assemble` by name."""
     return {name: model.get_layer(name) for name in model.output}
 
 
 def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = GAIN_INPUTS) -> dict[str, NDArray[np.float32]]:
-    """Return features as the inputs (N, 1) of a network."""
     columns = {name: np.clip(getattr(phi, name), -_LARGEST, _LARGEST) for name in names}
     return {name: column.astype(np.float32)[:, None] for name, column in columns.items()}
 
@@ -225,8 +215,8 @@ def distribution_by_paper(
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `GAIN_INPUTS` and partial link states (N,).
 
-    `shift_db` is the free-space gain at the networks' frequency less that at the links' frequency. Return probabilities
-    of the link states, means and standard deviations of the gain [dB], each (3, N) by LinkState.
+    `shift_db` is the free-space gain at the networks' frequency less the one at the links' frequency. Return
+    probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
     """
     inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, tf)}
     inputs = {name: tf.cast(values, tf.float32) for name, values in inputs.items()}
@@ -251,7 +241,7 @@ def distribution_by_paper(
 def evaluate_paper(
     networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
 ) -> tuple[Floats, Floats, Floats]:
-    """Return `distribution_by_paper` for N links as arrays; `frequency_hz` is the networks' frequency."""
+    """Return `distribution_by_paper` for N links as arrays."""
     shift_db = phi.free_space_shift_db(frequency_hz)
     blocks = [
         distribution_by_paper(networks, network_inputs(block), block.link_state, shift_db) for block in _blocks(phi)
@@ -261,7 +251,6 @@ def evaluate_paper(
 
 
 def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> Floats:
-    """Return P(indoor) (N,) by partial link state."""
     p_indoor = np.zeros(len(phi))
     for state, name in INDOOR_NETWORKS.items():
         served = phi.link_state == state
@@ -276,7 +265,6 @@ def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
 
 
 def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
-    """Return the range [low, high] to which each network of the paper clamps its inputs, by feature."""
     ranges = {}
     for name in OUTPUT_WIDTHS:
         network = model.get_layer(name)
@@ -288,7 +276,6 @@ def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
 
 
 def _scaled_inputs(names: tuple[str, ...], ranges: Ranges) -> tuple[dict[str, Any], Any]:
-    """Return inputs by name, and their tensor (N, len(names)) scaled to [0, 1] and clamped."""
     keras = import_keras()
     tensors = {name: keras.Input((1,), name=name, dtype="float32") for name in names}
     columns = list(tensors.values())
@@ -360,10 +347,7 @@ def _ranges(phi: LinkFeatures, settings: PredictorSettings) -> Ranges:
 
 
 def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> None:
-    """Fit a logistic classifier by cross-entropy, a convex problem.
-
-    A slight penalty keeps weights finite if the classes are separable.
-    """
+    """Fit a logistic classifier by cross-entropy; a slight penalty keeps weights finite for separable classes."""
     keras = import_keras()
     scaled = keras.Model(network.input, network.get_layer("clamped").output)(network_inputs(phi, tuple(network.input)))
     rows = np.concatenate([np.asarray(scaled, dtype=np.float64), np.ones((len(phi), 1))], axis=1)
@@ -391,7 +375,6 @@ def _gaussian_loss(gain_db: Any, prediction: Any) -> Any:
 
 
 def _train(network: "keras.Model", phi: LinkFeatures, gain_db: Floats, settings: PredictorSettings) -> None:
-    """Train a gain network in place; equal links and settings give equal weights."""
     keras = import_keras()
     trainer = keras.Model(network.input, network.output)
     decay = keras.optimizers.schedules.CosineDecay(settings.learning_rate, settings.steps)

@@ -1,9 +1,8 @@
 """Paths in unobserved space: survival of traced paths, and analogues of missing ones.
 
-A small network gives the probability that a path traced on a partial map exists in the building. Missing paths are
-taken from similar links of the same link state in procedural homes: their paths that a partial map did not show, turned
-to the direct line of the link (method of analogues; Lorenz, Atmospheric Predictability as Revealed by Naturally
-Occurring Analogues, 1969). `training.paths` makes both.
+Missing paths are taken from similar links in procedural homes: their paths that a partial map did not show, turned to
+the direct line (method of analogues; Lorenz, Atmospheric Predictability as Revealed by Naturally Occurring Analogues,
+1969).
 """
 
 import io
@@ -68,7 +67,6 @@ class LinkGeometry:
 
     @classmethod
     def of(cls, partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> "LinkGeometry":
-        """Measure the lines between transmitters and receivers (L, 3) [m]."""
         distance_m = np.linalg.norm(rx_m - tx_m, axis=1)
         tx_seen, rx_seen = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in (tx_m, rx_m))
         free_space_db = free_space_gain_db(distance_m, frequency_hz)
@@ -77,12 +75,10 @@ class LinkGeometry:
 
     @cached_property
     def arrival_rad(self) -> Floats:
-        """Zenith and azimuth (L, 2) of arrival at the receiver."""
         zenith_rad, azimuth_rad = self.departure_rad.T
         return np.stack([np.pi - zenith_rad, wrapped(azimuth_rad + np.pi)], axis=1)
 
     def take(self, index: Indices | Bools) -> "LinkGeometry":
-        """Select links."""
         return LinkGeometry(*(getattr(self, column.name)[index] for column in fields(self)))
 
     def keys(self, state: LinkState, gain_db: Floats, survivors_db: Floats) -> Floats:
@@ -170,10 +166,7 @@ class PathModel:
         return np.take_along_axis(order, chosen[:, None], axis=1)[:, 0]
 
     def departures_deg(self, state: LinkState) -> tuple[Indices, Floats]:
-        """Return directions (K, 2) of unseen paths from the direct line [degree], and their power (K,).
-
-        They are the mean over all analogues of a state and their mirror images.
-        """
+        """Return directions (K, 2) of unseen paths from the direct line [degree], and their mean power (K,)."""
         first = self.first[: self.los_count + 1] if state == LinkState.LOS else self.first[self.los_count :]
         here, counts = slice(first[0], first[-1]), np.diff(first)
         total = np.add.reduceat(np.append(self.fraction[here], 0.0).astype(np.float64), first[:-1] - first[0])
@@ -191,7 +184,6 @@ class PathModel:
         return (cKDTree(self.keys[:los_count]), 0), (cKDTree(self.keys[los_count:]), los_count)
 
     def save(self, path: Path) -> None:
-        """Write an `.npz` file."""
         arrays = {column.name: getattr(self, column.name) for column in fields(self)[1:]}
         arrays |= {f"weights{number}": values.astype(np.float32) for number, values in enumerate(self.weights)}
         packed = io.BytesIO()
@@ -202,7 +194,6 @@ class PathModel:
     @classmethod
     @cache
     def load(cls) -> "PathModel":
-        """Read the shipped model."""
         content = shipped_bytes(PREDICTORS_FOLDER / "paths.npz", _MAX_BYTES)
         with np.load(io.BytesIO(content), allow_pickle=False) as stored:
             weights = tuple(stored[f"weights{number}"].astype(np.float64) for number in range(6))
@@ -212,8 +203,8 @@ class PathModel:
 class AntennaLinks:
     """Links from (3,) to (N, 3) [m] with an antenna at the transmitter, or at the receivers (`at_rx`).
 
-    Traced paths and the direct line of a link in LOS have the antenna's gain in their direction, all else the mean over
-    the directions of analogues. `paths` are traced for both polarisations.
+    The direct and traced paths have the antenna's gain in their direction, all else the mean over the directions of
+    analogues.
     """
 
     def __init__(self, antenna: Antenna, frequency_hz: float, tx_m: Floats, rx_m: Floats, *, at_rx: bool) -> None:
@@ -222,7 +213,6 @@ class AntennaLinks:
         self._power, self._indirect, self._indirect_alone = np.zeros((3, len(rx_m)))
 
     def added(self, blocks: Iterable[SolvedPaths]) -> Iterator[SolvedPaths]:
-        """Add paths as they are found, and pass them on."""
         for paths in blocks:
             power, indirect = self.antenna.power(paths, self.frequency_hz, at_rx=self._at_rx), ~paths.is_direct
             np.add.at(self._power, paths.path_rx, power)
@@ -233,11 +223,7 @@ class AntennaLinks:
     def predict(
         self, phi: LinkFeatures, prediction: LinkPrediction, complete: Bools
     ) -> tuple[LinkFeatures, LinkPrediction, Floats]:
-        """Return features with the antenna, and the prediction as the sum of two terms; link states stay.
-
-        The second term is the mean gain of the antenna (N,) over states with a path [dB]. The first is the prediction
-        without it, except for the antenna's differences between states.
-        """
+        """Return features with the antenna, the prediction without its mean gain, and this mean gain (N,) [dB]."""
         traced_db, phi = phi.gain_db, replace(phi, gain_db=path_gain_db(self._power))
         antenna_db = phi.gain_db - traced_db
         if complete.all():

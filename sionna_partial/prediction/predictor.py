@@ -68,17 +68,15 @@ class TraceErrors(NamedTuple):
     Parameters
     ----------
     p_missed, missed_db, missed_std_db : float
-        P(NLOS) of a traced outage, falling as exp(-distance / `MISSED_RANGE_M`); mean and standard deviation of its
-        gain above -150 dB [dB].
+        P(NLOS) of a traced outage, falling as exp(-distance / `MISSED_RANGE_M`); its gain above -150 dB [dB].
     p_blocked, blocked_db, blocked_std_db : float
-        P(NLOS) of traced LOS; mean and standard deviation of the change of the gain [dB].
+        P(NLOS) of traced LOS; change of its gain [dB].
     p_opened : float
         P(LOS) of traced NLOS, falling as exp(-depth / `OPENED_DB`).
     p_lost : float
         P(outage) of traced NLOS, rising linearly from 0 over the depths `LOST_DB`.
     los_std_db, nlos_std_db, nlos_std_slope, nlos_slope : float
-        Standard deviations of the gain for an unchanged link state, and their growth with depth; growth of the gain
-        with depth beyond the first of `LOST_DB`.
+        Standard deviations for an unchanged link state; growth of deviation and gain with depth.
     """
 
     p_missed: float
@@ -121,12 +119,9 @@ class LinkPrediction(Shown):
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
-    >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> links = sp.trace_links(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)])
-    >>> prediction = sp.Predictor.load().predict(sp.link_features(partial, links))
-    >>> prediction.p_los.tolist()
-    [1.0]
+    >>> phi = sp.LinkFeatures([1, 0], unobserved_distance_m=[0.0, 4.5], distance_m=[3.0, 6.0], gain_db=[-71.0, -150.0])
+    >>> sp.Predictor.load("paper").predict(phi).p_los.round() + 0.0
+    array([1., 0.])
     """
 
     p_los: Floats
@@ -140,7 +135,6 @@ class LinkPrediction(Shown):
     gain_nlos_std_db: Floats
 
     _materials: ClassVar[tuple[tuple[LinkPrediction, ...], Floats] | None] = None
-    """Distributions by candidate wall material, and their probabilities (K,)."""
 
     @property
     def by_material(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
@@ -149,10 +143,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def over_materials(cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float) -> LinkPrediction:
-        """Return the mixture over candidate wall materials, and keep its parts.
-
-        `residual_db` is the standard deviation of gains about the trace with the true material [dB].
-        """
+        """Return the mixture over materials; `residual_db` is the standard deviation about the true trace."""
         probabilities, means_db, stds_db = cls.mixture(parts, weights).by_state
         stds_db[1:] = np.hypot(stds_db[1:], residual_db)
         mixed = cls.of_parts(probabilities, means_db, stds_db)
@@ -174,10 +165,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType = np) -> Self:
-        """Combine the distributions given each LinkState (3, N), by the laws of total expectation and variance.
-
-        `ops` is NumPy, or keras.ops for tensors; the standard deviation has finite derivatives.
-        """
+        """Combine distributions given LinkState (3, N); `ops` is NumPy, or keras.ops for tensors."""
         mean_db = ops.maximum(ops.sum(probabilities * means_db, axis=0), GAIN_FLOOR_DB)
         variance = ops.sum(probabilities * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
         spread = variance > 0.0
@@ -205,10 +193,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def of_trace(cls, phi: LinkFeatures) -> LinkPrediction:
-        """Return the trace as a prediction without uncertainty, as on a complete map (paper, eq. 9).
-
-        Its gain is the mean given every link state.
-        """
+        """Return the trace as a prediction without uncertainty, as on a complete map (paper, eq. 9)."""
         probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
         return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
 
@@ -216,18 +201,12 @@ class LinkPrediction(Shown):
     def of_mean_losses(
         cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
     ) -> LinkPrediction:
-        """Predict links through walls by the mean loss of walls.
-
-        `walls` (N,) are the expected numbers of unseen walls on the direct lines.
-        """
+        """Predict links by the mean loss of walls; `walls` (N,) are the expected numbers of unseen walls."""
         return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
-        """Return the trace on a nearly complete map with its uncertainty (`TraceErrors`).
-
-        Known walls exclude LOS; separated regions do not make outages certain.
-        """
+        """Return the trace on a nearly complete map with its uncertainty (`TraceErrors`)."""
         context, traced = context_of(phi), phi.link_state
         exact, noisy = np.array([EXACT, NOISY])[..., None]
         of = TraceErrors(*(exact + (noisy - exact) * excess_noise(context.wall_noise)))
@@ -285,7 +264,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
-        """Join links, one part after the other."""
+        """Join links."""
         joined = cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
         materials = [part._materials for part in parts if part._materials is not None]
         if len(materials) == len(parts) > 0:
@@ -309,7 +288,7 @@ class LinkPrediction(Shown):
         return cls.of_parts(probabilities / probabilities.sum(axis=0), mean_db, np.sqrt(variance))
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
-        """Return the links in another shape, such as (T, N)."""
+        """Return the links in another shape."""
         return self.mapped(
             lambda links: LinkPrediction(*(getattr(links, column.name).reshape(shape) for column in fields(links)))
         )
@@ -320,9 +299,7 @@ class LinkPrediction(Shown):
         return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
 
     def anywhere(self, p_indoor: ArrayLike) -> LinkPrediction:
-        """Return the distribution for receivers that may be outdoors, where every link is in outage.
-
-        P(LOS) and P(NLOS) are multiplied by `p_indoor`, the rest is outage (paper, "Indoor-Outdoor Estimation").
+        """Return the distribution for receivers that may be outdoors, in outage (paper, "Indoor-Outdoor Estimation").
 
         Parameters
         ----------
@@ -350,23 +327,20 @@ class LinkPrediction(Shown):
 class Predictor(Shown):
     """A predictor of link state and path gain, from `fit` or `load`.
 
-    The paper's (Sections III-D and III-E): P(link state | features) is one multinomial logistic classifier on distance
-    and unobserved distance for each partial link state; the gain given the link state is Gaussian, its mean and
-    log-variance from the networks of the paper's table. P(indoor) is a logistic classifier on the unobserved distance
-    for each partial link state, 1 before `fit_indoor`.
+    The paper's (Sections III-D and III-E): a logistic classifier on distance and unobserved distance gives P(link
+    state) for each partial link state; the gain given the link state is Gaussian. P(indoor) is a logistic classifier on
+    the unobserved distance, 1 before `fit_indoor`.
 
-    With `PredictorSettings.networks` other than "paper", further networks (`map_networks`) predict links whose features
-    have a context; on a complete map the trace is the prediction. Features without a context are predicted by the
-    paper's networks, fitted to the same links.
+    With `PredictorSettings.networks` other than "paper", further networks predict links whose features have a context;
+    on a complete map the trace is the prediction. The paper's networks predict features without a context.
 
     Parameters
     ----------
     model : keras.Model
-        All networks, in one model.
+        All networks.
     archive : bytes
         The model as a `.keras` file.
     settings : PredictorSettings
-        Settings of the training.
     homes : tuple of str
         Names of the training homes.
     links : mapping of str to int
@@ -431,9 +405,8 @@ class Predictor(Shown):
         gain_db : (N,) array-like
             Omnidirectional path gain on the complete map [dB].
         homes : sequence of str
-            Names of the homes, for the record.
+            Names of the homes.
         settings : PredictorSettings, optional
-            The paper's networks by default.
         progress : bool or callable, optional
             As in `predict_map`.
 
@@ -549,8 +522,7 @@ class Predictor(Shown):
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.
 
-        The card records features, their scaling (applied inside the networks), settings, homes, metrics, versions and
-        the SHA-256.
+        The card has features, scaling, settings, homes, metrics, versions and the SHA-256.
 
         Parameters
         ----------
@@ -624,8 +596,8 @@ class Predictor(Shown):
 class OtherPredictor:
     """A user's model instead of a `Predictor`: any object with `predict(phi)`.
 
-    `predict` gets the `LinkFeatures` of the N links that are not certain. It returns a `LinkPrediction`, or a mapping
-    of (N,) arrays: `p_los`, `p_nlos`, `p_outage`, and `gain_mean_db`, `gain_std_db` of links with a path, or both
+    `predict` gets the `LinkFeatures` of the N uncertain links. It returns a `LinkPrediction`, or a mapping of (N,)
+    arrays: `p_los`, `p_nlos`, `p_outage`, and `gain_mean_db`, `gain_std_db` of links with a path, or both
     `gain_los_...` and `gain_nlos_...` [dB]. Without a method `predict_indoor(phi)`, the default predictor gives
     P(indoor).
     """
@@ -676,10 +648,7 @@ class OtherPredictor:
 
 
 class MeanLosses:
-    """Predictor of links through walls by the mean loss of known walls and the expected number of unseen walls.
-
-    `networks` predict P(indoor).
-    """
+    """Predictor of links through walls by mean losses; `networks` predict P(indoor)."""
 
     name = WALL_LOSSES
 
@@ -741,7 +710,6 @@ def _map_reader(model: keras.Model) -> MapReader:
 
 
 def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:
-    """Return the file of a predictor by its shipped name or path."""
     name = SHIPPED[0] if name_or_path is None else name_or_path
     return PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
 

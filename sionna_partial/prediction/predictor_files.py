@@ -1,8 +1,4 @@
-"""Predictor files: a `.keras` archive and a JSON card beside it.
-
-Nothing in them is ever executed. The archive must have the SHA-256 in the card and hold only the stock Keras classes of
-our networks; it is loaded in safe mode.
-"""
+"""Predictor files: a `.keras` archive of stock Keras classes, loaded in safe mode, and a JSON card with its SHA-256."""
 
 import hashlib
 import io
@@ -39,7 +35,7 @@ _CLASSES = {
     *("DTypePolicy", "GlorotUniform", "Zeros", "Ones", "Constant", "__keras_tensor__"),
 }
 _COUNTED = re.compile(rb'"(maximum|log10)_\d+"')
-"""Unnamed operations, which Keras numbers through a process. Each of our networks has one of each."""
+"""Unnamed operations, which Keras numbers through a process."""
 
 _INPUTS = dict.fromkeys(GAIN_INPUTS, (None, 1))
 _OUTPUTS = {name: (None, width) for name, width in OUTPUT_WIDTHS.items()}
@@ -53,7 +49,7 @@ _FIXED_ENTRIES = {
 
 
 def pack(model: "keras.Model") -> bytes:
-    """Return the `.keras` archive of a model without Keras's date, so that a training has one hash."""
+    """Return the `.keras` archive without Keras's date, so that a training has one hash."""
     keras = import_keras()
     config = json.dumps(keras.saving.serialize_keras_object(model)).encode()
     metadata = json.dumps({"keras_version": keras.__version__}).encode()
@@ -69,15 +65,11 @@ def pack(model: "keras.Model") -> bytes:
 
 
 def digest(archive: bytes) -> str:
-    """Return the SHA-256 of an archive, in hexadecimal."""
     return hashlib.sha256(archive).hexdigest()
 
 
 def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
-    """Write the `.keras` file at `path` and its card, whole or not at all.
-
-    Format, features and hash are added to `card`.
-    """
+    """Write the `.keras` file and its card, whole or not at all."""
     if path.suffix != SUFFIX:
         raise PredictorError(f"path = '{path}' is no predictor: give the path of a {SUFFIX} file.")
     entries = {**_FIXED_ENTRIES, "sha256": digest(archive), **card}
@@ -87,7 +79,6 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
 
 
 def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
-    """Read and check a `.keras` file and its card; return model, archive and card."""
     archive = _read(path)
     card = _read_card(path.with_suffix(".json"))
     if card["sha256"] != digest(archive):
@@ -138,7 +129,6 @@ def _read_card(path: Path) -> dict[str, Any]:
 
 
 def _require_our_kind(path: Path, archive: bytes) -> None:
-    """Raise a PredictorError unless the archive is a Keras model of our classes and sizes."""
     try:
         content = unzipped(archive, _MAX_BYTES)["config.json"]
         config, config_bytes = json.loads(content), len(content)
@@ -159,7 +149,7 @@ def _require_our_kind(path: Path, archive: bytes) -> None:
 
 
 def _sizes(entry: Any) -> Iterator[int]:
-    """Yield the whole numbers of a configuration except seeds: units, filters, shapes, strides."""
+    """Yield the whole numbers of a configuration except seeds."""
     if isinstance(entry, int):
         yield abs(entry)
     values = entry.items() if isinstance(entry, dict) else enumerate(entry) if isinstance(entry, list) else ()

@@ -1,8 +1,4 @@
-"""Straight lines and windows on the cells of a map.
-
-The fraction of a line in unknown cells is the grid integral of d_unobs (paper, Section III-C). Windows around
-transmitters are the images of map networks.
-"""
+"""Straight lines and windows on the cells of a map: d_unobs (paper, Section III-C), and the images of map networks."""
 
 import itertools
 import math
@@ -31,22 +27,21 @@ _ALONG_CELLS = 1e-3
 """Extent along one axis below which a segment may follow the border of cells [cells]."""
 
 _SEGMENTS_PER_CORE = 20_000
-"""Number of segments for which another core is used."""
 
 WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
-"""Cells along each side of a window, and their edges in the near and far window of a transmitter [m]."""
+"""Cells along each side, and their edges in the near and far window of a transmitter [m]."""
 
 CHANNELS = ("free", "wall", "seen", "hidden", "detour")
 """Values of a cell of a window in 255ths, 0 where nothing was observed.
 
-free, wall: known fraction of the cell. seen: observed fraction of the direct line from the transmitter. hidden: 1 if
-that line meets a known wall. detour: see `_detours`.
+free, wall: known fraction. seen: observed fraction of the direct line from the transmitter. hidden: 1 if that line
+meets a known wall. detour: see `_detours`.
 """
 
 WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
 
 _FINEST = 4
-"""Largest number of map cells along a window cell; finer maps are coarsened once for all windows."""
+"""Largest number of map cells along a window cell; finer maps are coarsened once."""
 
 _WALL_COST = 100.0
 """Cost of a walk through a cell of wall only [cells]."""
@@ -58,8 +53,8 @@ _LONGEST_DETOUR = 40.0
 def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
     """Return the lengths (N,) of segments in unknown cells [m], exact up to rounding; ends are (N, 3) or (3,) [m].
 
-    Outside the grid all is unknown. On a complete map, a segment with an end in a known cell has the length 0 by
-    definition. A segment along the border of cells is in the freest of them, as in `PartialMap.state_at`.
+    The outside of the grid is unknown. On a complete map, a segment with an end in a known cell has the length 0. A
+    segment along the border of cells is in the freest of them.
     """
     start_m, end_m = np.broadcast_arrays(start_m, end_m)
     lengths_m, open_ended = np.zeros(len(end_m)), ~is_enclosed(partial, start_m, end_m)
@@ -68,7 +63,6 @@ def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) ->
 
 
 def lengths_in_unknown_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
-    """Return these lengths (N,) [m] without the rule for complete maps."""
     return _lengths_m(partial, CellState.UNKNOWN, start_m, end_m)
 
 
@@ -120,15 +114,11 @@ def in_cells(partial: PartialMap, points_m: Floats) -> Floats:
 
 
 def map_line_fractions(partial: PartialMap, starts: Floats, ends: Floats) -> Floats:
-    """Return `line_fractions` on the cells of a map."""
     return line_fractions(partial.state, starts, ends, partial.uniform_cells)
 
 
 def line_fractions(state: States, starts: Floats, ends: Floats, uniform: NDArray[np.int32] | None = None) -> Floats:
-    """Return the fractions (N, 3) of segments from `starts` to `ends` (N, 2) [cells] in each CellState.
-
-    Cells outside the grid are unknown. `uniform` is `uniform_cells(state)`, if at hand.
-    """
+    """Return the fractions (N, 3) of segments from `starts` to `ends` (N, 2) [cells] in each CellState."""
     uniform = uniform_cells(state) if uniform is None else uniform
     fractions = np.zeros((len(ends), len(CellState)))
     bounds = np.linspace(0, len(ends), 1 + min(core_count(), 1 + len(ends) // _SEGMENTS_PER_CORE)).astype(int)
@@ -155,7 +145,6 @@ class Segment(NamedTuple):
 
 @njit(cache=True)
 def segment_between(x: float, y: float, end_x: float, end_y: float) -> Segment:
-    """Return the segment between two points [cells]."""
     step_x, step_y = end_x - x, end_y - y
     pace_x = 1.0 / step_x if step_x != 0.0 else np.inf
     pace_y = 1.0 / step_y if step_y != 0.0 else np.inf
@@ -179,8 +168,8 @@ def leave_cells(
 ) -> tuple[float, int, int]:
     """Walk from fraction `here` out of a cell and `skip` cells around it (Amanatides and Woo 1987).
 
-    Return the fraction reached, at most `leave`, and the next x and y lines. Distances to lines are computed afresh, so
-    that rounding errors do not add up.
+    Return the fraction reached, at most `leave`, and the next x and y lines. Distances are computed afresh, so that
+    rounding errors do not add up.
     """
     turn_x, turn_y = (1 if segment.step_x > 0.0 else -1), (1 if segment.step_y > 0.0 else -1)
     at_x = (line_x + turn_x * skip - segment.x) * segment.pace_x if segment.step_x != 0.0 else np.inf
@@ -199,7 +188,6 @@ def leave_cells(
 
 @njit(cache=True, nogil=True)
 def _fill_fractions(state: States, uniform: NDArray[np.int32], starts: Floats, ends: Floats, fractions: Floats) -> None:
-    """Add the fractions of segments in each state to `fractions` (N, 3), skipping uniform cells."""
     ny, nx = state.shape
     for i in range(len(ends)):
         segment = segment_between(starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1])
@@ -237,7 +225,7 @@ def _first_line(position: float, step: float) -> int:
 
 @njit(cache=True)
 def _freest(state: States, x: float, y: float) -> int:
-    """Return the state of the freest cell within 1e-6 cells of a point [cells]: FREE before UNKNOWN before WALL."""
+    """Return the freest cell state within 1e-6 cells of a point: FREE before UNKNOWN before WALL."""
     ny, nx = state.shape
     found = _WALL
     for row in range(int(np.floor(y - _BORDER_CELLS)), int(np.floor(y + _BORDER_CELLS)) + 1):
@@ -257,7 +245,6 @@ def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, In
 
 
 def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
-    """Draw the windows (W, *WINDOWS) of `transmitters`."""
     windows = np.zeros((len(keys), *WINDOWS), dtype=np.uint8)
     for number in np.unique(keys[:, 0]).astype(int):
         here = keys[:, 0] == number
@@ -266,10 +253,7 @@ def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
 
 
 def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
-    """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m] of one map.
-
-    Row 0 of a window has the smallest y; the transmitter is in the middle.
-    """
+    """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m]; row 0 has the smallest y."""
     windows = np.zeros((len(tx_m), *WINDOWS), dtype=np.uint8)
     if not (partial.state == CellState.UNKNOWN).all():
         for scale, cell_m in enumerate(CELLS_M):
@@ -280,7 +264,6 @@ def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
 
 
 def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
-    """Return a map with larger cells, of at most `cell_m`; a block with a wall is a wall."""
     factor = math.floor(cell_m / partial.resolution_m + 1e-9)
     if factor < 2:
         return partial
@@ -291,7 +274,7 @@ def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
 
 
 def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
-    """Draw the window with cells of `cell_m` around a transmitter, which may be in a coarsened wall."""
+    """Draw the window around a transmitter, which may be in a coarsened wall."""
     state, start = _surroundings(partial, tx_m, cell_m)
     if clear_around_tx:
         column, row = np.floor(start).astype(int)
@@ -309,7 +292,6 @@ def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx
 
 
 def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[States, Floats]:
-    """Return the map part of a window, and the transmitter in it [cells]."""
     half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
     start = in_cells(partial, tx_m)
     column, row = np.floor(start).astype(int)
@@ -331,10 +313,7 @@ def overlaps(edges: Floats, count: int) -> Floats:
 
 
 def _detours(wall: Floats) -> Floats:
-    """Return the excess length of routes around known walls, in [0, 1] of `_LONGEST_DETOUR`.
-
-    Routes start at the four middle cells and go from cell to cell, also diagonally; walls are crossed at a cost.
-    """
+    """Return the excess length of routes around known walls, in [0, 1] of `_LONGEST_DETOUR`."""
     half = WINDOW_CELLS // 2
     middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]
     cost = 1.0 + _WALL_COST * wall

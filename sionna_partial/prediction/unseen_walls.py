@@ -1,12 +1,8 @@
 """Number of walls that a straight line meets in unknown cells, and its effect on links through walls.
 
-A U-Net (Ronneberger, Fischer and Brox 2015) reads the map and estimates the walls per metre of lines along x and y in
-each unknown cell. A second network corrects the integral over a line by its lengths and known walls. They were trained
-on lines through procedural buildings (`training.walls`). The number of walls has a negative binomial distribution
-(`count_probabilities`).
-
-The loss of an unseen wall is the mean loss of the known walls (`by_mean_losses`). Its constants were fitted to
-procedural homes, floors and halls of materials with 3 to 26 dB per wall; `benchmarks/unseen_walls.py` evaluates others.
+A U-Net (Ronneberger, Fischer and Brox 2015) estimates the walls per metre along x and y in each unknown cell; a second
+network corrects the integral over a line. `training.walls` trains both on procedural buildings. Constants of the loss
+were fitted to procedural buildings with 3 to 26 dB per wall (`benchmarks/unseen_walls.py`).
 """
 
 import functools
@@ -49,8 +45,7 @@ _FIRST, _LEAST = -1.5, -4.0
 
 _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
 """Width of the unknown border around known cells [m]; cells at the border of an image that are blurred, and left out;
-cells joined by pooling. Images are aligned to the world by such groups of cells, so that the result does not depend
-on the map's grid or the unknown cells around it. Beyond the image, its outermost cells count.
+cells joined by pooling. Images are aligned to the world by such groups, so that the result does not depend on the grid.
 """
 
 _LINES_AT_ONCE = 16_384
@@ -60,10 +55,10 @@ WALL_LOSSES = "the mean loss of unobserved walls"
 """Predictor's name in coverage maps."""
 
 LONGEST_M = 50.0
-"""Longest line in training: longer lines have the same walls per metre as a line of this length [m]."""
+"""Longest line in training: longer lines have its walls per metre [m]."""
 
 DISPERSION = 0.2
-"""Variance of the number of walls in excess of Poisson, in squares of the mean: buildings differ."""
+"""Variance of the number of walls in excess of Poisson, in squares of the mean."""
 
 MOST_COUNTED = 32
 """Largest number of unseen walls with a probability of its own."""
@@ -91,24 +86,13 @@ number of walls [dB]; and of other links, times the root of the number of walls,
 
 
 class WallDensity(NamedTuple):
-    """Estimated walls of the unknown cells of a map.
-
-    Parameters
-    ----------
-    per_m : (1, ny, nx, 2) float32 tensor
-        Walls per metre along x and y; 0 in known cells.
-    origin_m : (2,) array
-        Corner of the first cell [m].
-    lines : keras.Model
-        Network that corrects integrals.
-    """
+    """Estimated walls of unknown cells: walls per metre (1, ny, nx, 2) along x and y, and the corner [m]."""
 
     per_m: Any
     origin_m: Floats
     lines: Any
 
     def counts(self, phi: LinkFeatures) -> Floats:
-        """Return the expected number of unseen walls on the direct lines (N,)."""
         context = context_of(phi)
         ends = ((end_m[:, :2] - self.origin_m) / CELL_M for end_m in (context.tx_m, context.rx_m))
         scale = np.minimum(1.0, LONGEST_M / phi.distance_m)
@@ -123,21 +107,19 @@ class WallDensity(NamedTuple):
 
 
 class UnseenWalls(NamedTuple):
-    """Two networks: walls of cells, and corrections of lines."""
+    """Networks for the walls of cells and the corrections of lines."""
 
     cells: "keras.Model"
     lines: "keras.Model"
 
     @classmethod
     def untrained(cls, seed: int = 0) -> Self:
-        """Build the networks with random weights."""
         keras, start = import_keras(), kernel_starts(seed)
         return cls(_cell_network(keras, start), _line_network(keras, start))
 
     @classmethod
     @functools.cache
     def shipped(cls) -> Self:
-        """Return the shipped networks."""
         networks = cls.untrained()
         with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
             for name, network in networks._asdict().items():
@@ -145,7 +127,6 @@ class UnseenWalls(NamedTuple):
         return networks
 
     def save(self, path: Path) -> None:
-        """Write the weights to an .npz file."""
         arrays = {
             f"{name}_{number}": values
             for name, network in self._asdict().items()
@@ -155,7 +136,6 @@ class UnseenWalls(NamedTuple):
             np.savez_compressed(stream, **arrays)
 
     def of_map(self, partial: PartialMap) -> WallDensity:
-        """Estimate the walls of a map."""
         known = _known_part(partial)
         x0, y0, x1, y1 = known.bounds_m
         corner_m, pooled_m = np.array([x0, y0]), _POOLED * CELL_M
@@ -195,10 +175,7 @@ def _known_part(partial: PartialMap) -> PartialMap:
 def map_image(
     partial: PartialMap, shape: tuple[int, int] | None = None, start: Floats | tuple[float, float] = (0.0, 0.0)
 ) -> NDArray[np.uint8]:
-    """Return the fractions of free and wall of coarse cells (ny, nx, 2) [1/255].
-
-    The image begins at `start` (x, y) from the map's origin [cells], and by default covers the map.
-    """
+    """Return the fractions of free and wall of coarse cells (ny, nx, 2) [1/255], by default of the whole map."""
     coarse = CELL_M / partial.resolution_m
     counts = shape or [max(1, math.ceil(count / coarse - 1e-9)) for count in partial.shape]
     rows, columns = (
@@ -231,7 +208,6 @@ def walls_met(per_m: Any, start: Any, end: Any) -> Any:
 
 
 def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m: Any, known: Any) -> Any:
-    """Return the expected number of unseen walls of lines (...) from integrals, lengths and known walls."""
     lengths = (tf.math.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
     share, none = unobserved_m / (distance_m + 0.1), tf.cast(known == 0.0, tf.float32)
     inputs = tf.stack([tf.math.log(integral + 0.02), *lengths, tf.math.log(1.0 + known), share, none], axis=-1)
@@ -240,10 +216,7 @@ def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m
 
 
 def count_probabilities(walls: Floats) -> Floats:
-    """Return the probabilities (K, N) of 0, 1, ... and K - 1 or more unseen walls, given the mean (N,).
-
-    The distribution is negative binomial: Poisson with gamma-distributed means.
-    """
+    """Return the negative binomial probabilities (K, N) of 0, 1, ... and K - 1 or more walls, given the mean (N,)."""
     count, failures = np.arange(MOST_COUNTED)[:, None], 1.0 / DISPERSION
     ratios = (count + failures) / (count + 1.0) * (walls / (walls + failures))
     none = (1.0 + DISPERSION * walls) ** -failures
@@ -257,8 +230,7 @@ def by_mean_losses(
 ) -> tuple[Floats, Floats, Floats]:
     """Return probabilities, means and standard deviations of the gain [dB] of links through walls, each (3, N).
 
-    Rows are by LinkState. `walls` (N,) are the expected numbers of unseen walls on the direct lines; `max_walls` is the
-    limit of the trace. A link with traced LOS has LOS if there is no unseen wall.
+    `walls` (N,) are the expected numbers of unseen walls on the direct lines.
     """
     blocks = [slice(first, first + _LINES_AT_ONCE) for first in range(0, max(1, len(walls)), _LINES_AT_ONCE)]
     found = [_by_mean_losses(phi.take(block), walls[block], max_walls) for block in blocks]

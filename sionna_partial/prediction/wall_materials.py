@@ -1,14 +1,9 @@
 """The unknown material of walls: candidates for the losses of crossings and reflections, prior and evidence.
 
-Paths do not depend on the material of the walls, only their powers do. A trace with drywall therefore gives the gains
-under every candidate, which adds a loss to every crossing and reflection. Its limits
-are coarse (`Limits.of`): candidates differ by much more (`benchmarks/through_walls.py --only material`).
-
-The prior of the loss of a wall is a mixture of log-normal distributions around the mean losses of common materials
-(`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Measured losses of one material scatter by a factor of
-1.7. Measured powers are evidence (`Assimilation`): residuals of a trace are a Gaussian process of standard deviation s,
-white noise n, a common offset and a common factor on the loss of walls. Candidates share the correlation, so that one
-eigenvalue decomposition serves all candidates, s and n.
+Paths do not depend on the material of the walls, only their powers do: each candidate adds a loss to every crossing and
+reflection of a trace with drywall. The prior is a mixture of log-normal distributions around the mean losses of common
+materials (`tracing.power.wall_loss_db`; ITU-R P.2040-3, 3GPP TR 38.901). Measured powers are evidence (`Assimilation`):
+residuals of a trace are a Gaussian process, white noise, a common offset and a common factor on the loss of walls.
 """
 
 import math
@@ -39,8 +34,8 @@ BELOW = 1.3
 """Ratio of the smallest mean loss of a common material to the smallest candidate."""
 
 LIKELY_STD_DB, LIKELY_FADING_DB = 5.0, 3.0
-"""Most probable standard deviations of measured powers about a trace with the best material and offset [dB]: of a
-spatial process, for unmapped furniture, doors and people, and of fading (`benchmarks/reality.py`).
+"""Most probable standard deviations of measured powers about a trace [dB]: of a spatial process, and of fading
+(`benchmarks/reality.py`).
 """
 
 RESIDUAL_DB = math.hypot(LIKELY_STD_DB, LIKELY_FADING_DB)
@@ -50,15 +45,13 @@ STDS_DB, STD_SPREAD = (2.5, 3.5, 5.0, 7.0, 10.0), 0.4
 """Candidate standard deviations of the process [dB], and the prior standard deviation of their logarithm."""
 
 FADINGS_DB = np.array([1.0, 1.5, 2.0, 3.0, 4.0, 6.0, 8.0, 10.0])
-"""Candidate standard deviations of fading, which differs from receiver to receiver [dB]."""
+"""Candidate standard deviations of fading [dB]."""
 
 FADING_SPREAD = 0.5
 """Prior standard deviation of the logarithm of fading."""
 
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
-"""Exponents of the evidence of a transmitter and of other transmitters: errors of a trace are correlated more than the
-process assumes.
-"""
+"""Exponents of the evidence of a transmitter and of others: errors of a trace are more correlated than assumed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +79,6 @@ class WallMaterials:
     @classmethod
     @lru_cache(maxsize=16)
     def at(cls, frequency_hz: float) -> "WallMaterials":
-        """Return the candidates at a frequency [Hz]."""
         covered_hz = min(max(frequency_hz, MODELS_HZ[0]), MODELS_HZ[1])
         mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], covered_hz) for name in COMMON])
         losses_db = np.geomspace(mean_db.min() / BELOW, np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
@@ -100,16 +92,13 @@ class WallMaterials:
         return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
 
     def under(self, phi: LinkFeatures, fraction: float = 1.0) -> list[LinkFeatures]:
-        """Return the features under each candidate; `fraction` of the walls have an unknown material."""
         pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
         return [phi.with_extra_losses(*pair, fraction) for pair in pairs]
 
     def attributes(self, weights: Floats) -> dict[str, str | float]:
-        """Return the attributes of a coverage map: the materials as text, and the mean wall loss [dB]."""
         return {"wall_material": self.text(weights), "wall_loss_db": float(weights @ self.crossing_db) + self.traced_db}
 
     def text(self, weights: Floats) -> str:
-        """Return the probabilities (K,) by material as text, the most probable first."""
         sums = {name: float(weights @ [name == near for near in self.names]) for name in COMMON}
         shown = sorted(((round(p, 2), name) for name, p in sums.items()), reverse=True)
         return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)
@@ -156,7 +145,6 @@ class Residuals(NamedTuple):
 
 
 def log_std_prior() -> Floats:
-    """Return the log-probability (S, N) of `STDS_DB` and `FADINGS_DB`, up to a constant."""
     apart = np.log(np.array(STDS_DB) / LIKELY_STD_DB) / STD_SPREAD
     fading_apart = np.log(FADINGS_DB / LIKELY_FADING_DB) / FADING_SPREAD
     log_prior: Floats = -0.5 * apart[:, None] ** 2 - 0.5 * fading_apart**2
