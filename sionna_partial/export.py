@@ -102,7 +102,7 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     --------
     >>> import sionna_partial as sp
     >>> coverage = sp.load_coverage("coverage.nc")  # that save_coverage wrote
-    >>> coverage.attrs["spacing_m"]
+    >>> float(coverage.attrs["spacing_m"])
     0.5
     """
     content = read_bytes(path, "path", SettingsError, MAX_BYTES)

@@ -42,7 +42,7 @@ SensorSettings range_noise_m number [0, 1], drift_m_per_m number [0, 1], missed_
     missed_return_fraction number [0, 1]
 DatasetSettings links_per_home whole [1, 1000000], transmitters_per_home whole [1, 1000], seed whole [0, 2147483647],
     tx_height_m number (0, 1000], rx_height_m number (0, 1000], margin_m number [0, 1000],
-    short_link_fraction number [0, 1]
+    short_link_fraction number [0, 1], cir_paths whole [0, 1000]
 PredictorSettings frequency_hz number [1e+06, 1e+12], passes whole [1, 1000000], steps whole [1, 1000000],
     batch_size whole [1, 1000000], learning_rate number (0, 1], minimum_links whole [1, 1000000],
     seed whole [0, 1000000000]
