@@ -281,8 +281,8 @@ def load_antenna(path: str | Path) -> AntennaPattern:
     r"""Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
 
     A gain without unit is in dBd. Horizontal angles are clockwise from the main direction, vertical angles downwards
-    from the horizon; cuts include an electrical tilt. Other polarisations than vertical and horizontal are
-    computed as vertical, with a warning.
+    from the horizon; cuts include an electrical tilt. Other polarisations than vertical and horizontal are computed
+    as vertical, with a warning.
 
     Raises
     ------

@@ -42,12 +42,12 @@ _DIRECTED = 0.5
 """Factor of the tolerance with a directive antenna, whose gain is bounded within one degree."""
 
 Kinds = tuple[list[Kind], list[Kind]]
-"""Kinds of candidates between opaque walls, and of candidates through walls."""
+"""Kinds of candidates between opaque walls, and through walls."""
 
 
 @dataclass(frozen=True)
 class PlanScene:
-    """An extruded floor plan on disk; `shapes` are its shape names in face order.
+    """An extruded floor plan on disk, with its shape names in face order.
 
     `floor` (ny, nx) are the cells that have a floor; with `coarse`, fewer paths through walls are listed.
     """
@@ -86,7 +86,7 @@ class PlanScene:
 
 @dataclass(frozen=True)
 class MeshScene:
-    """A mesh on disk; `shapes` are its shape names in face order, vertices are in scene coordinates."""
+    """A mesh on disk, with its shape names in face order and vertices in scene coordinates."""
 
     xml: Path
     shapes: tuple[str, ...]

@@ -104,10 +104,6 @@ def gain_gradients(
     trace_settings : TraceSettings, optional
         Diffuse reflection must be off, and on meshes diffraction.
 
-    Returns
-    -------
-    GainGradients
-
     Raises
     ------
     PositionError

@@ -279,10 +279,6 @@ class TracedLinks(Shown):
         Dimensions are "rx", "tx" for several transmitters, "path" and "interaction"; variables have `units`,
         settings are attributes.
 
-        Returns
-        -------
-        xarray.Dataset
-
         Examples
         --------
         >>> import sionna_partial as sp
@@ -355,10 +351,6 @@ class TracedLinks(Shown):
             shortest `delay_s` (NaN without paths). Columns of paths: `tx`, `rx`, `gain_db`, `phase_rad`, `delay_s`,
             angles [rad], `interactions` by Sionna RT's `InteractionType`, such as "1-1-8", and number of `walls`
             crossed.
-
-        Returns
-        -------
-        pandas.DataFrame
 
         Raises
         ------
@@ -449,7 +441,7 @@ class LinkSums:
         return power
 
     def add(self, paths: SolvedPaths, counted: Bools | bool = True) -> None:
-        """Add some of the paths; walls and reflections count where `counted` (P, D) is True."""
+        """Add paths; walls and reflections count where `counted` (P, D) is True."""
         link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
         counts = (
             np.minimum(np.count_nonzero((paths.interactions == kind) & counted, axis=1), most - 1)

@@ -1,6 +1,6 @@
 """Paths of links as functions of transmitter positions, materials and frequency.
 
-A complete trace finds the paths once. Sionna RT then gives their power and vertices for other values, and Dr.Jit the
+A complete trace finds the paths. Sionna RT then gives their power and vertices for other values, and Dr.Jit the
 derivatives. A path that becomes invalid has no power; new paths are not found.
 """
 

@@ -53,7 +53,7 @@ InvalidLinks = Literal["raise", "nan"]
 _log = logging.getLogger(__name__)
 
 SHORTEST_M = 0.011
-"""Shortest distance of a link [m]. Sionna RT drops paths with a leg of 1 cm or less."""
+"""Shortest distance of a link [m], above `SHORTEST_LEG_M`."""
 
 LARGE_JOB = 8_000
 """Number of links from which the memory of their paths is estimated."""
@@ -150,10 +150,6 @@ class Simulation:
             As in `trace_links`.
         polarisations : {2, 1}
             1 traces vertical polarisation alone, with a quarter of the memory for `TracedLinks.transfer`.
-
-        Returns
-        -------
-        TracedLinks
         """
         require_choice("invalid", invalid, get_args(InvalidLinks))
         require_memory(memory_gb)
@@ -189,10 +185,6 @@ class Simulation:
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> PathSet:
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], which can be differentiated.
 
-        Returns
-        -------
-        PathSet
-
         Raises
         ------
         PositionError
@@ -214,8 +206,7 @@ class Simulation:
     ) -> Iterator[SolvedPaths]:
         """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
 
-        Paths that are weak with `antenna`, which needs both polarisations, are left out. Limits are coarse where the
-        material of walls is unknown.
+        `antenna` is as in `ExactFinder.paths`. Limits are coarse where the material of walls is unknown.
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
@@ -454,10 +445,6 @@ def trace_links(
     progress : bool or callable, optional
         As in `predict_map`.
 
-    Returns
-    -------
-    TracedLinks
-
     Raises
     ------
     MemoryLimitError
@@ -546,7 +533,6 @@ def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz:
 
 
 def _transmitters(partial: PartialMap, tx: ArrayLike) -> Floats:
-    """Return transmitters (T, 3) [m]; errors name one as tx1, tx2 and so on."""
     points_m = position_array("tx", tx)
     return partial.require_positions("tx", points_m, names=transmitter_names(len(points_m))).reshape(-1, 3)
 

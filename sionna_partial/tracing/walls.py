@@ -113,8 +113,7 @@ def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
 class MetFaces(NamedTuple):
     """Scratch of one path: the faces that it meets, in order from the transmitter.
 
-    `kind` is Sionna RT's `InteractionType`, `same_wall` marks further faces of a crossed wall, which cost nothing,
-    `cosine` is for the angle of incidence.
+    `kind` and `same_wall` are as in `Candidates`, `cosine` is for the angle of incidence.
     """
 
     face: NDArray[np.int64]

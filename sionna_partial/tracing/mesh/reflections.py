@@ -141,7 +141,6 @@ class MeshReflections:
         self._links = MeshLinks(mesh, *ends, limits, gains)
 
     def listed(self, found: Floats, *, sequences_at_once: int = _SEQUENCES_AT_ONCE) -> Iterator[Listed]:
-        """List straight lines, then sequence after sequence; paths through walls in one part, with their powers."""
         links, every = self._links, np.arange(len(self._links.rx_m), dtype=np.int32)
         direct = _straight(links) if self._opaque is None else np.full(len(every), np.inf)
         needed = links.limits.min_power(found + direct) if self._opaque is None else np.zeros(len(every))

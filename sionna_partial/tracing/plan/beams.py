@@ -92,10 +92,10 @@ class Needed(NamedTuple):
 class Beams(NamedTuple):
     """M beams of one number of reflections.
 
-    `parent` (M,) is the beam before the last reflection, counted through all beams, `piece` (M,) the reflecting piece
-    of wall; -1 for the roots. `window` (M, 6) are the image of the transmitter and the ends of the window [m]. `left`
-    (M, 2) bounds the power after reflections and after walls, `crossed` (M,) is the smallest number of walls, `more`
-    (M,) the largest number of further reflections, `sequence` (M,) numbers the sequences of lines.
+    `parent` and `piece` (M,) are as in `BeamTree`, -1 for the roots. `window` (M, 6) are the image of the transmitter
+    and the ends of the window [m]. `left` (M, 2) bounds the power after reflections and after walls, `crossed` (M,) is
+    the smallest number of walls, `more` (M,) the largest number of further reflections, `sequence` (M,) numbers the
+    sequences of lines.
     """
 
     parent: NDArray[np.int32]
@@ -465,7 +465,6 @@ def _extend(layers, lines, material, c, new, windows):
 
 @njit(cache=True)
 def _piece_of(layers, c, span):
-    """Return a part of a view as input of `reflect`: (t0, w0, t1, w1)."""
     w0, w1 = _nearness(layers, c, span[0]), _nearness(layers, c, span[1])
     return span[0], max(w0, 1e-9), span[1], max(w1, 1e-9)
 

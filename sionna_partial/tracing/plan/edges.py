@@ -351,7 +351,6 @@ def _leg_power(trail, count, building):
 
 @njit(cache=True)
 def _to_edge(building, origin, length, total, trail):
-    """Write the walls on a line from the transmitter to an edge; return the numbers of entries and of walls."""
     part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
     x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
     leg = Leg((tx_m[0], tx_m[1]), (x, y), np.int64(-1), np.int64(-1), 0.0, part * length / total)

@@ -162,7 +162,6 @@ class SpecularCandidates:
 
 @njit(cache=True, nogil=True)
 def _list_variants(tree, pairs, building, trail):
-    """List every variant of pairs: number of the pair, variant and bound (C,)."""
     room, largest, max_depth = building.room, building.materials.largest, building.limits.depth
     rx_m, wall_material, directed = room.rx_m, building.material, len(room.gains.table) > 1
     wavelength, pieces_m = building.materials.wavelength_m, building.plan.pieces_m

@@ -193,8 +193,8 @@ class Trail(NamedTuple):
     """Scratch of one path in the plan: its reflections, and all interactions in order from the transmitter.
 
     `walls` are reflecting pieces, `bounce` the points (x, y, fraction of the length) and the cosine of incidence. Of
-    all interactions, `surface` are pieces of walls, `kind` is Sionna RT's `InteractionType`, `same_wall` marks further
-    faces of a crossed wall, which cost nothing, `points` are (x, y, fraction of the length).
+    all interactions, `surface` are pieces of walls, `points` (x, y, fraction of the length), `kind` and `same_wall` as
+    in `Candidates`.
     """
 
     walls: NDArray[np.int64]
