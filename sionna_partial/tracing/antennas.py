@@ -42,10 +42,7 @@ MAX_GAIN_DBI, MAX_LOSS_DB = 60.0, 200.0
 """Largest gain of a pattern [dBi], and largest loss relative to it [dB]."""
 
 MAX_RADIATED, NOTED_RADIATED = 2.0, 1.25
-"""Radiated fraction of the fed power above which patterns are refused, and logged.
-
-No antenna exceeds 1, but two cuts give the power of a measured antenna to 2 dB only.
-"""
+"""Radiated fraction of the fed power above which patterns are refused, and logged: two cuts give it to 2 dB only."""
 
 FREQUENCY_RATIO = 1.3
 """Ratio of frequencies from which the pattern of an antenna differs."""
@@ -74,7 +71,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
     Parameters
     ----------
     rows, columns : int
-        As of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
+        Size of the `sionna.rt.PlanarArray`, whose antennas are numbered column by column.
     polarisations : int
         2 for a dual-polarised array: beams of the first polarisation come first.
 
@@ -107,8 +104,8 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
 class Antennas:
     """Antenna array at every transmitter or at every receiver.
 
-    Antennas are numbered as in Sionna RT: all positions (A, 3) [m] with the first of K patterns, then with the second.
-    Rotations from the array to the world are (1, 3, 3), or one for each of E ends.
+    As in Sionna RT, all positions (A, 3) [m] with the first of K patterns come first. Rotations from array to world are
+    (1, 3, 3), or (E, 3, 3) for E ends.
     """
 
     positions_m: Floats
@@ -141,7 +138,7 @@ class Antennas:
         return len(self.patterns) * len(self.positions_m)
 
     def rotations(self, end: NDArray[np.integer[Any]]) -> Floats:
-        """Return the rotation (P, 3, 3) at the end of each path (P,), or (1, 3, 3) if all are the same."""
+        """Return (P, 3, 3) for the ends (P,) of paths, or (1, 3, 3) if all are the same."""
         return self.rotation if len(self.rotation) == 1 else self.rotation[end]
 
     def advance_m(self, angles_rad: Floats, end: NDArray[np.integer[Any]]) -> Floats:
@@ -179,13 +176,13 @@ class AntennaPattern(Shown):
         Loss relative to it at 0, 1, ... 359 degrees [dB]: counterclockwise from the main direction seen from
         above, and downwards from the horizon.
     frequency_hz : float, optional
-        Frequency of the measurement. Traces that differ by a factor of more than 1.3 log a warning.
+        Frequency of the measurement; traces that differ by a factor above 1.3 log a warning.
 
     Raises
     ------
     SettingsError
-        For a gain above 60 dBi, cuts of another shape or with values outside 0 to 200 dB, or a pattern that radiates
-        more than twice the fed power. A uniform gain above 0 dBi is an amplifier and logs a warning.
+        For a gain above 60 dBi, cuts of another shape or outside 0 to 200 dB, or more than twice the fed power
+        radiated. A uniform gain above 0 dBi is an amplifier and logs a warning.
 
     Examples
     --------
@@ -234,7 +231,7 @@ class AntennaPattern(Shown):
 
     @property
     def radiated(self) -> float:
-        """Power radiated in all directions, as a fraction of the fed power."""
+        """Radiated fraction of the fed power."""
         angles_rad, weights = _sphere()
         return float(weights @ np.abs(self.amplitude(angles_rad)) ** 2)
 
@@ -283,15 +280,15 @@ class AntennaPattern(Shown):
 def load_antenna(path: str | Path) -> AntennaPattern:
     r"""Read the pattern of an antenna from an MSI Planet file (.msi, .pln).
 
-    A gain without unit is in dBd. Horizontal angles are clockwise from the main direction, vertical ones from the
-    horizon downwards; cuts include an electrical tilt. Antennas are computed with vertical polarisation: other
-    polarisations than vertical and horizontal log a warning.
+    A gain without unit is in dBd. Horizontal angles are clockwise from the main direction, vertical angles downwards
+    from the horizon; cuts include an electrical tilt. Other polarisations than vertical and horizontal are computed
+    as vertical, with a warning.
 
     Raises
     ------
     SettingsError
-        If the file cannot be read, exceeds 1 MB, lacks its gain or a cut or repeats one, has a gap of more than 90
-        degrees in a cut, is of a horizontally polarised antenna, or of one that radiates more than twice the fed power.
+        If the file cannot be read, exceeds 1 MB, lacks or repeats its gain or a cut, has a gap of more than 90 degrees
+        in a cut, is of a horizontally polarised antenna, or radiates more than twice the fed power.
 
     Examples
     --------
@@ -335,7 +332,6 @@ def load_antenna(path: str | Path) -> AntennaPattern:
 
 
 def _require_vertical(name: str, polarisation: str) -> None:
-    """Raise a SettingsError for horizontal polarisation; log that any other one is computed as vertical."""
     text = re.sub(r"[^a-z0-9]", "", polarisation.lower()).removesuffix("polarization").removesuffix("pol")
     horizontal = text in ("h", "hor", "horz") or ("horiz" in text and "vert" not in text)
     remedy = (
@@ -351,14 +347,13 @@ def _require_vertical(name: str, polarisation: str) -> None:
 
 
 def _frequency_hz(text: str) -> float | None:
-    """Return the frequency of a header in MHz, the geometric mean of a band; None if there is none."""
+    """Return the frequency of a header in MHz, the geometric mean of a band."""
     numbers = [float(number) for number in re.findall(r"\d+(?:\.\d+)?", text[:40])[:2]]
     frequency_hz = (1e9 if "ghz" in text.lower() else 1e6) * math.sqrt(numbers[0] * numbers[-1]) if numbers else 0.0
     return frequency_hz if 0.0 < frequency_hz <= 1e12 else None
 
 
 def _cut(lines: list[str], count: int, where: str) -> Floats:
-    """Return the losses (360,) [dB] at whole degrees of a cut with `count` lines of angle and loss."""
     pairs = [line.split() for line in lines]
     remedy = f"{count} lines of angle [degree] and loss [dB] follow, the angles increasing from 0 to 360."
     good = len(pairs) == count and all(len(pair) == 2 and all(map(_is_finite, pair)) for pair in pairs)
@@ -455,7 +450,7 @@ class Antenna(Checked):
 
     @property
     def uniform_gain_dbi(self) -> float | None:
-        """Gain of an upright antenna if it is the same in all directions [dBi], otherwise None."""
+        """Gain of an upright antenna if the same in all directions [dBi], otherwise None."""
         if self.rows * self.columns > 1 or self.downtilt_deg:
             return None
         if isinstance(self.pattern, AntennaPattern):
@@ -480,7 +475,7 @@ class Antenna(Checked):
         return found
 
     def warn_of_frequency(self, frequency_hz: float) -> None:
-        """Log a warning if its pattern was measured at a frequency far from the trace's."""
+        """Log a warning for a pattern that was measured at another frequency."""
         measured_hz = getattr(self.pattern, "frequency_hz", None)
         if measured_hz and abs(math.log(frequency_hz / measured_hz)) > math.log(FREQUENCY_RATIO):
             message = "antenna '%s' was measured at %g GHz, and is used at %g GHz, where its pattern is another one"
@@ -511,7 +506,7 @@ class Antenna(Checked):
 
 
 def _sphere() -> tuple[Floats, Floats]:
-    """Return zenith and azimuth (P, 2) of a grid on the sphere, and the fraction (P,) of the sphere around each."""
+    """Return directions (P, 2) of a grid on the sphere, and their fractions (P,) of it."""
     zenith_rad, azimuth_rad = np.radians(np.arange(0.5, 180.0)), np.radians(np.arange(360.0))
     angles_rad = np.stack(np.meshgrid(zenith_rad, azimuth_rad, indexing="ij"), axis=-1).reshape(-1, 2)
     weights = np.sin(angles_rad[:, 0])

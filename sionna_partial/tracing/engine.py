@@ -1,9 +1,7 @@
 """Sionna RT's internals: candidates in, verified paths out.
 
-Sionna RT's `PathSolver` runs a candidate generator, `ImageMethod` and `FieldCalculator`. Here the latter two run on our
-candidates. `Scene.targets()`, which compiles a kernel for each receiver, is avoided.
-
-Symbolic loops are the fastest, but Dr.Jit differentiates evaluated ones only: there is a verification with each kind.
+`ImageMethod` and `FieldCalculator` run on our candidates. `Scene.targets()`, which compiles a kernel for each receiver,
+is avoided. Symbolic loops are fastest, but Dr.Jit differentiates evaluated loops only: `_Verification` has each kind.
 """
 
 import functools
@@ -38,13 +36,13 @@ REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast en
 _BUFFER_COLUMNS = "_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"
 
 _BUFFER_FIELDS = {*_BUFFER_COLUMNS, "_valid", "_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"}
-"""Private fields of Sionna RT's `PathsBuffer` that are filled here."""
+"""Private fields of `PathsBuffer` that are filled here."""
 
 _log = logging.getLogger(__name__)
 
 
 def load_sionna() -> ModuleType:
-    """Import Sionna RT on the CPU, with a working LLVM; raise a BackendError with the remedy if that fails."""
+    """Import Sionna RT with a working LLVM, or raise a BackendError with the remedy."""
     load_llvm()
     with signals_held():
         import mitsuba as mi
@@ -135,7 +133,7 @@ class _Verification:
     def evaluate(
         self, scene: Any, buffer: Any, source: Any, targets: Any, field: tuple[int, Any], diffraction: bool
     ) -> Any:
-        """Return verified candidates with their coefficients, for a number of samples and antenna patterns."""
+        """Return verified candidates with coefficients; `field` is a number of samples and the antenna patterns."""
         import drjit as dr
         import mitsuba as mi
 
@@ -158,8 +156,8 @@ class _Verification:
 def _end_at_targets(buffer: Any, targets: Any) -> None:
     """Put the receiver where a path has no more interactions.
 
-    There `ImageMethod` leaves images of the edge, and `FieldCalculator` 2.2 takes the first of them for a point of the
-    path after the edge: a path with fewer interactions than others in its buffer came out longer, and some dB weaker.
+    `ImageMethod` leaves images of the edge there, and `FieldCalculator` 2.2 takes the first for a point after the edge:
+    paths with fewer interactions than others in their buffer came out longer, and some dB weaker.
     """
     import drjit as dr
     import mitsuba as mi
@@ -173,7 +171,6 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
 
 
 def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
-    """Return verified candidates without further faces of a wall, which cost nothing."""
     if candidates.same_wall is None:
         return buffer
     import drjit as dr
@@ -203,7 +200,7 @@ _ALIGNMENT_BYTES = 64
 
 
 def to_device(kind: Any, values: NDArray[Any]) -> Any:
-    """Copy an array to Dr.Jit, aligned as its own arrays are: for other mixtures it compiles kernels anew."""
+    """Copy an array to Dr.Jit, aligned as its own arrays: for other mixtures it compiles kernels anew."""
     count = values.size * values.itemsize
     room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
     skip = -room.ctypes.data % _ALIGNMENT_BYTES
@@ -216,15 +213,9 @@ def to_device(kind: Any, values: NDArray[Any]) -> Any:
 class Variables:
     """Variables of the power of paths, as `mitsuba.Float`, to which derivatives lead back.
 
-    Parameters
-    ----------
-    shift_m : tuple of 3
-        Added to the x, y, z of the transmitters, each with 1 or T entries [m].
-    relative_permittivity, conductivity_s_m, thickness_m : tuples
-        Values, not changes, which would drown in a metal's conductivity, for each of `SceneSolver.materials`; [S/m]
-        and [m]. ITU materials add their change with the frequency.
-    frequency_hz
-        Added to the carrier frequency [Hz].
+    `shift_m` is added to x, y, z of the transmitters, each with 1 or T entries [m], `frequency_hz` to the carrier
+    frequency. The others are values for each of `SceneSolver.materials`, not changes, which would drown in a metal's
+    conductivity; ITU materials add their change with the frequency.
     """
 
     shift_m: tuple[Any, ...]
@@ -236,10 +227,9 @@ class Variables:
 
 @dataclass(frozen=True)
 class HeldPaths:
-    """Functions that give the power (C,) of paths with fixed vertices.
+    """Power (C,) of paths with fixed vertices.
 
-    `evaluate` runs the field calculator. `repeat` replays kernels that Dr.Jit has recorded, which is faster, without
-    derivatives.
+    `evaluate` runs the field calculator; `repeat` replays kernels recorded by Dr.Jit: faster, without derivatives.
     """
 
     evaluate: Callable[[_Verification], Any]
@@ -247,10 +237,9 @@ class HeldPaths:
 
 
 class SceneSolver:
-    """Solver of candidates in one exported scene.
+    """Solver of candidates in one exported scene, with vertical antennas except after `polarised`.
 
-    `shapes` are names in face order; shapes that the scene lacks have no faces. Antennas are vertically polarised,
-    except after `polarised`.
+    `shapes` are names in face order; shapes that the scene lacks have no faces.
     """
 
     def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
@@ -292,7 +281,7 @@ class SceneSolver:
         return self._scene.mi_scene
 
     def verify(self, candidates: Candidates, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
-        """Verify candidates and compute their coefficients; return the paths and the candidate (P,) of each.
+        """Return the verified paths and the candidate (P,) of each path.
 
         The transmitter (3,) and the receivers (N, 3) are in scene coordinates [m].
         """
@@ -316,7 +305,7 @@ class SceneSolver:
     ) -> tuple[Any, Any]:
         """Verify candidates from T transmitters to N receivers, in scene coordinates, for other variables.
 
-        Returns their power (C,), 0 for invalid ones, and vertices (C D,) [m]. Derivatives need slower loops.
+        Return power (C,), 0 for invalid candidates, and vertices (C D,) [m]. Derivatives need slower loops.
         """
         import drjit as dr
         import mitsuba as mi
@@ -348,7 +337,7 @@ class SceneSolver:
         return HeldPaths(evaluate, dr.freeze(lambda: evaluate(self._symbolic), state_fn=state))
 
     def power(self, paths: HeldPaths, variables: Variables, *, differentiable: bool) -> Any:
-        """Return the power (C,) of paths with fixed vertices for other materials and another frequency."""
+        """Return the power (C,) for other materials and another frequency."""
         import drjit as dr
 
         with self._changed(variables), dr.scoped_set_flag(dr.JitFlag.SymbolicCalls, not differentiable):

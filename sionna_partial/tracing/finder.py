@@ -33,7 +33,7 @@ from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
 CANDIDATES_AT_ONCE = 100_000
-"""Number of candidates verified together, which bounds the memory."""
+"""Number of candidates verified together, to bound the memory."""
 
 Found = tuple[Candidates | None, SolvedPaths]
 """Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
@@ -42,14 +42,14 @@ _DIRECTED = 0.5
 """Factor of the tolerance with a directive antenna, whose gain is bounded within one degree."""
 
 Kinds = tuple[list[Kind], list[Kind]]
-"""Kinds of candidates between opaque walls, and of candidates through walls."""
+"""Kinds of candidates between opaque walls, and through walls."""
 
 
 @dataclass(frozen=True)
 class PlanScene:
-    """An extruded floor plan on disk; `shapes` are its shape names in face order.
+    """An extruded floor plan on disk, with its shape names in face order.
 
-    `floor` (ny, nx) are the cells that have a floor. Limits of paths through walls may be `coarse`.
+    `floor` (ny, nx) are the cells that have a floor; with `coarse`, fewer paths through walls are listed.
     """
 
     xml: Path
@@ -86,7 +86,7 @@ class PlanScene:
 
 @dataclass(frozen=True)
 class MeshScene:
-    """A mesh on disk; `shapes` are its shape names in face order, vertices are in scene coordinates."""
+    """A mesh on disk, with its shape names in face order and vertices in scene coordinates."""
 
     xml: Path
     shapes: tuple[str, ...]
@@ -97,7 +97,6 @@ class MeshScene:
     coarse: bool = False
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
-        """Return the kinds of candidates: sequences of planes that rays meet."""
         settings = self.settings
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, settings.max_depth)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
@@ -195,7 +194,7 @@ class MeanFinder:
 def write_scene_of(
     partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings, draw: int = 0
 ) -> PlanScene | MeshScene:
-    """Write the scene of a map to an existing folder, with the origin at the lower-left corner of the map.
+    """Write the scene of a map to a folder, with the origin at the map's lower-left corner.
 
     `settings` come from `resolved_settings`; `draw` is as in `build_scene`.
     """

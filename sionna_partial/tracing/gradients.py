@@ -21,7 +21,7 @@ from sionna_partial.tracing.simulation import Simulation, checked_positions, sim
 
 
 def one_transmitter(tx: ArrayLike) -> ArrayLike:
-    """Return a position, or raise a PositionError for several."""
+    """Return a position; several raise a PositionError."""
     if np.ndim(tx) != 1:
         raise PositionError(f"tx has shape {np.shape(tx)}: give one transmitter as (3,).")
     return tx
@@ -46,14 +46,14 @@ class GainGradients(Shown):
     tx_db_per_m : (N, 3) float64 array
         Derivatives with respect to the transmitter's x, y and z [dB/m].
     relative_permittivity_db : (N,) float64 array
-        With respect to the real relative permittivity [dB], of all materials together where a mesh has several.
+        With respect to the real relative permittivity [dB], of all materials of a mesh together.
     conductivity_db_per_s_m : (N,) float64 array
         With respect to their conductivity [dB / (S/m)].
     thickness_db_per_m : (N,) float64 array
         With respect to their thickness [dB/m].
     frequency_db_per_hz : (N,) float64 array
-        With respect to the carrier frequency [dB/Hz]. ITU materials follow the frequency where Sionna RT loads them by
-        name: all except `vacuum`.
+        With respect to the carrier frequency [dB/Hz]. ITU materials follow it, except `vacuum`, which Sionna RT does
+        not load by name.
     trace_settings : TraceSettings
     scene_settings : SceneSettings
 
@@ -92,37 +92,28 @@ def gain_gradients(
 ) -> GainGradients:
     """Differentiate the path gain from a transmitter to N receivers with Sionna RT and Dr.Jit.
 
-    The paths are as in `trace_links`; the power of a link is the sum of the powers of its paths, without phases. Dr.Jit
-    differentiates Sionna RT's image method and field calculator in forward mode.
+    The paths are as in `trace_links`; the power of a link is the sum of its paths' powers, without phases. Dr.Jit
+    differentiates in forward mode.
 
     Parameters
     ----------
-    scene : PartialMap, path or Simulation
-        Map of the building; unknown space is free.
+    scene, rx, scene_settings, progress
+        As in `trace_links`.
     tx : (3,) array-like
         Transmitter position [m].
-    rx : (N, 3) array-like
-        Receiver positions [m]; N may be 0.
     trace_settings : TraceSettings, optional
         Diffuse reflection must be off, and on meshes diffraction.
-    scene_settings : SceneSettings, optional
-    progress : bool or callable, optional
-        As in `predict_map`.
-
-    Returns
-    -------
-    GainGradients
 
     Raises
     ------
     PositionError
         As `trace_links`, and for several transmitters.
+    BackendError
+        As `trace_links`, and for an unsupported release of Sionna RT.
+    OutputError
+        As `trace_links`.
     SettingsError
         For a frequency that the material does not cover, settings of another kind, or paths that only rays find.
-    BackendError
-        If LLVM or Sionna RT cannot be used, or the fast engine does not support this release of Sionna RT.
-    OutputError
-        If no temporary file can be written.
 
     Examples
     --------

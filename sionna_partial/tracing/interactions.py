@@ -1,8 +1,7 @@
 """Kinds of interactions of paths, their finders and settings.
 
-A new kind is one row, and Sionna RT's rays find its paths. To find every path, it also needs a `Kind` of `select.py`,
-which lists candidates with a bound of their power (`power.py`), and which the scenes of `finder.py` return. Sionna RT
-verifies candidates of any kind.
+A new kind is one row, and Sionna RT's rays find its paths. To find every path, it also needs a `Kind` of `select.py`
+in the scenes of `finder.py`, which lists candidates with a bound of their power (`power.py`).
 """
 
 from collections.abc import Callable
@@ -17,18 +16,9 @@ from sionna_partial.settings import TraceSettings
 class Interaction:
     """A kind of interaction.
 
-    Parameters
-    ----------
-    number : int
-        Sionna RT's `InteractionType`.
-    setting : str
-        Field of `TraceSettings` that switches it on; "" if always on.
-    arguments : tuple of str
-        Arguments of Sionna RT's path solver that switch it on.
-    exact_on : tuple
-        Kinds of maps on which candidates find every path. Only these paths can be differentiated.
-    default : callable
-        Returns the value in place of None where candidates find it.
+    `number` is Sionna RT's `InteractionType`, `setting` the field of `TraceSettings` that switches it on, "" if always
+    on, `arguments` the arguments of Sionna RT's path solver for it. On maps of the kinds `exact_on`, candidates find
+    every path: only these paths can be differentiated, and `default` returns the value in place of None.
     """
 
     number: int
@@ -52,12 +42,12 @@ REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION = (kind.number for kind in INTERACT
 
 
 def with_defaults(settings: TraceSettings, environment: EnvironmentKind) -> TraceSettings:
-    """Return settings with values in place of None: by default, candidates alone find the paths."""
+    """Return settings with values in place of None; by default, candidates find all paths."""
     unset = [kind for kind in INTERACTIONS if kind.setting and getattr(settings, kind.setting) is None]
     values: dict[str, Any] = {kind.setting: environment in kind.exact_on and kind.default(settings) for kind in unset}
     return replace(settings, **values, power_tolerance_db=settings.tolerance_db)
 
 
 def only_by_rays(settings: TraceSettings, environment: EnvironmentKind) -> list[Interaction]:
-    """Return the kinds that settings without None ask for and that only rays find."""
+    """Return the enabled kinds that only rays find, for settings without None."""
     return [kind for kind in INTERACTIONS if kind.is_on(settings) and environment not in kind.exact_on]

@@ -25,9 +25,7 @@ if TYPE_CHECKING:
 @read_only
 @dataclass(frozen=True)
 class TracedLinks(Shown):
-    """Every traced path from one or T transmitters to N receivers.
-
-    The P paths are ordered by transmitter, receiver and delay.
+    """All traced paths from one or T transmitters to N receivers, by transmitter, receiver and delay.
 
     Parameters
     ----------
@@ -83,16 +81,16 @@ class TracedLinks(Shown):
     scene_settings: SceneSettings
 
     _partial: ClassVar[PartialMap | None] = None
-    """Map of links that were traced with the default tolerance, which channels do not have."""
+    """Map of links with the default tolerance, which channels do not have."""
 
     def of_map(self, partial: PartialMap) -> TracedLinks:
-        """Remember the map, so that `channels` can add the paths that were left out; return these links."""
+        """Remember the map, from which `channels` adds the paths that were left out."""
         object.__setattr__(self, "_partial", partial)
         return self
 
     @property
     def a(self) -> NDArray[np.complex128]:
-        """Complex path gain (P,) between isotropic, vertically polarised antennas: ``transfer[:, 0, 0]``."""
+        """Complex path gain (P,) between isotropic, vertically polarised antennas."""
         return self.transfer[:, 0, 0]
 
     @property
@@ -119,10 +117,9 @@ class TracedLinks(Shown):
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
         Channels have every path. Links traced with the default ``TraceSettings.power_tolerance_db`` lack weak paths:
-        they are traced again without a tolerance for the first channel, which then has more paths than its link. Trace
-        with ``power_tolerance_db=0.0`` to have the same paths in both. A tolerance that was set is kept, and so is the
-        tolerance of links that were read from a folder or changed; it is the attribute `power_tolerance_db` of the
-        result.
+        for the first channel they are traced again without a tolerance. With ``power_tolerance_db=0.0``, links and
+        channels have the same paths. A tolerance that was set is kept, as is any tolerance of links that were read from
+        a folder or changed; it is the attribute `power_tolerance_db` of the result.
 
         Parameters
         ----------
@@ -132,19 +129,19 @@ class TracedLinks(Shown):
             Rotation angles about z, y and x [rad], as in Sionna RT.
         rx_orientation_rad : (3,) or (N, 3) array-like, optional
         synthetic_array : bool
-            True: plane waves at the arrays. False: exact path lengths between each two antennas, with patterns and
-            reflection coefficients of the centres.
+            True: plane waves at the arrays. False: exact path lengths between antennas, with patterns and reflection
+            coefficients of the centres.
         normalize_delays : bool
             Count delays from the shortest path of each link.
         memory_gb : float
-            Largest memory of the result and of the work for it [GB].
+            Largest memory of result and work [GB].
 
         Returns
         -------
         xarray.Dataset
-            `a` (link, rx_ant, tx_ant, path): complex baseband gains a exp(-j 2 pi f delay), 0 where there is no path.
-            `delay_s` (link, path), or as `a` unless `synthetic_array`: NaN where there is no path. `paths` (link):
-            number of paths. Link ``tx * N + rx`` has coordinates `tx` and `rx`.
+            `a` (link, rx_ant, tx_ant, path): complex baseband gains a exp(-j 2 pi f delay), 0 without a path.
+            `delay_s` (link, path), or as `a` unless `synthetic_array`: NaN without a path. `paths` (link): number of
+            paths. Link ``tx * N + rx`` has coordinates `tx` and `rx`.
 
         Raises
         ------
@@ -197,7 +194,7 @@ class TracedLinks(Shown):
         return later("channels.responses:cfr")(self, frequencies_hz, **options)
 
     def taps(self, bandwidth_hz: float, l_min: int = -6, l_max: int | None = None, **options: Any) -> xr.Dataset:
-        """Return the taps of a channel that is filtered to a bandwidth, as `sionna.rt.Paths.taps` does.
+        """Return the channel taps of each link at a bandwidth, as `sionna.rt.Paths.taps` does.
 
         Parameters
         ----------
@@ -279,12 +276,8 @@ class TracedLinks(Shown):
     def to_xarray(self) -> xr.Dataset:
         """Return the links and their paths as a labelled Dataset.
 
-        Dimensions are "rx", "tx" for several transmitters, "path" and "interaction"; variables have `units`, settings
-        are attributes.
-
-        Returns
-        -------
-        xarray.Dataset
+        Dimensions are "rx", "tx" for several transmitters, "path" and "interaction"; variables have `units`,
+        settings are attributes.
 
         Examples
         --------
@@ -324,15 +317,15 @@ class TracedLinks(Shown):
     def spreads(self) -> xr.Dataset:
         """Return delay and angular spreads, K-factor and path loss of each link.
 
-        Weights are ``|a|^2``, the power between isotropic, vertically polarised antennas.
+        Weights are ``|a|^2``, between isotropic, vertically polarised antennas.
 
         Returns
         -------
         xarray.Dataset
-            On "rx", and "tx" for several transmitters. `path_loss_db`; `k_factor_db`, the power of the line of sight
-            over the power of all other paths; `delay_spread_s`; and the circular standard deviations
+            On "rx", and "tx" for several transmitters. `path_loss_db`; `k_factor_db`, the line of sight over all other
+            paths (NaN without line of sight); `delay_spread_s`; and the circular standard deviations
             `zenith_departure_spread_rad`, `azimuth_departure_spread_rad`, `zenith_arrival_spread_rad` and
-            `azimuth_arrival_spread_rad`. NaN without paths, and K without line of sight.
+            `azimuth_arrival_spread_rad`. NaN without paths.
 
         Notes
         -----
@@ -354,14 +347,10 @@ class TracedLinks(Shown):
         Parameters
         ----------
         of : {"links", "paths"}
-            Columns of links: numbers `tx` and `rx`, positions [m], `link_state`, `gain_db`, `distance_m`, number of
-            `paths` and shortest `delay_s` (NaN without paths). Columns of paths: `tx`, `rx`, `gain_db`, `phase_rad`,
-            `delay_s`, angles [rad], `interactions` by Sionna RT's `InteractionType`, such as "1-1-8", and number of
-            `walls` crossed.
-
-        Returns
-        -------
-        pandas.DataFrame
+            Columns of links: `tx`, `rx`, positions [m], `link_state`, `gain_db`, `distance_m`, number of `paths` and
+            shortest `delay_s` (NaN without paths). Columns of paths: `tx`, `rx`, `gain_db`, `phase_rad`, `delay_s`,
+            angles [rad], `interactions` by Sionna RT's `InteractionType`, such as "1-1-8", and number of `walls`
+            crossed.
 
         Raises
         ------
@@ -437,8 +426,7 @@ _VARIABLES = {
 class LinkSums:
     """Power of links (T, N) and line of sight, added up over blocks of paths.
 
-    `path_power` (T N, C + 1, R + 1) is the power by number of walls crossed and number of reflections; the last entries
-    include larger numbers.
+    `path_power` (T N, C + 1, R + 1) is by walls crossed and reflections; the last entries include larger numbers.
     """
 
     def __init__(self, transmitters: int, receivers: int, walls: int = 0, reflections: int = 0) -> None:
@@ -448,12 +436,12 @@ class LinkSums:
 
     @property
     def power(self) -> Floats:
-        """Return the power of each link (T N,)."""
+        """Power of each link (T N,)."""
         power: Floats = self.path_power.sum(axis=(1, 2))
         return power
 
     def add(self, paths: SolvedPaths, counted: Bools | bool = True) -> None:
-        """Add some of the paths; walls and reflections count where `counted` (P, D) is True."""
+        """Add paths; walls and reflections count where `counted` (P, D) is True."""
         link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
         counts = (
             np.minimum(np.count_nonzero((paths.interactions == kind) & counted, axis=1), most - 1)

@@ -1,7 +1,7 @@
-"""Paths of links as functions of the transmitters' positions, the materials and the frequency.
+"""Paths of links as functions of transmitter positions, materials and frequency.
 
-Paths are found once, by a complete trace. Sionna RT then gives their power and vertices for other values, and Dr.Jit
-the derivatives. A path that becomes invalid has no power; new paths are not found.
+A complete trace finds the paths. Sionna RT then gives their power and vertices for other values, and Dr.Jit the
+derivatives. A path that becomes invalid has no power; new paths are not found.
 """
 
 import itertools
@@ -21,7 +21,7 @@ from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, join_paths
 
 PATHS_PER_BLOCK = 50_000
-"""Number of paths that are evaluated together, which bounds the memory."""
+"""Number of paths evaluated together, to bound the memory."""
 
 Part = tuple[Candidates, SolvedPaths]
 """Candidates in scene coordinates, and their paths in world coordinates, row by row."""
@@ -38,7 +38,7 @@ class PathParameters(Shown):
         Transmitter positions [m].
     relative_permittivity, conductivity_s_m, thickness_m : (M,) float64 arrays
         Real relative permittivity, conductivity [S/m] and thickness [m] of each material. ITU materials also follow
-        the frequency, as in Sionna RT.
+        the frequency.
     frequency_hz : () float64 array
         Carrier frequency [Hz].
     """
@@ -69,20 +69,16 @@ class _Simulation(Protocol):
 
 
 class PathSet:
-    """The P paths from T transmitters to N receivers, found once by a `Simulation`.
+    """P paths from T transmitters to N receivers, found once by a `Simulation`.
 
     Attributes
     ----------
     base : PathParameters
         Parameters for which the paths were found.
-    rx_m : (N, 3) float64 array
-        Receiver positions [m].
-    path_tx, path_rx : (P,) int32 arrays
-        Transmitter and receiver of each path.
+    rx_m, path_tx, path_rx, interactions
+        As in `TracedLinks`.
     power : (P,) float64 array
         |a|^2 of each path at `base`.
-    interactions : (P, D) uint8 array
-        Sionna RT's `InteractionType` in order from the transmitter; 0 for none.
     is_direct : (P,) bool array
         True for the line of sight.
     vertices_m : (P, D, 3) float64 array
@@ -105,7 +101,7 @@ class PathSet:
 
     @property
     def solved(self) -> list[SolvedPaths]:
-        """The paths as they were found."""
+        """The paths as found."""
         return [solved for _, solved in self._parts]
 
     @classmethod
@@ -166,8 +162,8 @@ class PathSet:
         """Differentiate the power of each path with respect to the K entries of fields of `PathParameters`: (P, K).
 
         For transmitters, these are x, y, z of the path's own; with `together` all materials change by as much. Dr.Jit
-        passes forward once for each entry: one pass backwards takes longer than seven of these, and its derivatives of
-        the position differ from run to run.
+        makes one forward pass for each entry: a backward pass takes longer than seven, and its derivatives of the
+        position differ from run to run.
         """
         count = {name: 1 if together else len(self.base.thickness_m) for name in MATERIAL_PARAMETERS}
         power = {name: np.zeros((len(self), {**count, "tx_m": 3, "frequency_hz": 1}[name])) for name in names}
@@ -188,7 +184,6 @@ class PathSet:
     def _passes(
         self, parameters: PathParameters, names: Sequence[str], *, together: bool = False
     ) -> Iterator[tuple[slice, str, int, Any]]:
-        """Pass forward from each entry of each parameter: derivatives of power and vertices, block by block."""
         import drjit as dr
 
         solver, moves = self._simulation.solver, "tx_m" in names or self._moves(parameters)
@@ -244,7 +239,6 @@ class PathSet:
 
 
 def _merged(parts: list[Part]) -> list[Part]:
-    """Join parts that can be verified together, and cut them to `PATHS_PER_BLOCK`."""
     merged = []
     for crossing, diffracted in itertools.product((False, True), repeat=2):
         some = [

@@ -1,4 +1,4 @@
-"""Paths: candidates, and those that Sionna RT has verified."""
+"""Candidates of paths, and paths that Sionna RT has verified."""
 
 import math
 from collections.abc import Sequence
@@ -33,7 +33,6 @@ class SolvedPaths:
 
     @property
     def a(self) -> NDArray[np.complex128]:
-        """Complex path gain (P,) between isotropic, vertically polarised antennas."""
         return self.transfer[:, 0, 0]
 
     @property
@@ -43,7 +42,6 @@ class SolvedPaths:
 
     @property
     def is_direct(self) -> Bools:
-        """True for the line of sight (P,)."""
         return (self.interactions == 0).all(axis=1)
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
@@ -90,7 +88,7 @@ class SolvedPaths:
 
 
 class PathColumns:
-    """Paths of a trace in columns that grow in place, so that memory holds a dense grid's paths once."""
+    """Paths of a trace in columns that grow in place, so that memory holds the paths once."""
 
     def __init__(self, depth: int, polarisations: int = 1) -> None:
         types = _column_types(depth, polarisations)
@@ -119,7 +117,7 @@ class PathColumns:
 
 
 class PathFiles:
-    """Paths of a trace in an existing folder, a `.npy` file for each column, which `TracedLinks` maps into memory."""
+    """Paths of a trace in a folder, a `.npy` file for each column, which `TracedLinks` maps into memory."""
 
     def __init__(self, depth: int, folder: Path, polarisations: int) -> None:
         self._folder, self._count, self._room = folder, 0, (depth, polarisations)
@@ -191,9 +189,9 @@ def zenith_azimuth(direction: Floats) -> Floats:
 class Wedges:
     """W vertical edges, each with the two faces that bound the room around it.
 
-    Walls bound sectors around an edge. Only a sector wider than a half-plane holds directions that the walls hide from
-    each other, so an edge diffracts in one sector at most; where three or more walls meet, mostly in none. A free end
-    of a wall has both sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
+    Walls bound sectors around an edge. Walls hide directions from each other only in a sector wider than a half-plane,
+    so an edge diffracts in one sector at most; where three or more walls meet, mostly in none. A free end of a wall has
+    both sides as faces. In candidates, wedge W + i is wedge i with its faces swapped.
 
     `edge_m` (W, 2) are positions in the plan; edges rise from 0 to `height_m` (W,) [m]. `face` (2 W, 2) are 0-face and
     n-face, where the sector of wedge i < W ends counterclockwise; `normal` (2 W, 2, 2) are their unit normals into the
@@ -213,8 +211,8 @@ class Candidates:
     `rx` (C,) are receivers, `kind` (C, D) Sionna RT's `InteractionType` in order from the transmitter, 0 for none,
     `vertices_m` (C, D, 3) points [m]. `face` (C, D) counts through the scene's shapes, -1 for none: any face of a plane
     represents all, the 0-face an edge. `wedge` (C,) are numbers in `wedges`, if all candidates are diffracted.
-    `same_wall` (C, D), if any goes through walls, is True for refractions at further faces of a wall that has been
-    crossed: they cost nothing.
+    `same_wall` (C, D), if any goes through walls, marks refractions at further faces of a crossed wall, which cost
+    nothing.
     """
 
     rx: NDArray[np.int32]
@@ -231,7 +229,7 @@ class Candidates:
 
     @property
     def columns(self) -> dict[str, Any]:
-        """The arrays that are not None, by name, each with C rows."""
+        """Arrays that are not None, by name."""
         arrays = {name: value for name, value in vars(self).items() if name != "wedges"}
         return {name: array for name, array in arrays.items() if array is not None}
 

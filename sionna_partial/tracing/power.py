@@ -1,8 +1,8 @@
 """Power of paths by their geometry, before Sionna RT verifies them.
 
 Slabs follow ITU-R P.2040-3, eq. 31, 37 and 38, edges the uniform theory of diffraction (UTD). Paths between opaque
-walls have an upper bound of their power between vertically polarised antennas, with horizontal components added by
-magnitude; paths through walls have the power of their Jones vector.
+walls have an upper bound for vertical antennas, with horizontal components added by magnitude; paths through walls have
+the power of their Jones vector.
 """
 
 import math
@@ -28,13 +28,13 @@ MOST_LOSS_DB = 60.0
 """Loss from which a wall counts as opaque [dB]."""
 
 _ANGLES_DEG = np.arange(0.0, 61.0, 10.0)
-"""Angles of incidence for the mean loss: at normal incidence alone, interference fringes are deep."""
+"""Angles of incidence for the mean loss: at one angle, interference fringes are deep."""
 
 VACUUM_F_M = 8.8541878128e-12
 """Permittivity of the vacuum [F/m]."""
 
 COSINES = 2048
-"""Steps of the tables over the cosine of the angle of incidence."""
+"""Steps of the tables over the cosine of incidence."""
 
 _ANGLES, _MARGIN = 1024, 1.01
 """Steps of the table of largest coefficients, and factor that enlarges them."""
@@ -72,7 +72,6 @@ def reflection_loss_db(
 def _refracted(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], Floats, NDArray[np.complex128]]:
-    """Return the complex permittivity, the cosines as an array, and index of refraction times cosine inside."""
     loss = np.asarray(conductivity_s_m) / (2.0 * math.pi * frequency_hz * VACUUM_F_M)
     eta, cosine = np.asarray(permittivity) - 1j * loss, np.asarray(cosine)
     return eta, cosine, np.sqrt(eta - (1.0 - cosine**2))
@@ -81,7 +80,7 @@ def _refracted(
 def reflection_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the reflection coefficients of a slab, TE and TM, by the cosine of the angle of incidence."""
+    """Return the TE and TM coefficients of a slab by the cosine of incidence."""
     eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     inside = np.exp(-4j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
@@ -92,7 +91,6 @@ def reflection_coefficients(
 def transmission_coefficients(
     permittivity: ArrayLike, conductivity_s_m: ArrayLike, thickness_m: ArrayLike, frequency_hz: float, cosine: ArrayLike
 ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-    """Return the transmission coefficients of a slab, TE and TM, by the cosine of the angle of incidence."""
     eta, cosine, root = _refracted(permittivity, conductivity_s_m, frequency_hz, cosine)
     once = np.exp(-2j * math.pi * frequency_hz / SPEED_OF_LIGHT_M_S * np.asarray(thickness_m) * root)
     faces = ((first - root) / (first + root) for first in (cosine, eta * cosine))
@@ -111,11 +109,10 @@ def wall_loss_db(material: Material, frequency_hz: float) -> float:
 class Materials(NamedTuple):
     """Coefficients of M slabs, TE and TM, and of edges.
 
-    `reflection` and `transmission` (M, K + 1, 2) are by k / K, the cosine of the angle of incidence. `most_reflected`
-    (M, K + 1) is the largest |R|^2 at this cosine or a larger one, `most_transmitted` the largest |T|^2 at this cosine
-    or a smaller one. `largest` (M, L, 4) are the largest |TE|, |TM| and |TE + TM| reflected at cosines from l / L to
-    (l + 1) / L, and the largest of the first two from l / L on. `transition` is F(y^2) / y of the UTD transition
-    function F.
+    `reflection` and `transmission` (M, K + 1, 2) are by k / K, the cosine of incidence. `most_reflected` (M, K + 1) is
+    the largest |R|^2 at this cosine or a larger one, `most_transmitted` the largest |T|^2 at this cosine or a smaller
+    one. `largest` (M, L, 4) are the largest |TE|, |TM| and |TE + TM| reflected at cosines from l / L to (l + 1) / L,
+    and the largest of the first two from l / L on. `transition` is F(y^2) / y of the UTD transition function F.
     """
 
     wavelength_m: float
@@ -171,7 +168,7 @@ def gain_between(gains, first, second):
 
 
 def materials_of(constants: Iterable[ArrayLike], frequency_hz: float) -> Materials:
-    """Tabulate the coefficients of materials, each permittivity, conductivity and thickness (3,)."""
+    """Tabulate the coefficients of materials, each (permittivity, conductivity, thickness)."""
     given = np.array(list(constants), dtype=np.float64).reshape(-1, 3)
 
     def tabulated(coefficients: Any, steps: int) -> NDArray[np.complex128]:
@@ -214,7 +211,6 @@ def reflected_power(largest, cosine):
 
 @njit(cache=True)
 def power_near(table, material, cosine):
-    """Return the power that a slab reflects or transmits, for the better polarisation."""
     at = min(int(cosine * COSINES + 0.5), COSINES)
     te, tm = table[material, at, 0], table[material, at, 1]
     return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
@@ -237,8 +233,7 @@ def most_at_wall(largest, material, cosine):
 def at_wall(largest, material, cosine, sine, slope, field):
     """Return bounds of a reflected field: vertical, horizontal, and the part that is never turned.
 
-    `cosine` is for the angle of incidence seen from above; `sine` and `slope` are the horizontal and vertical part of
-    the path's direction.
+    `cosine` is for incidence seen from above; `sine` and `slope` are the horizontal and vertical part of the direction.
     """
     cosine = min(abs(cosine), 1.0)
     at = min(int(cosine * sine * _ANGLES), _ANGLES - 1)
@@ -253,8 +248,7 @@ def at_wall(largest, material, cosine, sine, slope, field):
 def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
     """Return bounds of a diffracted field as `at_wall` does, without the spread of the wave.
 
-    `tables` are `reflection` and `transition` of `Materials`, `boundary` is sqrt(2 k L), `cosines` are for incidence
-    at both faces.
+    `tables` are `reflection` and `transition`, `boundary` is sqrt(2 k L), `cosines` are for incidence at both faces.
     """
     (faces, transition), (cosine_0, cosine_n) = tables, cosines
     by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
@@ -284,7 +278,7 @@ def most_at_edge(terms, boundary, face_0, face_n):
 
 @njit(cache=True)
 def at_flats(largest, material, slope, bounces, field):
-    """Return a bound of a vertical field after reflections off floor and ceiling, anywhere in the path."""
+    """Return a bound of a vertical field after reflections off floor and ceiling."""
     at = min(int(slope * _ANGLES), _ANGLES - 1)
     te, tm = largest[material, at, 0], largest[material, at, 1]
     vertical, _, pure = field
@@ -293,7 +287,7 @@ def at_flats(largest, material, slope, bounces, field):
 
 @njit(cache=True)
 def _te_part(along, sine, slope):
-    """Return the fraction of a vertical field's power perpendicular to the plane of incidence at a wall.
+    """Return the TE fraction of a vertical field's power at a wall.
 
     `along` is the squared cosine of the angle between path and wall, seen from above.
     """
@@ -318,19 +312,19 @@ def _at_face(faces, material, cosine, sine, slope):
 
 @njit(cache=True)
 def _size(number):
-    """Return the magnitude of a complex number; `abs` is slower, as it guards against overflow."""
+    """Return the magnitude of a complex number; `abs` guards against overflow and is slower."""
     return math.sqrt(number.real * number.real + number.imag * number.imag)
 
 
 @njit(cache=True)
 def wedge_angle(angle, exterior):
-    """Return sine and cosine of an angle / 2 n, and of half of it, for `utd_terms`; n is the exterior angle / pi."""
+    """Return sine and cosine of an angle / 2 n, and of half of it; n is the exterior angle / pi."""
     scaled = angle * 0.5 * math.pi / exterior
     return math.sin(scaled), math.cos(scaled), math.sin(0.5 * angle), math.cos(0.5 * angle)
 
 
 def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return (W, 5) for `utd_terms`: sine and cosine of pi / 2 n and of n pi, and 1 / 2 n."""
+    """Return (W, 5): sine and cosine of pi / 2 n and of n pi, and 1 / 2 n."""
     half = 0.5 * math.pi**2 / exterior_rad
     parts = np.sin(half), np.cos(half), np.sin(exterior_rad), np.cos(exterior_rad), half / math.pi
     return np.stack(parts, axis=1)
@@ -340,9 +334,8 @@ def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 def utd_terms(wedge, arrival, departure, terms):
     """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
 
-    `terms` (4, 3) receives cot(psi) / 2 n, with y = sqrt(a / 2) the sine of n times the angle from psi to the nearest
-    pole of the cotangent, and 1 / y^2. `wedge` is from `wedge_constants`, directions from the 0-face are from
-    `wedge_angle`.
+    `wedge` is from `wedge_constants`, directions from the 0-face from `wedge_angle`. `terms` (4, 3) receives cot(psi) /
+    2 n, with y = sqrt(a / 2) the sine of n times the angle from psi to the nearest pole of the cotangent, and 1 / y^2.
     """
     for k in range(4):
         sign, turn = -1.0 if k < 2 else 1.0, 1.0 if k % 2 == 0 else -1.0
@@ -370,7 +363,7 @@ def utd_term(transition, terms, k, boundary):
 
 @njit(cache=True)
 def vertical_field(k):
-    """Return the field of a vertical antenna: the unit vector along theta of spherical coordinates."""
+    """Return the unit vector along theta of spherical coordinates."""
     flat = max(np.hypot(k[0], k[1]), 1e-12)
     return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
 

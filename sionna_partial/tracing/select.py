@@ -1,7 +1,7 @@
 """Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
 
-The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out as long as their sum does not
-exceed the power that the link may lack.
+The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out while their sum does not exceed
+the power that the link may lack.
 """
 
 import math
@@ -22,40 +22,29 @@ from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
 LEVELS = 96
-"""Number of levels. Level 0 has the direct path alone, the last level all candidates too weak for the others."""
+"""Number of levels: level 0 is the direct path alone, the last level all weaker candidates."""
 
 _STRONGEST = -25
 """Level of a power of 0 dB; two levels are a factor of 2."""
 
 _FOUND = 0.8
-"""Expected power of the verified paths of a link, as a fraction of the sum of all bounds."""
+"""Expected power of the verified paths of a link, relative to the sum of bounds."""
 
 _WRITTEN_AT_ONCE = 100_000
-"""Number of candidates written together, which bounds the memory."""
+"""Number of candidates written together, to bound the memory."""
 
 _USUAL_REFLECTIONS = 3
-"""Reflections of a path through walls beyond which its power is discounted."""
+"""Reflections beyond which the power of a path through walls is discounted."""
 
 _NO_POWER = 10.0 ** (GAIN_FLOOR_DB / 10.0)
 
 
 class Listed(NamedTuple):
-    """Candidates of a part of the work, not written yet.
+    """Unwritten candidates of a part of the work.
 
-    Parameters
-    ----------
-    rx : (C,) int array
-        Receiver of each candidate.
-    bound : (C,) float64 array
-        Upper bound of its power; infinite for the direct path, which every link needs.
-    write : callable
-        Returns the candidates of some rows (K,).
-    done : float
-        Fraction of this kind's work that ends with this part.
-    unlisted : (N,) float64 array or 0
-        Sum of the bounds of negligible candidates, which are not listed.
-    at_once : int
-        Number of candidates that are written together.
+    `rx` (C,) are receivers, `bound` (C,) upper bounds of the power, infinite for the direct path, which every link
+    needs. `write` returns the candidates of some rows (K,), `at_once` together. `done` is the fraction of this kind's
+    work that ends here, `unlisted` (N,) or 0 the sum of the bounds of negligible candidates.
     """
 
     rx: NDArray[np.integer]
@@ -79,16 +68,16 @@ class Kind(Protocol):
         ...
 
     def listed(self, found: Floats) -> Iterator[Listed]:
-        """List the candidates that links may need whose other indirect paths have the power `found` (N,)."""
+        """List the candidates that links need whose other indirect paths have the power `found` (N,)."""
         ...
 
 
 Part = tuple[str, Listed, NDArray[np.uint8]]
-"""Name of a kind, a part of its candidates without bounds, and their levels (C,)."""
+"""Name of a kind, candidates without bounds, and their levels (C,)."""
 
 
 class Block(NamedTuple):
-    """Written candidates, the fraction of the work that ends with them, and the message."""
+    """Written candidates, the finished fraction of the work, and the message."""
 
     candidates: Candidates
     done: float
@@ -97,7 +86,7 @@ class Block(NamedTuple):
 
 @dataclass(frozen=True)
 class Selection:
-    """Candidates of some kinds with their levels; `power` (N, LEVELS) are the sums of bounds by receiver and level."""
+    """Candidates of some kinds; `power` (N, LEVELS) are the sums of bounds by receiver and level."""
 
     parts: list[Part]
     power: Floats
@@ -116,7 +105,7 @@ class Selection:
         return cls(parts, power)
 
     def needed(self, found: Floats, tolerance_db: float) -> NDArray[np.int64]:
-        """Return the level (N,) below which links need candidates, if their paths have the power `found` (N,)."""
+        """Return the level (N,) below which links need candidates, for paths of the power `found` (N,)."""
         count = LEVELS - 1
         start = np.arange(len(found) + 1) * count
         first = _first_needed(start, self.power[:, :0:-1].ravel(), missing_power(found, tolerance_db))
@@ -130,7 +119,6 @@ class Selection:
 
 
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:
-    """List a kind; return its parts with their levels, and the sums of the bounds (N, LEVELS)."""
     parts, power = [], np.zeros((len(before), LEVELS))
     for part in kind.listed(before):
         level = levels_of(part.bound)
@@ -147,8 +135,8 @@ def rounds(
 ) -> Iterator[Callable[[Floats], Iterator[Block]]]:
     """Yield functions that select candidates by the power (N,) of the paths found so far.
 
-    The first selects candidates of opaque walls as if the strongest were as strong as their bounds; if Sionna RT finds
-    less power, more follow. Paths through walls come last, kind after kind.
+    The first selects candidates of opaque walls as if paths were as strong as their bounds; if Sionna RT finds less
+    power, more follow. Paths through walls come last, kind after kind.
     """
     low = 0.6 if through_walls else 1.0
     if tolerance_db == 0.0:
@@ -178,7 +166,7 @@ def _strongest_blocks(kind: Kind, tolerance_db: float, high: float, found: Float
 
 
 def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:
-    """Return the rows of candidates with exact bounds that links need in addition to `found` (N,)."""
+    """Return the rows of candidates with exact bounds that links need besides `found` (N,)."""
     order = np.lexsort((part.bound, part.rx))
     order = order[part.bound[order] > 0.0]
     rx, power = part.rx[order], part.bound[order]
@@ -206,7 +194,7 @@ class Limits(NamedTuple):
     def of(cls, settings: TraceSettings, walls: int, *, directed: bool, coarse: bool = False) -> "Limits":
         """Return the limits for at most so many walls; with a directed antenna, long paths can be the strongest.
 
-        With `coarse`, fewer paths are listed: where the material of walls is unknown, its spread is much larger.
+        With `coarse`, fewer paths are listed: an unknown wall material has a much larger effect.
         """
         depth = settings.max_depth
         if settings.tolerance_db == 0.0:
@@ -228,8 +216,8 @@ def discount_after(limits, reflections):
 class NeedsByDistance(NamedTuple):
     """Smallest power that matters, relative to free space, by distance from the transmitter.
 
-    `relative` is the smallest for any receiver at least as far away, `near` the smallest for any at most as far away,
-    times (4 pi / wavelength)^2.
+    `relative` is for receivers at least as far away, `near` for receivers at most as far away, times
+    (4 pi / wavelength)^2.
     """
 
     distance_m: Floats
@@ -247,7 +235,7 @@ def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: f
 
 @njit(cache=True)
 def matters(fraction, near, needed):
-    """Return whether a ray with a fraction of its power left, at least `near` long, may matter to any receiver."""
+    """Return whether a ray, at least `near` long, may matter to any receiver with a fraction of its power left."""
     at = np.searchsorted(needed.distance_m, near)
     if at < len(needed.distance_m) and fraction >= needed.relative[at]:
         return True

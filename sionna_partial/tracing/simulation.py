@@ -1,4 +1,4 @@
-"""Simulation: the paths from transmitters to receivers in a map, found by Sionna RT."""
+"""Simulation of the paths between transmitters and receivers in a map, by Sionna RT."""
 
 from __future__ import annotations
 
@@ -53,17 +53,17 @@ InvalidLinks = Literal["raise", "nan"]
 _log = logging.getLogger(__name__)
 
 SHORTEST_M = 0.011
-"""Shortest distance of a link [m]. Sionna RT drops paths with a leg of 1 cm or less."""
+"""Shortest distance of a link [m], above `SHORTEST_LEG_M`."""
 
 LARGE_JOB = 8_000
-"""Number of links from which the memory of their paths is estimated first."""
+"""Number of links from which the memory of their paths is estimated."""
 
 SAMPLE = 100
 """Number of receivers for this estimate."""
 
 
 class ResolvedSettings(NamedTuple):
-    """Settings on one map: its defaults instead of None, and its own material, if it has one."""
+    """Settings on one map: defaults instead of None, and the map's material, if it has one."""
 
     trace_settings: TraceSettings
     scene_settings: SceneSettings
@@ -72,8 +72,8 @@ class ResolvedSettings(NamedTuple):
 class Simulation:
     """Forward model: the paths of any links in one map, found by Sionna RT.
 
-    The scene is loaded for the first paths and kept with all compiled kernels, so that later calls are faster. Every
-    function that traces a map accepts a Simulation.
+    The scene and compiled kernels are kept, so that later calls are faster. Every function that traces a map accepts a
+    Simulation.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class Simulation:
     scene_settings : SceneSettings
     resolved : ResolvedSettings
     material_unknown : bool
-        True where paths go through walls of a material that neither settings nor map give.
+        True where paths go through walls of an unknown material.
 
     Raises
     ------
@@ -146,18 +146,10 @@ class Simulation:
 
         Parameters
         ----------
-        tx : (3,) or (T, 3) array-like
-            Transmitter positions [m].
-        rx : (N, 3) array-like
-            Receiver positions [m].
+        tx, rx, folder, memory_gb, invalid, progress
+            As in `trace_links`.
         polarisations : {2, 1}
             1 traces vertical polarisation alone, with a quarter of the memory for `TracedLinks.transfer`.
-        folder, memory_gb, invalid, progress
-            As in `trace_links`.
-
-        Returns
-        -------
-        TracedLinks
         """
         require_choice("invalid", invalid, get_args(InvalidLinks))
         require_memory(memory_gb)
@@ -193,18 +185,14 @@ class Simulation:
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> PathSet:
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], which can be differentiated.
 
-        Returns
-        -------
-        PathSet
-
         Raises
         ------
         PositionError
             As `trace_links`.
+        BackendError
+            As `trace_links`, and for an unsupported release of Sionna RT.
         SettingsError
             For paths that only rays find.
-        BackendError
-            If LLVM or Sionna RT cannot be used, or the fast engine does not support this release of Sionna RT.
         """
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.trace_settings.frequency_hz)
         tx_m, rx_m = tx_m.reshape(np.shape(tx)).copy(), rx_m.copy()
@@ -216,10 +204,9 @@ class Simulation:
     def blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[SolvedPaths]:
-        """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, some at a time.
+        """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
 
-        An antenna needs both polarisations; paths are left out that are weak with it. Limits are coarse where the
-        material of walls is unknown.
+        `antenna` is as in `ExactFinder.paths`. Limits are coarse where the material of walls is unknown.
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
@@ -230,10 +217,7 @@ class Simulation:
     def path_blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, rx_of_tx: Iterable[Indices] | None = None
     ) -> Iterator[PathSet]:
-        """Find the paths of `paths` some at a time, for checked positions.
-
-        `rx_of_tx` selects the receivers of each transmitter; None: all.
-        """
+        """Find the paths of `paths` in blocks, for checked positions; `rx_of_tx` selects receivers by transmitter."""
         sources_m = tx_m.reshape(-1, 3)
         chosen = [np.arange(len(rx_m))] * len(sources_m) if rx_of_tx is None else rx_of_tx
         for group in self._groups(sources_m, rx_m, chosen, report):
@@ -278,11 +262,11 @@ class Simulation:
             raise BackendError(f"Gradients need the fast engine, and {engine_fault()}: {REMEDY}")
 
     def in_scene(self, points_m: Floats) -> Floats:
-        """Return world points (..., 3) [m] in scene coordinates, with the origin at the map's corner."""
+        """Return world points (..., 3) [m] relative to the map's corner."""
         return points_m - self._origin_m
 
     def in_world(self, points_m: Floats) -> Floats:
-        """Return scene points (..., 3) [m] in world coordinates."""
+        """Return scene points (..., 3) [m] in the world."""
         return points_m + self._origin_m
 
     @property
@@ -291,7 +275,7 @@ class Simulation:
 
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
-        """Return the finder of paths, with its scene in memory; a warning is logged where only rays find them."""
+        """Load the finder of paths; log a warning where only rays find them."""
         return self._finder_of(0)
 
     @cached_property
@@ -301,7 +285,7 @@ class Simulation:
 
     @cached_property
     def _coarse_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Return the finder of the paths that predictions need."""
+        """Finder for predictions."""
         finder = self._mean_finder
         if not self.material_unknown or not isinstance(finder, ExactFinder):
             return finder
@@ -332,7 +316,6 @@ class Simulation:
         *,
         finder: ExactFinder | RayFinder | MeanFinder | None = None,
     ) -> Iterator[Iterator[Found]]:
-        """Find the paths from transmitters (T, 3) to the receivers of each, in blocks of bounded memory."""
         finder = finder or self._finder
         at_once = self.partial.environment.receivers_at_once
         groups = [
@@ -360,7 +343,6 @@ class Simulation:
         report: Progress,
         polarisations: int,
     ) -> dict[str, Any]:
-        """Trace the links of a mask (T, N) into columns of paths; return their states and gains [dB]."""
         sums = LinkSums(*valid.shape)
         rx_of_tx = map(np.flatnonzero, valid)
         finder = self._mean_finder if isinstance(columns, PathColumns) else self._finder
@@ -377,7 +359,6 @@ class Simulation:
     def _require_memory(
         self, tx_m: Floats, rx_m: Floats, memory_gb: float | None, valid: Bools, bytes_each: int
     ) -> None:
-        """Log the memory of the paths of a large job; raise a MemoryLimitError above `memory_gb`."""
         if valid.sum() <= LARGE_JOB:
             return
         source = int(valid.sum(axis=1).argmax())
@@ -397,7 +378,6 @@ class Simulation:
 
 
 def _shaped(ends: dict[str, Any]) -> dict[str, Any]:
-    """Reshape link values (T, N) to (N,) for one transmitter (3,)."""
     shape = (*ends["tx"].shape[:-1], len(ends["rx"]))
     return {name: each if name in ("tx", "rx") else each.reshape(shape) for name, each in ends.items()}
 
@@ -413,7 +393,7 @@ def simulation_of(
     trace_settings: TraceSettings | None = None,
     scene_settings: SceneSettings | None = None,
 ) -> Simulation:
-    """Return a simulation as it is, or make one of a map; a simulation has its settings."""
+    """Return a simulation as it is, or make one of a map."""
     simulation: Any = getattr(scene, "simulation", scene)
     if not isinstance(simulation, Simulation):
         return Simulation(simulation, trace_settings, scene_settings)
@@ -438,16 +418,16 @@ def trace_links(
     """Trace every path from one or more transmitters to N receivers with Sionna RT.
 
     On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge and at most
-    two reflections are complete, except paths with a leg of 1 cm or less, which Sionna RT drops: exact beams give
-    candidates, and Sionna RT's image method verifies them. On a mesh, rays find the sequences of planes; line of sight
-    and nearly all reflections are found. Both include paths through walls. With diffuse reflection, diffraction on a
-    mesh, or a release of Sionna RT other than 2.2, Sionna RT's public path solver shoots rays for one receiver at a
-    time: slow, and it finds most paths, not all. The result of a receiver does not depend on the other receivers.
+    two reflections are complete, except legs of 1 cm or less, which Sionna RT drops: exact beams give candidates, which
+    Sionna RT's image method verifies. On a mesh, rays find the sequences of planes; line of sight and nearly all
+    reflections are found. Both include paths through walls. With diffuse reflection, diffraction on a mesh, or a
+    release of Sionna RT other than 2.2, its public path solver shoots rays for one receiver at a time: slow, and not
+    all paths are found. The result of a receiver does not depend on other receivers.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
-        Map of the building; unknown space is free (paper, Section III-B). A simulation is not loaded again.
+        Map of the building; unknown space is free (paper, Section III-B).
     tx : (3,) or (T, 3) array-like
         Transmitter positions [m].
     rx : (N, 3) array-like
@@ -455,19 +435,15 @@ def trace_links(
     trace_settings : TraceSettings, optional
     scene_settings : SceneSettings, optional
     folder : path, optional
-        Folder for the paths, an `.npy` file for each array, written while they are traced. The arrays of the result are
-        read from there on demand, without the limit `memory_gb`.
+        Folder for the paths, an `.npy` file for each array, which the result reads on demand, without the limit
+        `memory_gb`.
     memory_gb : float
-        Largest memory of the paths [GB], compared with an estimate from some receivers.
+        Largest memory of the paths [GB], estimated from some receivers.
     invalid : {"raise", "nan"}
-        Treatment of receivers that are not finite, outside the map, in a wall, not between floor and ceiling, or at the
-        transmitter: an error, or a link without paths, with link state 255 and gain NaN.
+        Receivers that are not finite, outside the map, in a wall, not between floor and ceiling, or at the transmitter:
+        an error, or a link without paths, with link state 255 and gain NaN.
     progress : bool or callable, optional
         As in `predict_map`.
-
-    Returns
-    -------
-    TracedLinks
 
     Raises
     ------
@@ -526,7 +502,7 @@ def nearest_m(frequency_hz: float) -> float:
 
 
 def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
-    """Return whether receivers can be at points (..., 3) [m]: in no wall, and not within 1.1 cm of one."""
+    """Return whether points (..., 3) [m] are in no wall, and not within 1.1 cm of one."""
     clear, lower_m = ~partial.is_wall_at(points_m), 0.0 if partial.obstacle is None else -SHORTEST_M
     for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
         clear &= ~partial.is_wall_at(points_m + np.array([*corner, lower_m]))
@@ -550,14 +526,13 @@ def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequen
 
 
 def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
-    """Return transmitters (T, 3), receivers (N, 3) [m], and whether `checked_positions` accepts each link (T, N)."""
+    """Return transmitters (T, 3), receivers (N, 3) [m], and which links (T, N) `checked_positions` accepts."""
     tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
     far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
     return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
 
 
 def _transmitters(partial: PartialMap, tx: ArrayLike) -> Floats:
-    """Return transmitters as (T, 3) [m], or raise an error that names one as tx1, tx2 and so on."""
     points_m = position_array("tx", tx)
     return partial.require_positions("tx", points_m, names=transmitter_names(len(points_m))).reshape(-1, 3)
 

@@ -36,10 +36,10 @@ _MARKER_M = 0.15
 def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats) -> Iterator[SolvedPaths]:
     """Find paths of every enabled kind from a transmitter (3,) to receivers (N, 3) by Sionna RT's public path solver.
 
-    `scene` comes from `open_scene`; positions and paths are in its coordinates. Sionna RT counts sequences of surfaces
-    in a hash table shared by the receivers of a call, where a collision drops a path: each receiver has its own call.
-    Sionna RT 2.2 computes paths that are reflected after a diffraction, with fewer than `max_depth` interactions, too
-    long and some dB too weak.
+    Positions and paths are in the coordinates of `scene`, from `open_scene`. Each receiver has its own call: Sionna RT
+    counts sequences of surfaces in a hash table shared by a call's receivers, where a collision drops a path. Sionna RT
+    2.2 computes paths reflected after a diffraction, with fewer than `max_depth` interactions, too long and some dB too
+    weak.
     """
     if len(rx_m) == 0:
         return
@@ -61,7 +61,7 @@ def stock_paths(scene: Any, settings: TraceSettings, tx_m: Floats, rx_m: Floats)
 
 
 def _point(position_m: Floats) -> Any:
-    """Return a position on the device: Dr.Jit would compile a literal into its kernels, anew for each receiver."""
+    """Return a position on the device: Dr.Jit would compile a literal into a kernel for each receiver."""
     import mitsuba as mi
 
     return mi.Point3f(*(mi.Float([float(value)]) for value in position_m))
@@ -105,8 +105,8 @@ def _read_paths(found: Any, depth: int, index: int, tx_m: Floats, rx_m: Floats) 
 def listed_before(interactions: States, vertices_m: NDArray[np.floating[Any]]) -> Bools:
     """Mark the paths (P,) of one receiver that repeat an earlier one: the same interactions at the same points.
 
-    Sionna RT identifies sequences by hashes of rounded planes, and rounding can give one plane two hashes. Paths with
-    a diffuse reflection are samples of a rough surface and never repeats.
+    Sionna RT identifies sequences by hashes of rounded planes, where one plane can have two. Diffuse reflections are
+    samples of a rough surface and never repeats.
     """
     repeated = np.zeros(len(interactions), dtype=bool)
     exact = np.flatnonzero((interactions != DIFFUSE).all(axis=1))
@@ -183,7 +183,7 @@ def planar_radio_map(scene: Any, plane: MapPlane, tx: Mapping[str, Floats], gain
 def stock_gain_db(scene: Any, plane: MapPlane, tx: Mapping[str, Floats], settings: TraceSettings) -> Floats:
     """Return the path gains (T, ny, nx) of Sionna RT's RadioMapSolver, -150 dB where it finds no path.
 
-    The frequency of the scene and its transmitters are replaced; it gets isotropic antennas if it has none.
+    Frequency and transmitters of the scene are replaced; it gets isotropic antennas if it has none.
     """
     level = [name for name, position_m in tx.items() if abs(position_m[2] - plane.height_m) < plane.spacing_m / 10.0]
     if level:

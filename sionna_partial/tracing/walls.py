@@ -1,8 +1,8 @@
 """Rules for the faces along a line that are one wall, for floor plans, obstacles and meshes.
 
-Consecutive faces are one wall if they are at most `depth_m` apart, measured across them, and no free cell of the map is
-between them. In meshes they are also one wall where the line enters and leaves a closed body. One face of a wall has
-its loss, and none reflects a path that came through another.
+Consecutive faces are one wall if they are at most `depth_m` apart, measured across them, with no free cell of the map
+between them; in meshes also where the line enters and leaves a closed body. One face of a wall has its loss, and none
+reflects a path that came through another.
 
 Plans and meshes group faces in two functions: a mesh counts from the near end of the line, where its cells are also
 sampled, and a common function would change the order of close faces.
@@ -26,8 +26,8 @@ from sionna_partial.tracing.power import Materials
 class Interior(NamedTuple):
     """Space between walls: cells (ny, nx) that are free or have a floor, their edge and the largest wall depth [m].
 
-    `free_before` (ny + 1, nx + 1) is the number of free cells in smaller rows and columns. `solid` (P, 2) is True where
-    the wall continues on the left or right of its pieces.
+    `free_before` (ny + 1, nx + 1) counts the free cells in smaller rows and columns. `solid` (P, 2) is True where the
+    wall continues on the left or right of its pieces.
     """
 
     free: Bools
@@ -39,13 +39,12 @@ class Interior(NamedTuple):
 
     @classmethod
     def of(cls, free: Bools, floor: Bools, solid: Bools, cell_m: float, depth_m: float) -> "Interior":
-        """Count the free cells."""
         before = np.pad(free.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
         return cls(free, before, floor, solid, cell_m, depth_m)
 
 
 def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
-    """Return whether pieces (P,) of walls have only wall cells a cell away on their left and right (P, 2)."""
+    """Return which pieces (P,) of walls have only wall cells a cell away on their left and right (P, 2)."""
     start, along = plan.pieces_m[:, 0], plan.pieces_m[:, 1] - plan.pieces_m[:, 0]
     length = np.hypot(*along.T)
     count = np.maximum(1, np.ceil(length / cell_m)).astype(np.int64)
@@ -79,7 +78,7 @@ class Cells(NamedTuple):
 
 
 class SolidMesh(NamedTuple):
-    """A mesh that lines go through: its faces, planes, bodies and cells, and the material of each face (F,)."""
+    """A mesh that lines go through, and the material of each face (F,)."""
 
     tree: FaceTree
     planes: MeshPlanes
@@ -90,7 +89,7 @@ class SolidMesh(NamedTuple):
 
 
 def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
-    """Find the connected pieces of a mesh that close around a volume, every edge once in each direction."""
+    """Find the connected pieces of a mesh that enclose a volume, every edge once in each direction."""
     if not len(triangles):
         return Bodies(np.zeros(0, np.int64), np.zeros((0, 3)))
     count = len(vertices_m)
@@ -114,8 +113,7 @@ def closed_bodies(vertices_m: Floats, triangles: NDArray[np.int64]) -> Bodies:
 class MetFaces(NamedTuple):
     """Scratch of one path: the faces that it meets, in order from the transmitter.
 
-    `kind` is Sionna RT's number of each interaction, `same_wall` marks further faces of a wall that has been crossed,
-    which cost nothing, `cosine` is for the angle of incidence, `point_m` are the points.
+    `kind` and `same_wall` are as in `Candidates`, `cosine` is for the angle of incidence.
     """
 
     face: NDArray[np.int64]
@@ -178,7 +176,7 @@ def is_inside(mesh, first, second, a, b, begin, end):
 def mark_walls(mesh, a, b, count, met, entries, begin):
     """Write the faces on a line from a to b as trail entries from number `begin`; return the number of walls.
 
-    Walls are counted from the end with smaller coordinates, so that links are reciprocal.
+    Walls are counted from the end with smaller coordinates: links are reciprocal.
     """
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
@@ -211,8 +209,7 @@ def mark_walls(mesh, a, b, count, met, entries, begin):
 def group_faces(interior, start, end, found, cosine, same_wall):
     """Mark further faces of a wall on a leg (n,); return the number of walls.
 
-    `found` (n,) are ordered fractions of the leg, `cosine` (n,) the cosines of incidence. Walls are counted from the
-    end with smaller coordinates, so that links are reciprocal.
+    `found` (n,) are ordered fractions of the leg, `cosine` (n,) is for incidence. Walls are counted as in `mark_walls`.
     """
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
@@ -247,7 +244,7 @@ def choose_face(cosine, same_wall, begin, end, backwards):
 
 @njit(cache=True)
 def is_free_between(cells, start, end, first, last):
-    """Return whether a leg meets a free cell between two fractions, except cells that the faces there cut."""
+    """Return whether a leg meets a free cell between two fractions, except cells cut by the faces there."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
     s, high = first * length + cells.cell_m, last * length - cells.cell_m
@@ -261,9 +258,9 @@ def is_free_between(cells, start, end, first, last):
 
 @njit(cache=True)
 def are_in_wall(interior, x, y, rays):  # type: ignore[no-untyped-def]
-    """Return whether all rays between two from a point stay in one wall from a face to the next, by `is_free_between`.
+    """Return whether all rays between two from a point stay in one wall from a face to the next.
 
-    Each of the two rays is (direction x, y, cosine of incidence at the next face, distances of the two faces).
+    The two `rays` are (direction x, y, cosine of incidence at the next face, distances of the two faces).
     """
     left = low = np.inf
     right = high = -np.inf

@@ -1,7 +1,7 @@
 """Faces of a mesh: their planes, the face at a point of a plane, and the faces on a line.
 
-Faces in one plane reflect to one image, so that sequences of reflections are distinguished by planes. In a scanned mesh
-nearly every face is a plane of its own.
+Faces in one plane reflect to one image, so that planes distinguish sequences of reflections. In a scanned mesh nearly
+every face is a plane of its own.
 """
 
 from typing import NamedTuple
@@ -13,10 +13,10 @@ from sionna_partial.arrays import Floats, span_in_strip
 from sionna_partial.process import njit
 
 MOST_FACES = 64
-"""Largest number of faces on a line; further ones are left out."""
+"""Largest number of faces on a line; more are left out."""
 
 _LEAF = 4
-"""Largest number of faces in a box that is not divided further."""
+"""Largest number of faces in a box."""
 
 _INSIDE = 1e-9
 """Fraction of a face by which a line may miss it, so that neighbours leave no gap."""
@@ -25,7 +25,7 @@ PLANE_TOLERANCE_M = 1e-4
 """Distance of corners from a plane [m] up to which a face lies in it, for single precision."""
 
 _NORMAL_TOLERANCE = 1e-4
-"""Difference of unit normals up to which faces are parallel: 1 cm, which the solver accepts, in an image 50 m away."""
+"""Difference of unit normals of parallel faces: 1 cm, which the solver accepts, in an image 50 m away."""
 
 _FACE_TOLERANCE_M = 1e-3
 """Distance beyond a face [m] up to which a point counts as on it."""
@@ -34,8 +34,8 @@ _FACE_TOLERANCE_M = 1e-3
 class Boxes(NamedTuple):
     """F items in a tree of K boxes; box 0 holds all.
 
-    Box k has the corners `low_m`, `high_m` (K, 3) and holds items `start` to `stop` in `order` (F,); `child` is the
-    first of its two boxes, or -1.
+    Box k has the corners `low_m`, `high_m` (K, 3) and items `start` to `stop` of `order` (F,); `child` is the first of
+    its two boxes, or -1.
     """
 
     order: NDArray[np.int64]
@@ -106,10 +106,7 @@ def scratch():
 
 @njit(cache=True)
 def faces_between(tree, a, b, own, other, met):
-    """Write the faces between two points, except faces in the planes `own` and `other`; return their number.
-
-    Several faces in one plane count once.
-    """
+    """Write the faces between two points, one for each plane except `own` and `other`; return their number."""
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     ix = 1.0 / dx if dx != 0.0 else 1e300
     iy = 1.0 / dy if dy != 0.0 else 1e300
@@ -177,7 +174,7 @@ class FaceBins(NamedTuple):
 
     `axes` (P, 2) are the two coordinates used in a plane, in which `low_m` (P, 2) is the corner of its bins, `edge_m`
     (P,) their size, `columns` (P,) their number in a row and `first_bin` (P + 1,) the first. `start` (B + 1,) and
-    `face` list the faces in each bin; `corner_m` (F, 3, 2) are corners in these coordinates.
+    `face` list the faces of each bin, with corners `corner_m` (F, 3, 2).
     """
 
     axes: NDArray[np.int64]
@@ -194,7 +191,7 @@ class MeshPlanes(NamedTuple):
     """F faces of a mesh, grouped by P planes.
 
     `plane` (F,) is the plane of every face; a face without area has its own. Points of a plane satisfy
-    ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold the faces of each plane.
+    ``normal @ point == offset_m``. Balls `centre_m` (P, 3), `radius_m` (P,) hold its faces.
     """
 
     plane: NDArray[np.int32]
@@ -206,7 +203,6 @@ class MeshPlanes(NamedTuple):
 
 
 def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) -> MeshPlanes:
-    """Find the planes of a mesh of vertices (V, 3) [m] and triangles (F, 3), and sort the faces of each."""
     corner_m = np.ascontiguousarray(vertices_m[triangles], dtype=np.float64)
     across = np.cross(corner_m[:, 1] - corner_m[:, 0], corner_m[:, 2] - corner_m[:, 0])
     area = np.linalg.norm(across, axis=1)
@@ -244,7 +240,7 @@ def mix(a, b):
 def _plane_ids(order, normal, offset, corner):
     """Return the plane of every face, and the first face of every plane; faces come in `order`, largest first.
 
-    Planes are kept by cells of |normal| and |offset|, and looked for in the 16 cells around a face's own.
+    Planes are kept by cells of |normal| and |offset|, and looked for in the 16 cells around a face.
     """
     plane, first, count = np.full(len(order), -1, np.int32), np.empty(len(order), np.int32), 0
     size = 16
@@ -292,7 +288,6 @@ def _in_plane(first, f, normal, offset, corner):
 
 @njit(cache=True)
 def _fill_bins(plane, corner, low, edge, columns, first_bin):
-    """Return the first entry of every bin, and the faces in bin after bin, row by row."""
     start = np.zeros(first_bin[-1] + 1, np.int64)
     items = np.empty(0, np.int32)
     for stored in (False, True):

@@ -1,13 +1,10 @@
 """Specular paths of meshes, with or without walls that they cross, by the sequences of planes that rays met.
 
 A path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays determine the
-sequences and, seen from the image, directions and reach of the last leg. A receiver there, or a little beside, is a
-candidate if the line to it, folded back, meets a face of each plane.
-
-Where walls let power through, every leg is cast through the mesh, and its faces are grouped to walls, which gives the
-power. Where none may be crossed, Sionna RT finds the faces in the way.
-
-`unfold` of `plan/reflections.py` folds lines in the plan; the functions share one line only.
+sequences and, seen from the image, directions and reach of the last leg. A receiver in or near them is a candidate if
+the line to it, folded back, meets a face of each plane. Between opaque faces, Sionna RT finds the faces in the way;
+through walls, every leg is cast through the mesh, and its faces are grouped to walls, which gives the power.
+`unfold` of `plan/reflections.py` shares one line only.
 """
 
 import itertools
@@ -48,30 +45,30 @@ from sionna_partial.tracing.select import Limits, Listed, discount_after, needs_
 from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces
 
 _REACH, _REACH_M = 1.1, 0.3
-"""Factor and length [m] by which receivers may be farther than the sequence's rays reached."""
+"""Factor and length [m] by which receivers may be farther than the rays reached."""
 
 _LEAF = 8
-"""Largest number of receivers in a box that is not divided further."""
+"""Largest number of receivers in a box."""
 
 _PART = 0.5
-"""Fraction of the smallest power that matters down to which sequences are followed, as split rays only sample them."""
+"""Fraction of the smallest relevant power down to which sequences are followed, as split rays only sample them."""
 
 _AT_ONCE = 20_000
-"""Number of candidates through walls that are written together, which bounds the memory."""
+"""Number of candidates through walls written together, to bound the memory."""
 
 _SEQUENCES_AT_ONCE, _PARTS = 500, 64
-"""Number of sequences whose candidates one thread lists at a time, and about the most parts of all sequences."""
+"""Number of sequences whose candidates one thread lists at a time, and about the most parts."""
 
 _ENTRIES = 160
 """Largest number of faces on a path through walls."""
 
 
 _OPAQUE_MARGIN, _MARGIN = 8.0, 4.0
-"""Distances in direction from a sequence's rays to its receivers, in spacings of the rays; split rays are sparse."""
+"""Distances in direction from rays to receivers, in spacings of the rays; split rays are sparse."""
 
 
 class View(NamedTuple):
-    """The view of one sequence: image (3,), box of directions, width by which it is enlarged, and reach."""
+    """View of one sequence: image (3,), box of directions, its margin, and reach."""
 
     source: NDArray[np.float64]
     low: NDArray[np.float32]
@@ -88,7 +85,7 @@ class Traced(NamedTuple):
 
 
 class Images(NamedTuple):
-    """The columns of `Traced` and of the mesh for `fold_line`: passing both takes longer than its work."""
+    """Columns of `Traced` and of the mesh for `fold_line`: passing both takes longer than its work."""
 
     parent: NDArray[np.int32]
     plane: NDArray[np.int32]
@@ -144,11 +141,6 @@ class MeshReflections:
         self._links = MeshLinks(mesh, *ends, limits, gains)
 
     def listed(self, found: Floats, *, sequences_at_once: int = _SEQUENCES_AT_ONCE) -> Iterator[Listed]:
-        """List straight lines, then the candidates of sequence after sequence; none is negligible.
-
-        Paths through walls come in one part, with their powers: those that links may need whose indirect paths without
-        walls have the power `found` (N,).
-        """
         links, every = self._links, np.arange(len(self._links.rx_m), dtype=np.int32)
         direct = _straight(links) if self._opaque is None else np.full(len(every), np.inf)
         needed = links.limits.min_power(found + direct) if self._opaque is None else np.zeros(len(every))
@@ -292,9 +284,9 @@ def farthest(source, boxes):
 def bound_view(view, farthest, planes, p, bounds):
     """Write bounds of the points in view of an image and beyond its last plane.
 
-    Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, and 4 has
-    the largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from
-    the image is within r times that distance of r times the middle.
+    Rows 0 and 1 are the corners of a box around them; 2 is the image, 3 the middle of the box of directions, 4 the
+    largest distance of a direction from the middle, and the middle's square. A point in view at a distance r from the
+    image is within r times that distance of r times the middle.
     """
     source, low, high, margin, reach = view
     reach = min(reach, farthest)
@@ -334,7 +326,7 @@ def _apart(low, high, bounds):
 def fold_line(node, target, images, face, points):
     """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
 
-    Returns a bound on the power of the path, or -1 where the line, folded back, misses a plane of the sequence.
+    Return a bound on the power, or -1 where the line, folded back, misses a plane of the sequence.
     """
     parent, plane, depths, sources, planes, material, largest, wavelength = images
     normals, offsets, bins, depth = planes.normal, planes.offset_m, planes.bins, depths[node]
@@ -363,7 +355,7 @@ def fold_line(node, target, images, face, points):
 
 @njit(cache=True)
 def _follow(reflections, target, links, met, entries, faces, points):
-    """Write all faces that a path with reflections meets; return their number, -1 if it crosses no or many walls."""
+    """Write all faces on a path with reflections; return their number, -1 if it crosses no or too many walls."""
     mesh, count, crossed = links.mesh, 0, 0
     a, own = links.tx_m, np.int64(-1)
     for k in range(reflections + 1):

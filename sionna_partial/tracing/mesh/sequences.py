@@ -1,8 +1,8 @@
 """Sequences of planes that rays from a transmitter meet.
 
-Between opaque faces, Mitsuba reflects many rays. Where faces let power through, fewer rays are followed here; each
-splits at every face into a reflected and a transmitted ray, down to the power that matters. For opaque faces, Mitsuba
-is faster by far. Both fill the same tree.
+Between opaque faces, Mitsuba reflects many rays, far faster. Where faces let power through, fewer rays are followed
+here; each splits at every face into a reflected and a transmitted ray, down to the power that matters. Both fill the
+same tree.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -26,7 +26,7 @@ _RAYS_PER_CHUNK = 250_000
 
 
 class MeshLinks(NamedTuple):
-    """The mesh, both ends of all paths of a call, their limits, and the gains of the transmit antenna."""
+    """The mesh, both ends of all paths, their limits, and the gains of the transmit antenna."""
 
     mesh: SolidMesh
     tx_m: Floats
@@ -38,8 +38,8 @@ class MeshLinks(NamedTuple):
 class Rays(NamedTuple):
     """R rays that were reflected up to D times.
 
-    `face` (R, D) are the faces met, counted through the shapes, -1 after escape; `leg_m` (R, D + 1) the lengths between
-    them, inf where nothing was met; `direction` (R, D + 1, 3) the unit directions of the legs.
+    `face` (R, D) are the faces met, counted through the shapes, -1 after escape; `leg_m` (R, D + 1) the lengths, inf
+    where nothing was met; `direction` (R, D + 1, 3) the unit directions.
     """
 
     face: NDArray[np.int32]
@@ -50,10 +50,9 @@ class Rays(NamedTuple):
 def shoot_rays(
     mi_scene: Any, shapes: Sequence[Any], tx_m: NDArray[np.float64], count: int, max_depth: int
 ) -> Iterator[Rays]:
-    """Shoot `count` rays from a transmitter (3,) in all directions, and reflect each up to `max_depth` times.
+    """Shoot `count` rays from a transmitter (3,) on Sionna RT's Fibonacci lattice, with up to `max_depth` reflections.
 
-    Directions are Sionna RT's Fibonacci lattice. `shapes` are all shapes of the scene in face order. Rays come part by
-    part, always in the same order.
+    `shapes` are all shapes of the scene in face order. Rays come part by part, always in the same order.
     """
     import drjit as dr
     import mitsuba as mi
@@ -91,7 +90,6 @@ def lattice(number: NDArray[np.int64], count: int) -> NDArray[np.float32]:
 
 
 def _launch(mi_scene: Any, first_face: Any, rays: Any, max_depth: int) -> list[tuple[Any, Any, Any]]:
-    """Start tracing: face, length and direction of each leg, which Dr.Jit computes in the background."""
     import drjit as dr
     import mitsuba as mi
 
@@ -115,11 +113,11 @@ def _collect(legs: list[tuple[Any, Any, Any]], max_depth: int) -> Rays:
 
 
 class Sequences(NamedTuple):
-    """Every sequence of planes that rays met, as a tree; the first `size` rows of the arrays are used.
+    """Sequences of planes that rays met, as a tree; the first `size` rows of the arrays are used.
 
     `parent` (M,) is the sequence without its last plane (-1 for none), `plane` (M,) that plane. Boxes `low`, `high` (M,
-    3) hold the unit directions in which rays left it, `reach_m` (M,) is the longest unfolded length of these rays to
-    the next face, `left` (M,) the largest fraction of power of split rays. `table` is a hash table, -1 where empty.
+    3) hold the unit directions in which rays left it, `reach_m` (M,) is their longest unfolded length to the next face,
+    `left` (M,) the largest fraction of power of split rays. `table` is a hash table, -1 where empty.
     """
 
     parent: NDArray[np.int32]
@@ -137,7 +135,7 @@ class Views(NamedTuple):
     """Views of M sequences, in which their receivers are.
 
     `order` has each sequence after its parent, followed by all its extensions; `depth` is the number of planes,
-    `source_m` (M, 3) the image of the transmitter, `margin` the width by which the box of directions is enlarged.
+    `source_m` (M, 3) the image of the transmitter, `margin` enlarges the box of directions.
     """
 
     order: NDArray[np.int32]
@@ -165,7 +163,7 @@ def _no_sequences() -> Sequences:
 
 @njit(cache=True)
 def _with_room(sequences, size, more):
-    """Return `size` sequences with room for more: at first 1024, then twice as many, as a hash table needs it."""
+    """Return `size` sequences with room for more: at first 1024, then doubled, as a hash table needs it."""
     parent, plane, low, high, reach, left, table, _, rays = sequences
     room = max(1024, size + more)
     parent, plane, reach, left = grow(parent, room), grow(plane, room), grow(reach, room), grow(left, room)
@@ -222,8 +220,8 @@ def _widen(low, high, node, direction):
 class _RayStack(NamedTuple):
     """Rays that have been split off.
 
-    `value` (K, 8) are origin, direction, length and fraction of power left; `number` (K, 3) sequence, reflections and
-    walls crossed.
+    `value` (K, 8) are origin, direction, length and fraction of power left; `number` (K, 3) sequence, reflections,
+    walls.
     """
 
     value: Floats
@@ -244,7 +242,7 @@ def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequenc
 
 @njit(cache=True)
 def _split(sequences, directions, needed, links, far):
-    """Add the sequences of rays in some directions (R, 3), and count them; no line in the mesh is longer than `far`."""
+    """Add the sequences of rays in directions (R, 3), and count them; `far` is the size of the mesh."""
     room, size = MOST_FACES * (links.limits.reflections + 1), sequences.size
     stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
     for direction in directions:
@@ -262,7 +260,7 @@ def _split(sequences, directions, needed, links, far):
 
 @njit(cache=True)
 def _go_on(sequences, size, stack, top, needed, links, far):
-    """Follow one ray through all faces, and stack the reflected ones; return the numbers of sequences and rays."""
+    """Follow one ray through all faces and stack the reflected rays; return the numbers of sequences and rays."""
     mesh, limits, met, end = links.mesh, links.limits, stack.met, stack.end
     a, d = stack.value[top, :3].copy(), stack.value[top, 3:6].copy()
     length, left = stack.value[top, 6], stack.value[top, 7]
@@ -311,7 +309,6 @@ def _reflect(a, d, length, planes, p, ray):
 
 
 def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.float64], spacings: float) -> Views:
-    """Find the image, the margin, in spacings of the rays, and the order of all sequences."""
     parent, plane = sequences.parent[: sequences.size], sequences.plane[: sequences.size]
     margin = spacings * np.sqrt(4.0 * np.pi / max(1, sequences.rays))
     return Views(_depth_first(parent), *_images(parent, plane, planes, tx_m, margin))
@@ -319,7 +316,7 @@ def view_sequences(sequences: Sequences, planes: MeshPlanes, tx_m: NDArray[np.fl
 
 @njit(cache=True)
 def _images(parent, plane, planes, tx, margin):
-    """Return depth, image of the transmitter and margin of every sequence: a small plane bounds the directions."""
+    """Return depth, image and margin of every sequence: a small plane bounds the directions."""
     depth, source, margins = np.empty(len(parent), np.int32), np.empty((len(parent), 3)), np.empty(len(parent))
     for node in range(len(parent)):
         p, above = plane[node], parent[node]
@@ -341,7 +338,7 @@ def _images(parent, plane, planes, tx, margin):
 
 @njit(cache=True)
 def _depth_first(parent):
-    """Return the order of the sequences in which those with the same first planes are together."""
+    """Return the order in which sequences with the same first planes are together."""
     child, beside = np.full(len(parent) + 1, -1, np.int32), np.empty(len(parent), np.int32)
     for node in range(len(parent) - 1, -1, -1):
         beside[node], child[parent[node] + 1] = child[parent[node] + 1], node

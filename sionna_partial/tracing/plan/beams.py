@@ -1,19 +1,17 @@
 """Beams of a floor plan: sequences of walls that can reflect a path, and the receivers that they reach.
 
-The search has two dimensions, as a wall of full height reflects a path in the plan like a line. The image S of the
+A wall of full height reflects a path in the plan like a line, so the search has two dimensions. The image S of the
 transmitter and a window from A to B, the reflecting part of the last wall, bound a beam. A point in it is
 S + r ((1 - t)(A - S) + t (B - S)): the window is r = 1, t runs from 0 to 1, and on any line 1 / r is linear in t.
 
-One search (`follow`) takes the beams of one number of reflections to the next. Opaque walls are walls that no path
-crosses (`Limits.walls` is 0). Walls in a beam are sorted in one of two ways:
+`follow` takes the beams of one number of reflections to the next:
 
-- Opaque walls: `_look` splits a beam by the nearest wall, the upper envelope of segments in (t, 1 / r), among walls
-  clipped in strips from the window outwards until the view is full. A beam sees low walls, and past them. Every
-  sequence is listed, as `select.py` needs the sum of all bounds.
-- Through walls: all walls behind the window are clipped and `_lay` sorts them by distance between two edges. This
-  gives the walls before any point and a bound of the power there. Beams too weak for every receiver end.
-
-`_lay` and `_add_pairs` for opaque walls, too, would be slower.
+- Between opaque walls (`Limits.walls` is 0), `_look` splits a beam by the nearest wall, the upper envelope of segments
+  in (t, 1 / r), among walls clipped in strips from the window outwards until the view is full. A beam sees low walls,
+  and past them. Every sequence is listed, as `select.py` needs the sum of all bounds.
+- Through walls, all walls behind the window are clipped, and `_lay` sorts them by distance between two edges, which
+  gives the walls before any point and a bound of the power there. Beams too weak for every receiver end. For opaque
+  walls, this would be slower.
 """
 
 import math
@@ -47,10 +45,10 @@ from sionna_partial.tracing.select import discount_after, matters, needs_by_dist
 from sionna_partial.tracing.walls import are_in_wall
 
 _BEAMS_AT_ONCE = 256
-"""Number of beams through walls that one thread works on at a time."""
+"""Number of beams through walls that a thread follows at a time."""
 
 _CELL_M = 1.0
-"""Edge of the cells of receivers that beams are compared with [m]."""
+"""Edge of the cells of receivers [m]."""
 
 _ROOT_ANGLE_RAD = 0.1234567
 """Direction of the first root beam [rad]: no wall of a lattice map is parallel to it."""
@@ -60,7 +58,7 @@ class BeamTree(NamedTuple):
     """M beams as trees: a beam is the sequence of walls from a root down to it.
 
     `parent` (M,) is -1 at the roots, `piece` (M,) the reflecting piece of a wall, `source_m` (M, 2) the image of the
-    transmitter. Beams 4 k to 4 k + 3 are the roots of source k, one for each quadrant.
+    transmitter. Beams 4 k to 4 k + 3 are the roots of source k, by quadrant.
     """
 
     parent: NDArray[np.int32]
@@ -79,8 +77,8 @@ class BeamTree(NamedTuple):
 class Needed(NamedTuple):
     """Smallest power that matters, relative to (wavelength / 4 pi)^2.
 
-    `power` (N,) is for each receiver; `distance_m`, `relative` and `near` are as in `NeedsByDistance`, in the plan.
-    `cells` (ny, nx) is for square cells; `grid` (4,) are their corner x0 and y0, edge [m] and number of columns.
+    `power` (N,) is by receiver; `distance_m`, `relative` and `near` are as in `NeedsByDistance`, in the plan. `cells`
+    (ny, nx) is by square cell; `grid` (4,) are their corner x0 and y0, edge [m] and number of columns.
     """
 
     power: Floats
@@ -94,10 +92,10 @@ class Needed(NamedTuple):
 class Beams(NamedTuple):
     """M beams of one number of reflections.
 
-    `parent` (M,) is the beam before the last reflection, counted through all beams, `piece` (M,) the reflecting piece
-    of wall; -1 for the roots. `window` (M, 6) are the image of the transmitter and the ends of the window [m]. `left`
-    (M, 2) bounds the fractions of power after reflections and after walls, `crossed` (M,) is the smallest number of
-    walls, `more` (M,) the largest number of further reflections, `sequence` (M,) the number of the sequence of lines.
+    `parent` and `piece` (M,) are as in `BeamTree`, -1 for the roots. `window` (M, 6) are the image of the transmitter
+    and the ends of the window [m]. `left` (M, 2) bounds the power after reflections and after walls, `crossed` (M,) is
+    the smallest number of walls, `more` (M,) the largest number of further reflections, `sequence` (M,) numbers the
+    sequences of lines.
     """
 
     parent: NDArray[np.int32]
@@ -110,7 +108,7 @@ class Beams(NamedTuple):
 
     @classmethod
     def first(cls, sources_m: Floats, more: NDArray[np.integer], power: float) -> "Beams":
-        """Return the beams from sources (E, 2) with numbers of reflections (E,) and the power of their antenna."""
+        """Return the beams from sources (E, 2) with numbers of reflections (E,) and the antenna's power."""
         low = [_ROOT_ANGLE_RAD + 0.5 * np.pi * root for root in range(4)]
         window = [(0.0, 0.0, math.cos(angle), math.sin(angle), -math.sin(angle), math.cos(angle)) for angle in low]
         windows_m = (np.tile(sources_m, 3)[:, None] + np.array(window)).reshape(-1, 6)
@@ -121,7 +119,7 @@ class Beams(NamedTuple):
 
 
 class Task(NamedTuple):
-    """Inputs for beams; walls transmit the fraction `most_transmitted` of the power at most."""
+    """Inputs for beams; walls transmit the fraction `most_transmitted` at most."""
 
     receivers: PointBins
     building: Building
@@ -143,8 +141,8 @@ class _Layers(NamedTuple):
     """Scratch of one beam: its walls, and the walls between two edges, from the window outwards.
 
     For clipped wall c, `slope` (C,) is the slope of 1 / r, `along` (C, 2) its direction. For edge i, `ray` (E, 3) is
-    the direction and length of the beam. Between edges i and i + 1, there are `depth` (E,) walls `wall` (E, D), behind
-    which `left` (E, D) of the power is left after `crossed` (E, D) walls. `open` (P,) is the last window of a line.
+    the direction and length of the beam. Between edges i and i + 1 are `depth` (E,) walls `wall` (E, D), behind which
+    `left` (E, D) of the power is left after `crossed` (E, D) walls. `open` (P,) is the last window of a line.
     """
 
     clipped: Clipped
@@ -173,8 +171,8 @@ def trace_beams(
 ) -> tuple[BeamTree, NDArray[np.int32]]:
     """Find every sequence of opaque walls from sources (E, 2) with largest depths (E,) to receivers.
 
-    Returns the beams and pairs (K, 2) of beam and receiver in its view, ordered by sequence and then receiver; a
-    receiver has each sequence of wall lines once.
+    Return beams and pairs (K, 2) of beam and receiver, ordered by sequence and then receiver; a receiver has each
+    sequence of wall lines once.
     """
     nothing, beams = np.zeros(0), Beams.first(sources_m, max_depth, 1.0)
     needed = Needed(np.zeros(len(receivers.order)), nothing, nothing, nothing, np.zeros((1, 1)), np.zeros(4))
@@ -187,10 +185,7 @@ def trace_beams(
 
 
 def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.int32], Floats]:
-    """Reflect the last beams of a tree; return the new ones, pairs (K, 2) of beam and receiver, and powers (K,).
-
-    A receiver has each sequence of wall lines once. Powers are bounds of the fraction after walls.
-    """
+    """Reflect the last beams of a tree; return the new ones, pairs as in `trace_beams`, and bounds (K,) after walls."""
     building, count, before = task.building, len(beams.parent), len(tree.parent) - len(beams.parent)
     at_once = _BEAMS_AT_ONCE if building.limits.walls else max(1, count)
 
@@ -210,7 +205,6 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
 
 @njit(cache=True, nogil=True)
 def _follow_beams(beams, before, first, stop, task):
-    """Follow some beams, of which there are others `before`; return as `follow`, without sequences."""
     layers, building = _layers_of(task.building.plan), task.building
     plan, opaque, room, receivers = building.plan, building.limits.walls == 0, building.room, task.receivers
     pieces_m, low, scratch = plan.pieces_m, plan.low, layers.clipped
@@ -277,7 +271,6 @@ def _layers_of(plan):
 
 @njit(cache=True)
 def _clip_walls(plan, beam, own, opaque, layers):
-    """Clip the walls in a beam, only the nearest if opaque, and sort their edges; return their number."""
     scratch, grid = layers.clipped, plan.cells.grid
     scratch.visit[-1] += 1
     if opaque:
@@ -307,7 +300,7 @@ def _clip_walls(plan, beam, own, opaque, layers):
 def _look(count, line, low, layers, span, wall):
     """Split a beam by the nearest opaque wall and the low walls before it.
 
-    Returns windows (t0, 1 / r0, t1, 1 / r1), their clipped walls, -1 for none, and their number.
+    Return windows (t0, 1 / r0, t1, 1 / r1), their clipped walls, -1 for none, and their number.
     """
     found, order, active, edge = layers.clipped.found, layers.clipped.order, layers.clipped.active, layers.clipped.edge
     slope, walls = layers.slope, layers.clipped.wall
@@ -445,7 +438,6 @@ def _lay_one(beam, i, active, task, layers, windows):
 
 @njit(cache=True)
 def _is_solid(pieces, solid, beam, piece):
-    """Return whether a beam meets a wall from inside it."""
     px, py = pieces[piece, 0, 0], pieces[piece, 0, 1]
     dx, dy = pieces[piece, 1, 0] - px, pieces[piece, 1, 1] - py
     left = dx * (beam[1] - py) - dy * (beam[0] - px) > 0.0
@@ -454,7 +446,6 @@ def _is_solid(pieces, solid, beam, piece):
 
 @njit(cache=True)
 def _extend(layers, lines, material, c, new, windows):
-    """Add a window that reflects a beam, or enlarge the one beside it."""
     t0, t1, reflected, left, crossed = new
     span, wall, count = windows
     piece = layers.clipped.wall[c]
@@ -474,7 +465,6 @@ def _extend(layers, lines, material, c, new, windows):
 
 @njit(cache=True)
 def _piece_of(layers, c, span):
-    """Return a part of a view as input of `reflect`: (t0, w0, t1, w1)."""
     w0, w1 = _nearness(layers, c, span[0]), _nearness(layers, c, span[1])
     return span[0], max(w0, 1e-9), span[1], max(w1, 1e-9)
 
@@ -504,7 +494,7 @@ def _window_distance(beam):
 
 @njit(cache=True)
 def _reaches(beam, near, left, needed):
-    """Return whether a beam would matter to any receiver behind its window if no wall were there."""
+    """Return whether a beam would matter to any receiver behind its window without walls."""
     x0, y0, edge, (rows, columns) = needed.grid[0], needed.grid[1], needed.grid[2], needed.cells.shape
     corner = cone_of(beam, True, needed.grid, rows)
     low, high = np.min(corner[:, 1]) - TOLERANCE_M, np.max(corner[:, 1]) + TOLERANCE_M

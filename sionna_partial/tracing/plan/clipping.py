@@ -10,13 +10,13 @@ from sionna_partial.process import njit
 from sionna_partial.scene.outlines import grow
 
 TOLERANCE_M = 1e-4
-"""Width by which beams are widened [m], as points share one lattice and the solver has single precision."""
+"""Width by which beams are widened [m]: points share one lattice, and the solver has single precision."""
 
 _STRIP_CELLS = 6.0
 """Depth of the strips in which a narrow beam is searched for walls [cells of the index]."""
 
 _FAR_M = 1e6
-"""Length at which beams that hit nothing are cut off [m], fixed so that no receiver depends on the others."""
+"""Length at which beams that hit nothing are cut off [m], fixed: no receiver depends on others."""
 
 THINNEST = 1e-12
 """Smallest part of a beam's width between two edges."""
@@ -25,8 +25,8 @@ THINNEST = 1e-12
 class Clipped(NamedTuple):
     """Scratch of one beam; `visit` ends with the number of the present beam.
 
-    Of the clipped walls, `found` (C, 4) are the parts (t0, 1 / r0, t1, 1 / r1), `wall` (C,) the pieces, and `order`
-    sorts them by t0. `active` are the walls at a t, and `edge` the sorted ends.
+    `found` (C, 4) are the parts (t0, 1 / r0, t1, 1 / r1) of the clipped walls, `wall` (C,) the pieces; `order` sorts
+    them by t0. `active` are the walls at a t, `edge` the sorted ends.
     """
 
     found: Floats
@@ -76,10 +76,10 @@ def _clip(beam, wall, reflected):
 
 @njit(cache=True)
 def clip_nearest(plan, beam, own, scratch):
-    """Clip the walls in a beam, from its window outwards, until they hide everything else; return their number.
+    """Clip the walls in a beam, from its window outwards, until they fill the view; return their number.
 
-    Cells of the index are visited in strips across the beam. Other cells are beyond all strips, so that walls that fill
-    the view within the strips hide them.
+    Cells of the index are visited in strips across the beam. Walls that fill the view within the strips hide all
+    others.
     """
     x0, y0, edge, columns, rows = plan.cells.grid
     x1, y1 = x0 + columns * edge, y0 + rows * edge
@@ -102,7 +102,7 @@ def clip_nearest(plan, beam, own, scratch):
 
 @njit(cache=True)
 def _leaves(corner, low, high, axis, first, second):
-    """Return whether the near side of a strip is beyond [low, high] along one axis and its beam runs on outwards."""
+    """Return whether the near side of a strip is beyond [low, high] along one axis, running outwards."""
     return (min(corner[0, axis], corner[1, axis]) > high and min(first, second) >= 0.0) or (
         max(corner[0, axis], corner[1, axis]) < low and max(first, second) <= 0.0
     )
@@ -110,7 +110,6 @@ def _leaves(corner, low, high, axis, first, second):
 
 @njit(cache=True)
 def clip_cells(plan, beam, own, corner, count, scratch):
-    """Clip the walls in the cells of a strip that were not clipped before; return the number of all clipped walls."""
     visit = scratch.visit[-1]
     first, last = rows_in(corner, plan.cells)
     for row in range(first, last):
@@ -138,7 +137,6 @@ def clip_cells(plan, beam, own, corner, count, scratch):
 
 @njit(cache=True)
 def rows_in(corner, bins):
-    """Return the range of rows of square bins that a quadrilateral reaches."""
     y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
     low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
     high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
@@ -147,7 +145,6 @@ def rows_in(corner, bins):
 
 @njit(cache=True)
 def entries_in(corner, bins, row):
-    """Return the range of entries of the bins of a row that a convex quadrilateral reaches."""
     x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
     left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
     if left > right:
@@ -229,7 +226,7 @@ def reflect(beam, piece, wall, child):
 
 @njit(cache=True)
 def cone_of(beam, reflected, grid, rows):
-    """Return the corners (4, 2) of a beam from its window, or its source if it is a root, to beyond a grid."""
+    """Return the corners (4, 2) of a beam from its window, or the source of a root, to beyond a grid."""
     x0, y0, x1, y1 = grid[0], grid[1], grid[0] + grid[3] * grid[2], grid[1] + rows * grid[2]
     far = np.hypot(max(abs(beam[0] - x0), abs(beam[0] - x1)), max(abs(beam[1] - y0), abs(beam[1] - y1)))
     corner = np.empty((4, 2))
@@ -244,7 +241,7 @@ def cone_of(beam, reflected, grid, rows):
 
 @njit(cache=True)
 def corners_of(beam, reflected, piece):
-    """Return the corners (4, 2) of a beam between its window and one piece of its view, cut off where it is far."""
+    """Return the corners (4, 2) of a beam between its window and one piece of its view, cut off far away."""
     sx, sy = beam[0], beam[1]
     corner = np.empty((4, 2))
     for k in range(2):

@@ -4,7 +4,7 @@ An edge is a point in the plan. A candidate joins a path from the transmitter to
 receiver. On a vertical edge Keller's cone keeps the slope of a path, so that heights unfold along the whole path.
 
 Between opaque walls, beams find pairs of edges and receivers with few reflections; through walls, straight lines join
-all edges and receivers. Arrivals, bounds and writing are shared.
+all edges and receivers.
 """
 
 from collections.abc import Iterator
@@ -56,22 +56,22 @@ MAX_REFLECTIONS = 2
 """Largest number of reflections around the diffraction, floor and ceiling included."""
 
 _EXTERIOR_M = 1e-5
-"""Distance from the plane of a face [m] at which the path solver counts a point as outside a wedge."""
+"""Distance from a face [m] at which the path solver counts a point as outside a wedge."""
 
 _NEAR_M = 1e-3
-"""Shortest leg in the plan next to an edge [m]: walls that meet there do not reflect it."""
+"""Shortest leg next to an edge [m]: walls that meet there do not reflect it."""
 
 _ASIDE_M = 1e-3
 """Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
 _NEGLIGIBLE = 3e-6
-"""Rough bound of diffracted paths, relative to the reflected ones of a link, below which none is listed."""
+"""Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
 
 _FLAT_RAD = 1e-3
 """Smallest angle between walls and a straight line at an edge [rad]."""
 
 _EDGES_AT_ONCE = 32
-"""Number of edges whose beams are in memory together; fixed, as the order of candidates depends on it."""
+"""Number of edges whose beams are in memory together; the order of candidates depends on it."""
 
 _VARIANTS = 4
 """Variants of paths through walls: at most one reflection at floor or ceiling."""
@@ -81,11 +81,11 @@ class _Arrivals(NamedTuple):
     """J paths from the transmitter to edges, ordered by edge.
 
     `start` (E + 1,) is the first path of each edge, `edge` (J,) the edge, `reflections` (J,) their number, `length_m`
-    (J,) the length in the plan, `walls` (J, R) and `points` (J, R, 3) the reflections as in `unfold`, `material` (J, R)
-    and `cosine` (J, R) of these walls and angles of incidence, `angle` (J, 4) the direction of arrival as in
-    `wedge_angle`, `faces` (J, 2) the cosines of incidence at 0-face and n-face, -1 in the shadow, `lit` (J,) True where
-    the 0-face is lit. `toward` (J, 2) are horizontal unit vectors of departure, `gain` (J,) the largest gain of the
-    antenna there. Walls leave the fraction `left` (J,) of the power; `crossed` (J,) is their number.
+    (J,) the length in the plan, `walls` (J, R) and `points` (J, R, 3) are as in `unfold`, `material` and `cosine` (J,
+    R) of these walls and angles of incidence, `angle` (J, 4) the direction of arrival as in `wedge_angle`, `faces` (J,
+    2) the cosines of incidence at 0-face and n-face, -1 in the shadow, `lit` (J,) True where the 0-face is lit.
+    `toward` (J, 2) are horizontal unit vectors of departure, `gain` (J,) the largest gain there. `crossed` (J,) walls
+    leave the fraction `left` (J,) of the power.
     """
 
     start: NDArray[np.int64]
@@ -108,8 +108,8 @@ class _Arrivals(NamedTuple):
 class _Edges(NamedTuple):
     """Edges in the plan: positions (E, 2) [m], direction of the 0-face and exterior angle [rad], normals (E, 4).
 
-    `utd` (E, 5) are the `wedge_constants`, `material` (E, 2) is for both faces where the 0-face is lit, and where it is
-    not: for Sionna RT an edge has one shape.
+    `utd` (E, 5) are the `wedge_constants`, `material` (E, 2) is for a lit and for an unlit 0-face: for Sionna RT an
+    edge has one shape.
     """
 
     position_m: Floats
@@ -130,10 +130,7 @@ class _Edges(NamedTuple):
 
 
 class _EdgeTask(NamedTuple):
-    """Beams from a group of edges, their pairs with receivers, all edges, arrivals there, and the building.
-
-    `reflections` is the largest number of reflections of a path.
-    """
+    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path."""
 
     tree: BeamTree
     pairs: NDArray[np.int32]
@@ -147,9 +144,8 @@ class _EdgeTask(NamedTuple):
 class _Pair(NamedTuple):
     """Numbers of a pair of a beam from an edge and a receiver, of the edge, and of the receiver.
 
-    `left` is the number of further reflections allowed, `after` the number of reflections at walls after the edge,
-    `onward_m` the length of this leg, `departure` its direction as in `wedge_angle`; `utd` and `material` as in
-    `_Edges`.
+    `left` is the number of further reflections allowed, `after` the number of walls that reflect after the edge,
+    `onward_m` this leg's length, `departure` its direction as in `wedge_angle`; `utd` and `material` as in `_Edges`.
     """
 
     number: np.int32
@@ -164,7 +160,7 @@ class _Pair(NamedTuple):
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
-    """Find the vertical edges of the walls that diffract, with or without those where observation ended."""
+    """Find the vertical edges that diffract, with or without those where observation ended."""
     vertex = geometry.segments.ravel()
     away = geometry.vertices_m[geometry.segments[:, ::-1].ravel()] - geometry.vertices_m[vertex]
     angle = np.arctan2(away[:, 1], away[:, 0])
@@ -196,7 +192,6 @@ class _EdgeCandidates:
         self._edges = _Edges.of(wedges, building.room.wall_material)
 
     def _arrivals(self, tree: BeamTree, pairs: NDArray[np.int32], reflections: int) -> _Arrivals:
-        """Keep the pairs (beam, edge) that reach an edge from outside its wedge, with at most so many reflections."""
         pairs = pairs[np.argsort(pairs[:, 1], kind="stable")]
         trail = trail_of(self._geometry.plan)
         good, *columns = _unfold_all(tree, pairs, self._edges, self._building, max(1, reflections), trail)
@@ -233,7 +228,6 @@ class DiffractionCandidates(_EdgeCandidates):
         self._walls_a_side = min(walls_a_side, self._reflections)
 
     def listed(self, found: Floats) -> Iterator[Listed]:
-        """List the candidates over some edges at a time; those far below the power `found` (N,) are negligible."""
         if self._reflections < 0 or not len(self._wedges.edge_m):
             return
         plan, room, edges = self._geometry.plan, self._building.room, self._edges
@@ -262,7 +256,7 @@ class DiffractionCandidates(_EdgeCandidates):
 
 
 class CrossedEdgeCandidates(_EdgeCandidates):
-    """All paths over one vertical edge, through a wall at least, without reflections at walls."""
+    """All paths over one vertical edge, through at least one wall, without reflections at walls."""
 
     name = "diffractions through walls"
 
@@ -307,7 +301,7 @@ def _shortest_leg_m(building):
 
 @njit(cache=True)
 def _unfold_all(tree, pairs, edges, building, reflections, trail):
-    """Return whether each path reaches an edge from outside its wedge, and the columns of `_Arrivals`."""
+    """Return which paths reach an edge from outside its wedge, and the columns of `_Arrivals`."""
     size, room, shortest_m = len(pairs), building.room, _shortest_leg_m(building)
     good, count, crossed = np.zeros(size, np.bool_), np.zeros(size, np.int64), np.zeros(size, np.int64)
     length, walls = np.zeros(size), np.zeros((size, reflections), np.int64)
@@ -347,7 +341,7 @@ def _unfold_all(tree, pairs, edges, building, reflections, trail):
 
 @njit(cache=True)
 def _leg_power(trail, count, building):
-    """Return a bound of the power after the walls of a leg, as if it were horizontal, for any polarisation."""
+    """Return a bound of the power after a leg's walls, as if it were horizontal, for any polarisation."""
     power, table = 1.0, building.materials.transmission
     for k in range(count):
         if not (trail.same_wall[k] or building.plan.low[trail.surface[k]]):
@@ -357,7 +351,6 @@ def _leg_power(trail, count, building):
 
 @njit(cache=True)
 def _to_edge(building, origin, length, total, trail):
-    """Write the walls on a line from the transmitter to an edge; return the numbers of entries and of walls."""
     part, tx_m = 1.0 - _ASIDE_M / length, building.room.tx_m
     x, y = tx_m[0] + part * (origin[0] - tx_m[0]), tx_m[1] + part * (origin[1] - tx_m[1])
     leg = Leg((tx_m[0], tx_m[1]), (x, y), np.int64(-1), np.int64(-1), 0.0, part * length / total)
@@ -375,7 +368,7 @@ def _from_edge(building, origin, target, length, total, count, trail):
 
 @njit(cache=True)
 def _outside(normals, x, y):
-    """Return whether a point, relative to the edge, is in front of the 0-face of a wedge, and of either face."""
+    """Return whether a point, relative to the edge, is in front of the 0-face, and of either face."""
     first = normals[0] * x + normals[1] * y > _EXTERIOR_M
     return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
 
@@ -398,9 +391,9 @@ def _media(building):
 def _strength(media, arrived, face, after, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
-    `arrived` and `after` are materials, cosines and number of reflections. `face` is the material of the edge with the
-    cosines of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical parts of the direction, and the
-    number of reflections at floor and ceiling.
+    `arrived` and `after` are materials, cosines and number of reflections, `face` the edge's material and the cosines
+    of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical parts of the direction, and the number of
+    reflections at floor and ceiling.
     """
     (tables, largest, flat, _), (boundary, sine, slope, bounces) = media, path
     material, cosine, j, count = arrived
@@ -416,7 +409,7 @@ def _strength(media, arrived, face, after, terms, path):
 
 @njit(cache=True, nogil=True)
 def _list_joined(task, negligible, trail):
-    """Join arrivals at edges and departures from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
+    """Join paths to edges and from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
 
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
     references at every access, on all cores.
@@ -462,7 +455,7 @@ def _heights(room, size):
 
 @njit(cache=True)
 def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):
-    """Add all paths of a pair, one for each arrival and variant; return the unlisted power.
+    """Add all paths of a pair; return the unlisted power.
 
     Paths with a rough bound below `negligible`, which takes `most`, are not listed.
     """
@@ -511,14 +504,13 @@ def _constants(edges, edge):
 
 @njit(cache=True)
 def _spread(wavelength, length, onward):
-    """Return the spread of the power over an edge, to be divided by the length of the path, and 2 k L."""
+    """Return the spread of the power over an edge, to be divided by the path length, and 2 k L."""
     spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
     return spread, 4.0 * np.pi / wavelength * length * onward / (length + onward)
 
 
 @njit(cache=True)
 def _most_of_arrivals(largest, arrivals, material, highest):
-    """Return bounds (J, 3) of fields that arrive at edges, and of reflections at the two faces there."""
     most, one = np.empty((len(arrivals.lit), 3)), np.int64(1)
     for edge in range(len(arrivals.start) - 1):
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
@@ -592,7 +584,6 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):
 
 @njit(cache=True, nogil=True)
 def _write_joined(tree, edges, arrivals, chosen, building, trail, size):
-    """Write chosen beams from edges, receivers, arrivals and variants (C,); paths with too short legs stay empty."""
     node, rx, arrival, variant = chosen
     paths, room, owner = empty_paths(len(rx), size), building.room, building.plan.owner
     for c in range(len(rx)):
@@ -607,7 +598,7 @@ def _write_joined(tree, edges, arrivals, chosen, building, trail, size):
 
 @njit(cache=True, forceinline=True)
 def _join(arrivals, j, origin, target, after, onward, building, trail):
-    """Write all that a whole path meets in the plan; return the number of entries, -1 if Sionna RT drops the path."""
+    """Write all that a path meets in the plan; return the number of entries, -1 if Sionna RT drops it."""
     length, count, through_walls = arrivals.length_m[j], np.int64(0), building.limits.walls > 0
     total, reflection = length + onward, np.int64(REFLECTION)
     if through_walls:

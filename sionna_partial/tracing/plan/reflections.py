@@ -1,8 +1,7 @@
 """Paths of a floor plan without diffraction: reflections between opaque walls, and paths through walls.
 
 Sequences of walls from `beams.py` are unfolded into points of reflection, with every possible number of reflections at
-floor and ceiling. Paths between opaque walls are selected by an upper bound of their power for any polarisation, paths
-through walls by the power of their Jones vector.
+floor and ceiling. They are selected by their power, as in `power.py`.
 """
 
 from collections.abc import Iterator
@@ -57,7 +56,7 @@ _VARIANTS = 6
 """Variants of paths through walls: at most two reflections at floor and ceiling."""
 
 _LISTED_AT_ONCE = 200_000
-"""Number of pairs of opaque sequence and receiver that are listed together, which bounds the memory."""
+"""Number of pairs of opaque sequence and receiver listed together, which bounds the memory."""
 
 _PAIRS_AT_ONCE = 5_000
 """Number of pairs that one thread works on at a time."""
@@ -163,7 +162,6 @@ class SpecularCandidates:
 
 @njit(cache=True, nogil=True)
 def _list_variants(tree, pairs, building, trail):
-    """List every variant of pairs between opaque walls: number of the pair, variant and bound (C,)."""
     room, largest, max_depth = building.room, building.materials.largest, building.limits.depth
     rx_m, wall_material, directed = room.rx_m, building.material, len(room.gains.table) > 1
     wavelength, pieces_m = building.materials.wavelength_m, building.plan.pieces_m
@@ -197,7 +195,7 @@ def _list_variants(tree, pairs, building, trail):
 
 @njit(cache=True)
 def _bounds(k, length, through, building, target, least, trail, possible):
-    """Mark the variants of a path that may have the power `least`; return whether there is any."""
+    """Mark the variants of a path that may have the power `least`; return whether any has."""
     room, table, some = building.room, building.materials.reflection, False
     x, y = _departure(k, building, target, trail)
     through *= gain_at_azimuth(room.gains, x, y)
@@ -221,7 +219,7 @@ def _bounds(k, length, through, building, target, least, trail, possible):
 def _pair_powers(tree, pair, through, building, needed, trail):
     """Return the power (K, V) of each variant of pairs (beam, receiver), of which walls leave at most `through` (K,).
 
-    It is 0 without a path through a wall that has the power `needed` (N,).
+    It is 0 for paths through no wall or below the power `needed` (N,).
     """
     power, possible = np.zeros((len(pair), _VARIANTS)), np.empty(_VARIANTS, np.bool_)
     for i in range(len(pair)):
@@ -298,10 +296,7 @@ class _Paths(NamedTuple):
 
 
 class CrossingCandidates:
-    """Paths of a room that go through walls, without diffraction, within `Limits`.
-
-    They have at most two reflections at floor and ceiling.
-    """
+    """Paths through walls, without diffraction, within `Limits`; at most two reflections at floor and ceiling."""
 
     name = "paths through walls"
 
@@ -326,10 +321,7 @@ class CrossingCandidates:
         yield Listed(pair[:, 1], power, partial(self._written, tree, pair, variant), 1.0)
 
     def _found(self, found: Floats) -> tuple[BeamTree, _Paths]:
-        """List all beams, and the paths that links need, by the number of their reflections.
-
-        The paths of few reflections decide how strong paths of more have to be.
-        """
+        """List all beams and the paths that links need; paths of few reflections decide how strong others must be."""
         room, limits, count = self.building.room, self.building.limits, len(found)
         receivers, reflections = bin_points(room.rx_m[:, :2]), np.array([limits.reflections])
         beams = Beams.first(room.tx_m[None, :2], reflections, room.gains.largest)

@@ -1,10 +1,9 @@
 """Surfaces of a floor plan, and all that a path between two points meets.
 
-Seen from above, a path is a sequence of straight legs between reflections at walls. A leg crosses walls, unless walls
-are opaque (`Limits.walls` is 0): then it meets nothing. The height changes linearly with the unfolded length in the
-plan, so that reflections at floor and ceiling depend on this length alone. Paths cross obstacles or run above them.
-
-The variant of a path is twice its number of reflections at floor and ceiling, plus 1 if the first is at the ceiling.
+Seen from above, a path is a sequence of straight legs between reflections at walls, which cross walls unless these are
+opaque (`Limits.walls` is 0). The height changes linearly with the unfolded length in the plan, on which alone
+reflections at floor and ceiling depend. Paths cross obstacles or run above them. The variant of a path is twice its
+number of reflections at floor and ceiling, plus 1 if the first is at the ceiling.
 """
 
 from dataclasses import dataclass, replace
@@ -24,7 +23,7 @@ from sionna_partial.tracing.select import Limits
 from sionna_partial.tracing.walls import Interior, group_faces, is_free_between
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
-"""Surfaces: none, floor, ceiling, vertical edge, and from `WALLS` on walls or entries of a trail."""
+"""Surfaces: none, floor, ceiling, vertical edge; from `WALLS` on walls or entries of a trail."""
 
 FACES = 40
 """Largest number of faces of walls that a leg may cross."""
@@ -43,8 +42,7 @@ class Room(NamedTuple):
     """Surfaces around a transmitter (3,) and receivers (N, 3), in the local frame [m].
 
     The floor is at 0, the ceiling at `height_m`; `floor` and `ceiling` are True if they reflect. `wall_material` (S,)
-    and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls, `gains` of the transmit
-    antenna.
+    and `flat_material` are indices of materials, `top_m` (S,) the heights of the walls.
     """
 
     height_m: float
@@ -74,7 +72,7 @@ class Room(NamedTuple):
 
 
 class Building(NamedTuple):
-    """A floor plan, the materials (P,) of the pieces of its walls, and all else that decides its paths."""
+    """A floor plan, the materials (P,) of the pieces of its walls, and all else that decides paths."""
 
     plan: Plan
     interior: Interior
@@ -95,7 +93,7 @@ class Building(NamedTuple):
 
 
 class Rise(NamedTuple):
-    """Heights along a path [m], unfolded: `height_m` in all, `to_first_m` to its first reflection at floor or ceiling.
+    """Heights along an unfolded path [m]: `height_m` in all, `to_first_m` to its first reflection at floor or ceiling.
 
     `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections.
     """
@@ -178,9 +176,9 @@ def gain_of_departure(room, x, y, rise, length):
 
 
 class Leg(NamedTuple):
-    """A straight leg between two points of a path [m], at fractions `done` and `stop` of its length.
+    """A straight leg of a path [m], at fractions `done` and `stop` of its length.
 
-    `own` and `other` are the pieces of walls that reflect it there, -1 for none.
+    `own` and `other` are the pieces of walls that reflect it at its ends, -1 for none.
     """
 
     start: tuple[float, float]
@@ -195,9 +193,8 @@ class Trail(NamedTuple):
     """Scratch of one path in the plan: its reflections, and all interactions in order from the transmitter.
 
     `walls` are reflecting pieces, `bounce` the points (x, y, fraction of the length) and the cosine of incidence. Of
-    all interactions, `surface` are pieces of walls, `kind` Sionna RT's number, `same_wall` marks further faces of a
-    wall that has been crossed, which cost nothing, `cosine` is the cosine of incidence, `points` (x, y, fraction of the
-    length).
+    all interactions, `surface` are pieces of walls, `points` (x, y, fraction of the length), `kind` and `same_wall` as
+    in `Candidates`.
     """
 
     walls: NDArray[np.int64]
@@ -253,7 +250,7 @@ def cross_leg(plan, interior, leg, count, trail):
 
 @njit(cache=True)
 def _faces_on(plan, leg, dx, dy, length, trail):
-    """Write the pieces that a leg crosses, in order, with fractions; return their number, -1 if too many."""
+    """Write the pieces that a leg crosses in order, with fractions; return their number, -1 if too many."""
     (ax, ay), (bx, by) = leg.start, leg.end
     x0, y0, edge, columns, rows = plan.cells.grid
     columns, rows, n = int(columns), int(rows), 0
@@ -295,7 +292,7 @@ def _faces_on(plan, leg, dx, dy, length, trail):
 
 @njit(cache=True)
 def _crossed_at(piece, ax, ay, dx, dy, length):
-    """Return the fraction of a leg at which it crosses a piece of a wall, -1 if it does not.
+    """Return the fraction of a leg at which it crosses a piece of a wall, or -1.
 
     A point on the leg's line counts as left of it, so that a line through a shared corner crosses one of its walls.
     """
@@ -316,7 +313,6 @@ def _cosine(plan, piece, dx, dy, length):
 
 @njit(cache=True)
 def _is_reflected_inside(plan, interior, leg, n, trail):
-    """Return whether the first or the last face on a leg and the wall that reflects it there are one wall."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
     length = np.hypot(dx, dy)
     for wall, face, t in ((leg.own, 0, 0.0), (leg.other, n - 1, 1.0)):
@@ -350,7 +346,6 @@ def add_entry(trail, count, piece, kind, x, y, fraction):
 
 @njit(cache=True)
 def empty_paths(count, size):
-    """Return surfaces, kinds, vertices and `same_wall` of paths (C, D), without any interaction."""
     vertices, same_wall = np.zeros((count, size, 3)), np.zeros((count, size), np.bool_)
     return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
 
@@ -379,7 +374,7 @@ def candidates_of(
     wedge: NDArray[np.int32] | None = None,
     wedges: Wedges | None = None,
 ) -> Candidates:
-    """Return paths of `write_path` as candidates; paths through walls have as many columns as the longest needs."""
+    """Return paths of `write_path` as candidates, with as many columns as needed."""
     surface, kind, vertices_m, same_wall = paths
     walls = 2 * np.arange(len(geometry.segments))
     of_surface = np.concatenate([[-1, geometry.floor_face, geometry.ceiling_face, -1], walls]).astype(np.int32)
@@ -394,8 +389,8 @@ def candidates_of(
 class Lowered:
     """Function that lowers walls on candidates, which all reach the ceiling, to obstacles.
 
-    `walls_m` (S, 2, 2) are the walls, `corners_m` (T, 3, 2) the triangles of the tops of obstacles, `lid_m`
-    (T,) their heights and `lid_face` (T,) a face of each top in the scene.
+    `walls_m` (S, 2, 2) are the walls, `corners_m` (T, 3, 2) the triangles of the tops of obstacles, `lid_m` (T,) their
+    heights and `lid_face` (T,) a face of each in the scene.
     """
 
     building: Building
@@ -420,7 +415,7 @@ class Lowered:
         )
 
     def __call__(self, candidates: Candidates) -> Candidates:
-        """Remove walls below paths, and candidates that go through nothing then; add the tops of obstacles."""
+        """Remove walls below paths, and candidates that then cross nothing; add the tops of obstacles."""
         room, interior = self.building.room, self.building.interior
         if (room.top_m >= room.height_m).all() or not len(candidates.rx):
             return candidates
@@ -436,7 +431,7 @@ class Lowered:
 
 @njit(cache=True)
 def _lower(kind, face, vertices, same, walls, lids, ends, interior):
-    """Write the walls that candidates cross at their heights, in place; return the numbers (C,), -1 if too many."""
+    """Write the walls that candidates cross at their heights, in place; return numbers (C,), -1 if too many."""
     (tx_m, targets), (walls_m, top_m) = ends, walls
     crossings, most = np.zeros(len(kind), np.int64), kind.shape[1]
     old_kind, old_face, old = np.empty(most, np.uint8), np.empty(most, np.int32), np.empty((most, 3))
