@@ -80,7 +80,7 @@ class NextView(Shown):
     position_m : (2,) float64 array
         World x and y [m], in a free cell.
     heading_deg : float
-        Direction of the view, from x towards y [degree].
+        From x towards y [degree].
     path_length_m : float
         Length of the shortest safe path from the start [m].
     gain : float
@@ -89,7 +89,7 @@ class NextView(Shown):
     gain_per_m : float
         `gain` per metre driven, with 1.25 m added to the path. Views are ranked by it.
     path_m : (K, 2) float64 array
-        The path, from the start to the pose [m].
+        From the start to the pose [m].
     frontier_m : (F, 2) float64 array
         Centres of the free cells of the frontier [m].
 
@@ -203,8 +203,8 @@ def next_views(
     """Rank poses by the expected decrease of the uncertainty of a coverage map per metre driven.
 
     Poses are in the middle of frontiers and face the largest unknown area. A view of a fraction of the unobserved part
-    of a link's direct line is expected to lower the uncertainty of that link by that fraction. Unknown cells count as
-    free. Unknown pockets that no robot fits into are ignored.
+    of a link's direct line is expected to lower its uncertainty by that fraction. Unknown cells count as free; unknown
+    pockets that no robot fits into are ignored.
 
     Parameters
     ----------
@@ -216,8 +216,7 @@ def next_views(
     measurements : Measurements, mapping, data frame or path, optional
         Measured gains, as for `predict_map`.
     goal : {"coverage", "state", "area"}
-        Quantity to learn: whether the path gain exceeds the threshold, the link state, or the map alone, without
-        prediction.
+        Learn whether the path gain exceeds the threshold, the link state, or the map alone, without prediction.
     count : int
         Largest number of poses.
     start : (2,) array-like, optional
@@ -225,14 +224,8 @@ def next_views(
     threshold_db : float
         Path gain above which a receiver is covered [dB].
     sensor : SensorSettings, optional
-        Sensor of the robot.
     predictor, scene_settings, trace_settings, progress
         As for `predict_map`.
-
-    Returns
-    -------
-    NextViews
-        At most `count` poses, the best first.
 
     Raises
     ------

@@ -100,7 +100,6 @@ class LiveGrid(NamedTuple):
     Parameters
     ----------
     name : str
-        Name of the transmitter.
     map_number : int
         Number of the map, from 1.
     is_final : bool
@@ -135,7 +134,7 @@ class LiveGrid(NamedTuple):
 
 
 class LiveViews(NamedTuple):
-    """Best next views on one map."""
+    """Next views on one map."""
 
     views: NextViews
     header: dict[str, Any]
@@ -147,8 +146,6 @@ class LiveViews(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A checked OccupancyGrid."""
-
     percent: NDArray[np.integer[Any]]
     resolution_m: float
     origin: tuple[float, float, float]
@@ -160,7 +157,6 @@ class _Grid:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return the key that tells maps apart."""
         return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
 
     @property
@@ -223,8 +219,8 @@ def _refusing(method: Callable[..., None]) -> Callable[..., None]:
 class LiveCoverage:
     """Coverage of the newest map of a robot, for any transport.
 
-    Any thread may pass messages; while one map is computed, newer ones replace each other. `start` computes in a
-    thread, `step` in the calling one. Refused messages are logged.
+    Any thread may pass messages; newer maps replace each other while one is computed. `start` computes in a thread,
+    `step` in the calling one. Refused messages are logged.
 
     Parameters
     ----------

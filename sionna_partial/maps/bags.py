@@ -157,16 +157,10 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
     Parameters
     ----------
     path : path-like
-        The recording.
     topic : str or None
         A topic of `nav_msgs/OccupancyGrid`; by default `/map`, or the only one.
     time_s : float or None
         Seconds since the start of the recording: the last map up to then, by default the last of all.
-
-    Returns
-    -------
-    PartialMap
-        See `map_from_occupancy`.
 
     Raises
     ------
@@ -222,10 +216,6 @@ def map_from_occupancy(
     occupied_percent, free_percent : float or None
         From the first value a cell is wall; up to the second it is free. By default 65 and 25, as in nav2's map_saver,
         or, for continuous values as of Cartographer, one fitted threshold, with a `MapWarning`.
-
-    Returns
-    -------
-    PartialMap
 
     Raises
     ------

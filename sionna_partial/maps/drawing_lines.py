@@ -133,7 +133,7 @@ def opened(content: bytes) -> Any:
 class DrawnLines:
     """Lines of a drawing by layer. Each block is read once.
 
-    `counts` is the number of entities by layer (in lower case) and type, including blocks, whose entities on layer 0
+    `counts` has the numbers of entities by layer (in lower case) and type, including blocks, whose entities on layer 0
     take the layer of the INSERT. `names` are the layers as written.
     """
 

@@ -71,25 +71,25 @@ def map_from_drawing(
     """Make a map from a DXF floor plan.
 
     Walls are lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space, also in
-    blocks, and enclosed areas at most 0.5 m wide: walls drawn by both faces are solid. Other enclosed areas, doors
-    included, are free; openings of up to 2 m in outer walls count as closed for that. All other cells are unknown.
+    blocks. Enclosed areas up to 0.5 m wide are solid walls drawn by both faces; others, doors included, are free, and
+    openings of up to 2 m in outer walls count as closed for that. All other cells are unknown.
 
     Parameters
     ----------
     path : path-like
-        The drawing (DXF, text or binary).
+        DXF, text or binary.
     wall_layers : sequence of str or None
-        Layers with the walls, with wildcards `*` and `?`. By default visible layers with names of walls, columns or
-        windows, in European languages or the AIA/NCS standard, except demolished ones. Without such layers, all visible
+        Layers with the walls, with wildcards `*` and `?`. By default visible layers named as walls, columns or
+        windows, in European languages or the AIA/NCS standard, except demolished ones. Without any, all visible
         ones; if they enclose hardly any area, also the layer that closes most rooms: both raise a `MapWarning`.
     layer_materials : mapping of str to Material or str, or None
-        Materials of the walls on layers, with wildcards. The last layer wins.
+        Materials of the walls on layers, with wildcards; the last layer wins.
     layer_heights_m : mapping of str to float, or None
         Heights of the walls on layers [m], with wildcards. By default walls reach the ceiling, with a `MapWarning` for
         layers whose names mean a partial height.
     unit_m : float or None
-        Length of a unit of the drawing [m], 0.001 for millimetres. By default the unit of its `$INSUNITS`, or another
-        one, with a `MapWarning`, if extent, doors, walls and texts fit only that.
+        Length of a unit of the drawing [m]. By default the unit of its `$INSUNITS`, or another one, with a
+        `MapWarning`, if extent, doors, walls and texts fit only that.
     resolution_m : float
         Edge of a cell [m].
     wall_height_m : float
@@ -98,7 +98,7 @@ def map_from_drawing(
     Returns
     -------
     PartialMap
-        Its `import_report` lists the unit, and the layers that were read and skipped.
+        Its `import_report` lists the unit and the layers read and skipped.
 
     Raises
     ------
@@ -200,7 +200,6 @@ class _Plan(NamedTuple):
         return found
 
     def segments(self, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
-        """Return pieces of lines on some layers as `DrawnLines.segments`, or raise a MapError."""
         segments, on_layer = self.lines.segments(layers)
         if not len(segments):
             remedy = f"name layers with lines as wall_layers; it has {self.listed()}."
@@ -368,10 +367,10 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
 
 
 def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
-    """Read a floor plan from a picture with dark walls on a bright ground, or the inverse.
+    """Read a floor plan from a picture with dark walls on bright ground, or the inverse.
 
-    `resolution_m` is the edge of a pixel [m], `threshold` the largest shade of walls in `wall_shades`, by default
-    Otsu's. The origin is the lower-left corner of the picture.
+    `resolution_m` is the edge of a pixel, `threshold` the largest shade of walls in `wall_shades`, by default
+    Otsu's. The origin is the lower-left corner.
     """
     if resolution_m is None:
         raise bare_image(path)

@@ -1,7 +1,7 @@
 """Contents of a map: walls extruded from its cells (`FloorPlan`), or triangles (`SceneMesh`).
 
-`PartialMap.environment` selects one. Another kind, such as voxels, needs a class like these, a writer in
-`scene.write_map`, and a path finder in `tracing/finder.py`.
+Another kind, such as voxels, needs a class like these, a writer in `scene.write_map`, and a path finder in
+`tracing/finder.py`.
 """
 
 import json
@@ -46,15 +46,15 @@ FAR_M = 1000.0
 class SceneMesh(Shown):
     """Triangles in world axes (x right, y up, z up), in metres; none where nothing has been observed.
 
-    Triangles are sorted by material, vertices by their first use. Degenerate triangles and unused vertices are
-    dropped. Arrays are read-only.
+    Triangles are sorted by material, vertices by first use; degenerate triangles and unused vertices are dropped.
+    Arrays are read-only.
 
     Parameters
     ----------
     vertices_m : (V, 3) float64 array
-        Corners [m]; adjacent triangles share them.
+        Corners [m], shared by adjacent triangles.
     triangles : (F, 3) int64 array
-        Indices into `vertices_m`, at most `MAX_TRIANGLES` triangles.
+        Indices into `vertices_m`; at most `MAX_TRIANGLES` rows.
     material : (F,) uint8 array
         Index into `materials` of every triangle.
     materials : tuple of Material or None
@@ -125,7 +125,7 @@ class SceneMesh(Shown):
     def within(self, area: Any) -> "SceneMesh":
         """Cut the mesh at the border of an area (shapely, world x and y [m]) seen from above.
 
-        Triangles inside, and walls on the border, are kept. Triangles that shared edges still do: an edge gets the cut
+        Triangles inside, and walls on the border, are kept. Shared edges stay shared: an edge gets the cut
         points of its neighbours. Cut points within `SEAM_M` of each other or of a vertex are merged.
         """
         whole, pieces, source = cut_triangles(self.corners_m, area)
@@ -264,8 +264,8 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
 class FloorPlan:
     """Walls from floor to ceiling in all wall cells of a map.
 
-    `is_extruded`: the cells show the walls at any height. `suffixes`: possible suffixes of map files, the usual one
-    first. `receivers_at_once`: number of receivers whose paths are found at once, which bounds the memory.
+    `is_extruded`: the cells show the walls at any height. `suffixes`: suffixes of map files, the usual one first.
+    `receivers_at_once`: receivers whose paths are found at once, which bounds the memory.
     """
 
     wall_height_m: float

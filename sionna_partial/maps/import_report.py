@@ -117,28 +117,27 @@ class ImportSource:
 
 @dataclass(frozen=True)
 class ImportReport(ImportSource, Shown):
-    """Report of a map that was read from a file; size, rooms and doors are computed from the cells of the map.
+    """Report of a map that was read from a file; size, rooms and doors follow from its cells.
 
     Parameters
     ----------
     file : str
-        Path of the file.
+        Its path.
     unit_m : float
         Length of a unit of the file [m].
     unit_source : str
-        Source of the unit: a header, an option, the file format, or a guess.
+        A header, an option, the file format, or a guess.
     used, skipped : tuple of Elements
         Elements of the file.
     notes : tuple of str
-        Further decisions of the reader.
+        Further decisions.
     extent_m : (float, float)
         Extent of the known cells along x and y [m].
     rooms : int
-        Number of rooms.
     free_area_m2 : float
         Area of the free cells [m^2].
     door_widths_m : tuple of float
-        Widths of the openings between rooms, to a cell [m], one for each joined room.
+        Widths of the openings between rooms, to a cell [m].
     """
 
     extent_m: tuple[float, float] = (0.0, 0.0)
@@ -169,7 +168,7 @@ class ImportReport(ImportSource, Shown):
         return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
 
     def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
-        """Yield implausible results with their remedies; checks without a remedy are skipped."""
+        """Yield implausible results with their remedies; an empty remedy skips its check."""
         (x, y), widths = self.extent_m, self.door_widths_m
         if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
             yield f"spans {x:.4g} x {y:.4g} m, with {self._unit}: {size}"
@@ -200,10 +199,7 @@ class ImportNotes:
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
-        """Return a PartialMap with its report, and warn of implausible results.
-
-        `size`, `doors` and `area` are remedies; a check without a remedy is skipped.
-        """
+        """Return a PartialMap with its report, and warn of implausible results, as `ImportReport.faults`."""
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
         source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))

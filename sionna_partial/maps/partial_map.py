@@ -70,7 +70,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     resolution_m : float
         Edge of a cell [m], between 1 mm and 10 m.
     origin_m : (float, float)
-        World x and y of the lower-left corner of the lower-left cell [m].
+        World x and y of the lower-left corner of the grid [m].
     wall_height_m : float
         Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
@@ -80,13 +80,13 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     material : Material or None
         Material of walls, floor and ceiling, or of unnamed parts of the mesh; None is the material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
-        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Not for meshes.
-        See `with_wall_material`.
+        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material` (see `with_wall_material`). Not for
+        meshes.
     wall_materials : tuple of Material
         At most 255.
     obstacle : (ny, nx) uint8 array or None
-        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls.
-        Not for meshes. See `with_obstacle_height`.
+        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls (see
+        `with_obstacle_height`). Not for meshes.
     obstacle_heights_m : tuple of float
         At most 255 [m].
     room : (ny, nx) uint8 array or None
@@ -94,7 +94,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     room_names : tuple of str
         At most 255 names, such as the segments of a vacuum robot's map.
     import_source : ImportSource or None
-        Facts about the source file, for `import_report`. Equality ignores it.
+        Facts about the source file, for `import_report`; ignored by equality.
 
     Raises
     ------
@@ -199,7 +199,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Parameters
         ----------
         material : Material or str
-            The material, or its name for `Material.named`.
+            The material, or a name for `Material.named`.
         where : (ny, nx) bool array, (M, 2) array-like, or shapely geometry
             Cells, or a polygon or geometry in world x and y [m] that contains the centres of cells.
 
@@ -229,7 +229,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Parameters
         ----------
         height_m : float
-            Height of their tops [m]; from `wall_height_m` on they are walls.
+            Height of their tops [m]; from `wall_height_m` on they are full walls.
         where : (ny, nx) bool array, (M, 2) array-like, shapely geometry or None
             The area as in `with_wall_material`. None selects free-standing walls: pieces within 2.5 m along x and y
             with only free cells around them, pillars included.
@@ -280,7 +280,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns (ny, nx)."""
+        """Rows and columns (ny, nx)."""
         ny, nx = self.state.shape
         return ny, nx
 
@@ -304,14 +304,14 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def import_report(self) -> ImportReport | None:
-        """Report of the source file: unit, extent, rooms, doors, elements used and skipped. None without a file."""
+        """Report of the source file, None without one."""
         return None if self.import_source is None else report_of(self.import_source, self.state, self.resolution_m)
 
     @cached_property
     def is_complete(self) -> bool:
         """True if no free cell touches an unknown one by an edge; False without free cells.
 
-        The space beyond the grid is unknown: free cells at its border make a map incomplete.
+        The space beyond the grid is unknown.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
 
@@ -395,9 +395,9 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
-        """Heights up to which walls reach [m], and a map with the walls of that height, full walls first.
+        """Heights up to which walls reach [m], and maps with the walls of that height, full walls first.
 
-        The first map has infinite height, and free cells instead of obstacles and the areas that they enclose.
+        The first height is infinite; its map has free cells instead of obstacles and the areas that they enclose.
         """
         if self.obstacle is None:
             return ((math.inf, self),)
@@ -422,7 +422,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
 
-        Messages contain the argument `name` and the `names` of positions, if given.
+        Messages contain the argument's `name` and the `names` of positions.
 
         Raises
         ------
@@ -547,7 +547,7 @@ def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
-    """Return unknown cells, as in furniture and pillars, of enclosed regions without a square of `POCKET_M`."""
+    """Return unknown cells of enclosed regions without a square of `POCKET_M`, as in furniture and pillars."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     size = max(1, math.ceil(POCKET_M / resolution_m - 1e-6))
     regions, count = ndimage.label(unknown, np.ones((3, 3), dtype=bool))
@@ -636,7 +636,7 @@ def _checked_state(values: ArrayLike) -> States:
 
 
 def free_standing(state: States, resolution_m: float) -> Bools:
-    """Return free-standing wall cells (ny, nx): pieces within `FREE_STANDING_M`, with free cells around.
+    """Return free-standing wall cells (ny, nx), as `PartialMap.with_obstacle_height`.
 
     Unknown cells that only walls touch belong to them.
     """

@@ -193,7 +193,7 @@ def _layer(
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
     """Write a map as `path` (YAML) and a PGM image of the same stem.
 
-    The YAML of a map with a mesh completes the exported scene beside it.
+    With a mesh, the YAML completes the exported scene beside it.
     """
     sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
     if partial.interior_cells is not None:
@@ -309,9 +309,9 @@ def fitted_threshold(
 ) -> float | None:
     """Return the occupancy that separates free cells and walls in a map of continuous values, else None.
 
-    Such a map, as of Cartographer, has many different values between the thresholds. The result is in the valley of the
+    Such a map, as of Cartographer, has many values between the thresholds. The result is in the valley of the
     histogram (V,), between two well separated distributions with means below and above 50 percent. An empty remedy
-    keeps the thresholds, which the caller chose.
+    keeps the caller's thresholds.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
     inside = int(count[between].sum())
@@ -535,7 +535,7 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
 def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict: bool) -> States | None:
     """Return the states of a map of continuous values, with fitted thresholds; None for any other map.
 
-    Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than its neighbours.
+    Transparent pixels are unknown, and the shade 205, 127 or 128 if far more frequent than its neighbours.
     """
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
@@ -593,7 +593,7 @@ def _keep_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Keep transparent pixels and the shade 205 unknown, in place.
 
     With a free_thresh above 0.196 (older nav2 wrote 0.25), or an alpha channel, 205 reads as free. It stays unknown
-    where more cells would be lost that way than would be unknown.
+    where reading it as free would lose more cells than would be unknown.
     """
     shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)

@@ -35,8 +35,7 @@ _ROUGH, _DEEP = 0.05, 0.3
 
 _RAGGED = 0.006, 0.012
 """Fractions of ragged edges from which depth is a sign of noise, in part and in full.
-
-Plans have less than 0.001, and up to 0.01 where tilted; lidars with range noise have 0.007 to 0.1.
+Plans have less than 0.001 (0.01 where tilted); lidars with range noise have 0.007 to 0.1.
 """
 
 _DEPTH_M = 0.0125
@@ -65,9 +64,9 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) for outlines.
 
-    `peeled` (ny, nx) were removed from walls two cells thick: the outline is between both layers. `noise` is 0 for
-    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of thick
-    walls.
+    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `noise` is 0 for
+    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of
+    thick walls.
     """
 
     cells: Bools
@@ -79,7 +78,7 @@ class CleanWalls(NamedTuple):
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
     """Clean the wall cells of a map with states (ny, nx).
 
-    Enclosed pinholes are filled, notches and bumps of one by at most two cells are levelled, and gaps in seen walls are
+    Enclosed pinholes are filled, notches and bumps of one by at most two cells levelled, and gaps in seen walls
     closed: of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to `MAX_FREE_GAP_M`. Of walls seen
     from FREE cells only the cells beside these, and inner corners of deep walls, are kept. Walls two cells thick are
     thinned.
@@ -128,8 +127,7 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     """Return the noise of `CleanWalls`.
 
-    Exact rays mark one layer of cells with smooth faces, noisy ones several with rough faces. Walls of plans are thick,
-    but smooth.
+    Exact rays mark one layer of cells, noisy ones several with rough faces. Walls of plans are thick, but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
@@ -169,7 +167,7 @@ def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
-    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones. The shortest line between the pieces closes it,
+    A gap is a row of at most `longest` such cells beside FREE ones. The shortest line between the pieces closes it,
     or the row itself where rays passed that line.
     """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
@@ -292,8 +290,7 @@ def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Float
     variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
     ragged runs if that moves their ends by at most half a cell.
 
-    Returns the index of the first corner of every run (r,), and a point x, y on and the direction x, y of its line (r,
-    4).
+    Returns the first corner of every run (r,), and a point x, y and the direction x, y of its line (r, 4).
     """
     upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
     tolerance = tolerance + 1e-6

@@ -438,15 +438,14 @@ def _fitting(log_evidence: Floats, candidates: int) -> Floats:
 class Assimilation(Shown):
     """Posterior of the links to other receivers, given measurements of one transmitter (`fit`).
 
-    The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
-    Gaussian process whose correlation decreases with the walking length between receivers. A measurement at or below
-    the sensitivity is an upper bound (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood; with a large offset, as of a real
-    radio, the predicted loss over free space is scaled, too.
+    Residuals (gain minus predicted mean, in predicted standard deviations) are a Gaussian process whose correlation
+    decreases with the walking length between receivers. A measurement at or below the sensitivity is an upper bound
+    (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine Learning, sections 3.6 and 3.9).
+    Noise and common offset maximise the likelihood; with a large offset, as of a real radio, the predicted loss over
+    free space is scaled, too.
 
-    Through walls of an unknown material there is one process per candidate, weighted by its evidence and that of other
+    Through walls of an unknown material there is one process per candidate, weighted by its evidence, also from other
     transmitters.
-
 
     Examples
     --------
@@ -466,7 +465,7 @@ class Assimilation(Shown):
     """Standard deviation of the measurements, given noise and fading [dB]."""
 
     offset_db: float
-    """Common offset of the measurements above the predicted gains [dB]."""
+    """Common offset of measurements above predictions [dB]."""
 
     shadow_scale: float
     """Factor on the predicted loss over free space."""
@@ -508,22 +507,16 @@ class Assimilation(Shown):
         measured : Measurements
             M links of this transmitter.
         prior : LinkPrediction
-            Prediction of these links without the measurements.
+            Prediction of these links without measurements.
         antenna_db : float or (M,) array-like
-            Gain of the transmitter's antenna, which `measured` includes and `prior` does not [dB]; `update` works
-            without it.
+            Gain of the transmitter's antenna [dB], included in `measured`, not in `prior`; `update` excludes it.
         frequency_hz : float
         p_powers : float, optional
-            Prior probability that the measurements are powers with an unknown offset, not path gains.
+            Prior probability of powers with an unknown offset instead of path gains.
         through_walls : bool
-            True for a trace through walls. The measurements are then from a real radio: the loss of walls is inferred,
-            and no trace is certain.
+            True for a trace through walls, of a real radio: the loss of walls is inferred, and no trace is certain.
         others : sequence of Assimilation
             Fits to other transmitters of the building through walls, which inform losses and offsets.
-
-        Returns
-        -------
-        Assimilation
 
         Raises
         ------
@@ -595,11 +588,7 @@ class Assimilation(Shown):
         rx_m : (N, 3) array-like
             Receivers [m].
         prior : LinkPrediction
-            Prediction of these links without the measurements.
-
-        Returns
-        -------
-        LinkPrediction
+            Prediction of these links without measurements.
 
         Raises
         ------

@@ -85,9 +85,9 @@ class Measurements(Shown):
     gain_db : (N,) float64 array
         Omnidirectional path gain [dB], negative; -150 is an outage.
     std_db : (N,) float64 array, optional
-        Standard deviation of each gain, or one for all [dB], at least 0.1; estimated if not given.
+        Standard deviation of each gain, or one for all [dB], at least 0.1; by default estimated.
     sensitivity_db : float
-        Sensitivity of the receiver [dB]: a gain at or below it is an upper bound.
+        Of the receiver [dB]: a gain at or below it is an upper bound.
 
     Raises
     ------
@@ -180,10 +180,6 @@ def measurements_of(source: Any) -> Measurements:
         `tx_z`, `rx_x`, ... (N,), as in a CSV with a header; heights are 1.5 m by default. Cells of a data frame may
         hold x, y, z. `std_db` (N,), `sensitivity_db` and `tx` are optional.
 
-    Returns
-    -------
-    Measurements
-
     Raises
     ------
     MeasurementError
@@ -221,24 +217,20 @@ def load_measurements(
     Parameters
     ----------
     path : path-like
-        A CSV with a header has the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db
-        [dB]; power_dbm, rssi or rsrp are received powers, instead of gain_db. Missing heights are 1.5 m. A recording
-        (.vwm) has mean received powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same
-        file; transmitters are unknown.
+        A CSV with a header: columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db [dB], or
+        power_dbm, rssi or rsrp for received powers. Missing heights are 1.5 m. A recording (.vwm) has mean received
+        powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same file; transmitters are
+        unknown.
     columns : mapping, optional
         Headers of these columns in the file, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db
         without the word "gain" is a received power.
     tx : (3,) array-like, optional
         Transmitter of all links [m], instead of the columns.
     tx_power_dbm : float
-        Received power without path loss [dBm], subtracted from received powers, never from gain_db. Leave it out if
-        unknown: `predict_map` and `calibrate_materials` estimate a common offset.
+        Received power without path loss [dBm], subtracted from received powers only. Leave it out if unknown:
+        `predict_map` and `calibrate_materials` estimate a common offset.
     access_point : str, optional
         BSSID or SSID in a recording; by default the access point with most measurements.
-
-    Returns
-    -------
-    Measurements
 
     Raises
     ------
@@ -350,8 +342,8 @@ def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
     """Merge repeated measurements: L links with mean gains, the link of each measurement (N,), and variances (L,).
 
-    The variance [dB^2] of a mean follows from the scatter of repetitions; without repetitions it is 0, and the noise is
-    part of the link.
+    The variance [dB^2] of a mean follows from the scatter of repetitions; without any it is 0, and the noise is part
+    of the link.
     """
     cubes = np.round(np.hstack([measured.tx, measured.rx]) / SAME_M)
     keys = np.column_stack([cubes, measured.is_outage])

@@ -68,7 +68,7 @@ FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 class PlacementArea:
     """Possible positions of a transmitter, and weighted receivers.
 
-    A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors, averaged over
+    A receiver in a free cell has weight 1, in an unknown cell its probability of being indoors, averaged over
     transmitter positions: no position gains by making the building seem larger.
 
     Parameters
@@ -89,7 +89,7 @@ class PlacementArea:
 
     @property
     def size_m2(self) -> float:
-        """Return the area of transmitter positions [m^2]."""
+        """Area of transmitter positions [m^2]."""
         return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
 
     def stands(self, positions_m: Floats) -> Bools:
@@ -156,7 +156,7 @@ def placement_area(
 
 
 def _room(partial: PartialMap) -> PartialMap:
-    """Return a map whose free cells are the possible transmitter positions; all others are unknown."""
+    """Return a map whose free cells are the possible transmitter positions, all others unknown."""
     fine = max(1, math.ceil(partial.resolution_m / FINEST_M - 1e-9))
     fine = max(1, min(fine, int(math.sqrt(4e6 / partial.state.size))))
     state = partial.state.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -174,7 +174,6 @@ def _room(partial: PartialMap) -> PartialMap:
 
 
 def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: float | None) -> Floats:
-    """Return weights (N,) of receivers: 1 in free cells, else the mean P(indoor) over transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():
         return weight
@@ -304,32 +303,23 @@ def place_transmitter(
     that cover different receivers are traced and predicted. Around the best of these, neighbours at 0.6 and 0.25 m are
     tried; the results are compared at all receivers. Larger maps get more positions and steps.
 
-    Receivers are those of `predict_map`, 0.5 m apart; one in a free cell has weight 1, one in an unknown cell its
-    probability of being indoors.
+    Receivers are those of `predict_map`, 0.5 m apart, with weights as in `TransmitterPlacement`.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
         A map, or a file that `load_map` reads.
     objective : {"coverage", "percentile"}
-        Maximised quantity: mean probability that the path gain exceeds the threshold, or mean predicted gain of the
-        worst tenth of the receivers.
+        Mean probability that the path gain exceeds the threshold, or mean predicted gain of the worst tenth of the
+        receivers.
     threshold_db : float
         Path gain of a covered receiver [dB].
     tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m].
     seed : int
         Seed of the compared positions.
-    predictor : None, "map", "paper", path or Predictor
+    predictor, scene_settings, trace_settings, progress
         As in `predict_map`.
-    scene_settings : SceneSettings, optional
-    trace_settings : TraceSettings, optional
-    progress : bool or callable, optional
-        As in `predict_map`.
-
-    Returns
-    -------
-    TransmitterPlacement
 
     Raises
     ------

@@ -107,16 +107,16 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
-    Each transmitter has a row. Walls are black, the unobserved area is hatched, the transmitter is a star; a line
-    encloses 90 % of the posterior of an unknown position. On a complete map the outside is blank.
+    Each transmitter has a row. Walls are black, the unobserved area hatched, the transmitter a star; a line encloses
+    90 % of the posterior of an unknown position. On a complete map the outside is blank.
 
     Parameters
     ----------
     coverage : xarray.Dataset
         From `predict_map` or `load_coverage`.
     layers : sequence of str
-        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by the
-        probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by
+        probability, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
 
@@ -177,7 +177,7 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
 def plot_comparison(
     coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
 ) -> Figure:
-    """Draw coverage maps of one area: columns of titles, rows of layers (paper, Fig. 5).
+    """Draw coverage maps of one area: a column per title, a row per layer (paper, Fig. 5).
 
     Walls that only the first map contains are grey in the others.
     """
@@ -321,7 +321,7 @@ def outside(coverage: xr.Dataset) -> Bools:
 def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
     """Refine a picture to the size of `wall`, and fill cells without receiver by the nearest.
 
-    Walls thinner than a cell would have a white border otherwise.
+    Otherwise walls thinner than a cell would have a white border.
     """
     fine = wall.shape[0] // valid.shape[0]
     bare = ~valid.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -413,7 +413,7 @@ def report_figure(
 def _report_grid(most: int, aspect: float, height_in: float) -> tuple[int, int]:
     """Return the number of panels, two or more, and the columns that give them most of the page.
 
-    Colour bars are beside the panels of one column, and else below each panel.
+    Colour bars are beside the panels of one column, else below each panel.
     """
 
     def area(grid: tuple[int, int]) -> float:
@@ -433,7 +433,7 @@ def _draw_report(
     threshold_dbm: float,
     height_in: float,
 ) -> None:
-    """Draw received power, its probability, and as it fits the strongest transmitter and the uncertainty."""
+    """Draw received power and its probability, and, as space allows, strongest transmitter and uncertainty."""
     power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
     strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
     thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
@@ -535,10 +535,6 @@ def plot_network(network: xr.Dataset) -> Figure:
     ----------
     network : xarray.Dataset
         From `network_map`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

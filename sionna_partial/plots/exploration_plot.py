@@ -71,10 +71,6 @@ def plot_exploration(exploration: Exploration) -> Figure:
     exploration : Exploration
         From `explore_trajectory`. Each step has a panel, up to `MAX_PANELS`.
 
-    Returns
-    -------
-    matplotlib.figure.Figure
-
     Raises
     ------
     SettingsError
@@ -109,7 +105,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
 def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], tx: ArrayLike | None = None) -> None:
     """Write a GIF of an exploration, with a frame for each of its `steps`.
 
-    With a transmitter, predicted path gain and uncertainty are beside the map; each frame takes a prediction.
+    With a transmitter, each frame takes a prediction and has path gain and uncertainty beside the map.
 
     Parameters
     ----------
@@ -266,10 +262,6 @@ def plot_next_views(views: NextViews) -> Figure:
     ----------
     views : NextViews
         From `next_views`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

@@ -107,9 +107,7 @@ def legend_below(
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
-    """Draw a map and the positions of radios on it, to check scale and orientation.
-
-    Positions outside the map are included.
+    """Draw a map and radios on it, also outside the map, to check scale and orientation.
 
     Parameters
     ----------
@@ -118,10 +116,6 @@ def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike 
         Transmitters [m].
     rx : (2,), (3,), (N, 2) or (N, 3) array-like, optional
         Receivers [m].
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

@@ -1,7 +1,6 @@
 """PartialMap -> wall outlines -> plan for beams.
 
-Outlines are straight segments through the centres of boundary wall cells. A plan has walls that meet only at ends,
-their lines, and an index of them.
+Outlines are straight segments through the centres of boundary wall cells. Walls of a plan meet only at ends.
 """
 
 import itertools
@@ -73,8 +72,8 @@ class _Graph:
 class _FittedChain:
     """A chain of points (n,) of a graph, and the straight runs that fit it.
 
-    Runs have lines (R, 4) of a point x, y and a direction x, y [cells], and begin at `first` (R,). `corners` are the
-    indices of points where the chain turns. `plain` (R,) runs keep their corners.
+    Runs have lines (R, 4) of a point x, y and a direction x, y [cells], and begin at `first` (R,). The chain turns at
+    the indices `corners`. `plain` (R,) runs keep their corners.
     """
 
     points: NDArray[np.int64]
@@ -103,8 +102,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. Outlines turn,
     mirror and move with the map, unless it equals its own mirror image.
 
-    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres; from 0.5 on,
-    the staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
+    `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
+    staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
     ragged faces (`fit_runs`).
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
@@ -148,7 +147,7 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
 def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
     """Turn or mirror a grid to the orientation with the smallest bytes, so that outlines turn with the map.
 
-    Returns the grid, whether it was transposed, and whether columns and rows were flipped then.
+    Returns the grid, whether it was transposed, and whether columns and rows were then flipped.
     """
 
     def turned(transpose: bool, flip_y: bool, flip_x: bool) -> States:
@@ -201,8 +200,8 @@ def _indexed(ends: NDArray[np.int64]) -> _Graph:
 def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
     """Split a graph into chains of points (n,) that contain every edge once.
 
-    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops begin at
-    the point farthest from their centre, which is their first and last.
+    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops start and
+    end at the point farthest from their centre.
     """
     beside: list[list[int]] = [[] for _ in range(len(graph.points))]
     for a, b in graph.edges.tolist():

@@ -74,7 +74,7 @@ class SceneGeometry:
     open_end : (V,) bool array
         True where a wall ends because observation ended.
     wall_material : (S,) int64 array
-        Index into `materials`; the first of these is also the material of floor and ceiling.
+        Index into `materials`, whose first is also the material of floor and ceiling.
     top_m : (S,) float64 array
         Height of each wall [m]; less than `height_m` for obstacles.
     lids : tuple of Lid
@@ -208,11 +208,11 @@ def export_scene(
 ) -> Path:
     """Write a map as a scene folder that stock Sionna RT loads.
 
-    The folder holds `scene.xml`, the non-empty ones of `meshes/walls.ply`, `meshes/walls1.ply` (and so on, for
-    `wall_materials`), `meshes/floor.ply` and `meshes/ceiling.ply`, or `meshes/part0.ply` and so on for the materials
-    of a mesh, and the map as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates
-    minus `scene_offset` in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the
-    map, or whole metres on the far axes of a mesh.
+    The folder holds `scene.xml`; the non-empty meshes `meshes/walls.ply`, `walls1.ply` and so on (for
+    `wall_materials`), `floor.ply` and `ceiling.ply`, or `part0.ply` and so on for the materials of a mesh; and the map
+    as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates minus `scene_offset`
+    in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the map, or whole metres on
+    the far axes of a mesh.
 
     Parameters
     ----------
@@ -227,7 +227,6 @@ def export_scene(
     Returns
     -------
     pathlib.Path
-        The folder.
 
     Raises
     ------
@@ -285,8 +284,8 @@ def write_scene(
 ) -> Path:
     """Write `scene.xml` and its meshes into an existing folder, and return the path of `scene.xml`.
 
-    World x and y `offset_m` become the origin; `geometry.origin_m` gives local coordinates. Wall i has the triangles 2
-    i and 2 i + 1, counted through `geometry.shapes`. Adjacent walls of one material share vertices and so form wedges.
+    World x and y `offset_m` become the origin (`geometry.origin_m` gives local coordinates). Wall i has the triangles
+    2 i and 2 i + 1, counted through `geometry.shapes`. Adjacent walls of one material share vertices, forming wedges.
     """
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     scene = _new_scene(folder)
@@ -312,7 +311,7 @@ def write_mesh_scene(
 ) -> Path:
     """Write `scene.xml` and the meshes of a SceneMesh, and return the path of `scene.xml`.
 
-    The shapes `part0`, `part1`, ... have the triangles of each material in order; empty ones are left out. The world
+    Shapes `part0`, `part1`, ... have the triangles of each material in order; empty ones are left out. The world
     position `offset_m`, (x, y) or (x, y, z), becomes the origin.
     """
     shift = np.zeros(3)

@@ -73,8 +73,8 @@ def furnish(
 ) -> Iterator[Polygon]:
     """Yield furniture and pillars (they may overlap) that leave a room and its doors passable.
 
-    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number of
-    trials for every 4 m2, `pillars` the probability of pillars in a large room.
+    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number
+    of trials for every 4 m2, `pillars` the probability of pillars in a large room.
     """
     near = [opening for opening in openings if opening.distance(room) < NEAR_M]
     doorsteps = union_of([opening.buffer(walk_m, cap_style="flat") for opening in near])

@@ -29,8 +29,7 @@ class Fusion(NamedTuple):
 
     `by_scan` counts each picture once in a cell, as a hit if any of its rays ends there. A hit adds `passes_of_hit`
     passes. From `min_passes` a cell is known, and wall if hits / passes exceeds `max_free`. A distance of `travel_m`
-    [m] or a turn of `turn_deg` [degree] triggers the next picture. Rays without a wall in range clear up to `cleared_m`
-    [m].
+    or a turn of `turn_deg` triggers the next picture. Rays without a wall in range clear up to `cleared_m`.
     """
 
     by_scan: bool
@@ -59,8 +58,8 @@ FUSIONS = {
 }
 """Rules of mappers, with their default parameters.
 
-- slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from more
-  than two passes; a hit adds two passes. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
+- slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from three
+  passes; a hit adds two. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
 - gmapping (`slam_gmapping.cpp`): wall where hits / (hits + passes) > `occ_thresh`, 0.25. `linearUpdate` is 1 m,
   `angularUpdate` 0.5.
 - Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55, `miss_probability` 0.49; wall where the log odds
@@ -181,7 +180,7 @@ class _Rays(NamedTuple):
     """Rays of one picture: start, believed minus true position, and angles [radian].
 
     `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall [cells],
-    `turn` is the error of the heading [radian], `grazing` the sine of the smallest angle to a face with a reading.
+    `turn` is the heading error [radian], `grazing` the sine of the smallest angle to a face with a reading.
     """
 
     start: tuple[float, float]

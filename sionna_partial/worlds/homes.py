@@ -1,8 +1,8 @@
 """Procedural homes: complete floor plans from a seed.
 
 A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
-furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
-robots. `docs/researchers.md` compares the plans with real homes.
+furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on robots'
+maps. `docs/researchers.md` compares the plans with real homes.
 """
 
 import math
@@ -132,13 +132,13 @@ def make_home(
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; by default 0.05, or 0.1 for the large kinds.
     locked_rooms : bool
-        True if the home may have free rooms that cannot be reached, also behind closed doors.
+        Allow free rooms that cannot be reached, also behind closed doors.
 
     Returns
     -------
     PartialMap
-        Complete (`is_complete`): free inside, with walls around everything free, unknown outside and in furniture. Free
-        cells are connected, except in locked rooms. Walls are one or more cells thick and meet at least at corners.
+        Complete (`is_complete`): free inside, with walls around, unknown outside and in furniture. Free cells are
+        connected, except in locked rooms. Walls are at least one cell thick and meet at least at corners.
 
     Raises
     ------
@@ -252,7 +252,7 @@ def _varied(rng: Rng, style: _Style) -> _Style:
 
 
 def _outline(rng: Rng, area: float) -> Polygon:
-    """Outline of a home: a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
+    """Draw a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
     width, height = rng.uniform(1.0, 2.0), 1.0
     outline = box(0, 0, width, height)
     corners = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0)]

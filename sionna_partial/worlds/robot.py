@@ -1,7 +1,7 @@
 """The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-Each action is a quarter of a metre forward or a turn of ten degrees, with a long-term goal every 25 steps. Frontiers
-drawn at random and shortest paths over seen cells replace the learnt policies.
+Each action is a quarter of a metre forward or a turn of ten degrees, with a goal every 25 steps. Randomly drawn
+frontiers and shortest paths over seen cells replace the learnt policies.
 """
 
 import math
@@ -45,7 +45,7 @@ GOAL_RANGES = 2.0
 GOAL_SHARPNESS = 3.0
 """Exponent of a frontier's promise in its odds to become the goal [1].
 
-Fitted to the mean observed fractions of the paper on real homes; the best frontier every time would see more.
+Fitted to the paper's mean observed fractions on real homes; always taking the best frontier would see more.
 """
 
 _AHEAD_M = 0.3
@@ -125,7 +125,7 @@ class Robot:
         return self.position[0] + self._shift[0], self.position[1] + self._shift[1]
 
     def act(self) -> None:
-        """Do one action towards a frontier, and look; do nothing if no frontier can be reached."""
+        """Do one action towards a frontier, and look; do nothing if none can be reached."""
         if self.is_finished:
             return
         route = self._route

@@ -96,8 +96,8 @@ def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
 def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple[Indices, Indices]:
     """Split triangles at vertices from `first_new` on that are on their open edges, so that neighbours share edges.
 
-    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
-    triangles (G, 3), and the source triangle of each (G,), rising.
+    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns triangles
+    (G, 3), and their source triangles (G,), rising.
     """
     source = np.arange(len(triangles))
     while True:

@@ -96,14 +96,14 @@ def map_from_points(
 ) -> PartialMap:
     """Make a map from a point cloud.
 
-    Floor and ceiling are the layers with points in most cells. Cells with points in the height band are walls, other
-    cells with points between floor and ceiling are free, and so are small gaps. Heights of the map start at the floor.
-    Files are read in parts, except PCD and PLY: memory grows with the building, not with the number of points.
+    Floor and ceiling are the layers with points in most cells. Cells with points in the height band are walls; others
+    with points between floor and ceiling, and small gaps, are free. Heights of the map start at the floor. Except PCD
+    and PLY, files are read in parts: memory grows with the building, not with the number of points.
 
     Parameters
     ----------
     points : (N, 3) array-like or path-like
-        x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are skipped.
+        x, y, z [m]; or a PCD, PLY, LAS, LAZ or text file (XYZ, PTS). Points that are not finite are skipped.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
         Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free.
     height_band_m : (float, float) or None
@@ -111,11 +111,7 @@ def map_from_points(
     observed, resolution_m, up, unit_m
         As in `load_map`. By default the free and wall cells are observed. All other arguments are in metres.
     wall_height_m : float or None
-        Height of walls and ceiling [m]; by default the height of the ceiling of the cloud, or 3.
-
-    Returns
-    -------
-    PartialMap
+        Height of walls and ceiling [m]; by default the cloud's ceiling, or 3.
 
     Raises
     ------
@@ -341,10 +337,7 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
 def _occupied_voxels(
     what: str, parts: Iterable[NDArray[Any]], cell_m: float, reading: MeshReading, notes: ImportNotes
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
-    """Return indices x, y, z (V, 3) of the voxels with points, and their numbers of points.
-
-    The third value has the number of points, and the sum of their heights [m], of each layer.
-    """
+    """Return voxels x, y, z (V, 3), their numbers of points, and count and sum of heights [m] of each layer."""
     heights_m: dict[int, tuple[int, float]] = {}
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for part in parts:
