@@ -25,7 +25,7 @@ from sionna_partial.worlds.robot import Choice, Robot
 MAX_STEPS = 100_000
 
 VAIN_STEPS = 1000
-"""Number of actions without progress after which a robot stops; errors of its map may block every route."""
+"""Actions without progress after which a robot stops: errors of its map may block every route."""
 
 PROGRESS = 0.005
 
@@ -114,9 +114,9 @@ def explore(
     home : PartialMap
         Complete; unknown cells stop the robot and its view.
     steps : sequence of int or float
-        Increasing numbers of actions [1], at most 100,000, after which the map is returned; empty after 0. Or
-        increasing fractions of the free area in [0, 1): the first map with that fraction, or the last map if nothing is
-        left to see or after 1000 actions without progress.
+        Increasing numbers of actions [1], at most 100,000; the map after 0 is empty. Or increasing fractions of the
+        free area in [0, 1): the first map with that fraction, or the last one if nothing is left to see or 1000 actions
+        made no progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
@@ -130,8 +130,8 @@ def explore(
     Returns
     -------
     list of PartialMap
-        One for each of `steps`, on the grid of `home`, with its number of free cells as `interior_cells`. Known cells
-        stay known; without errors they keep their states. A mesh is cut to the known cells.
+        One for each of `steps`, on the grid of `home`, with `interior_cells`. Known cells stay known; without errors
+        they keep their states. A mesh is cut to the known cells.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Next views for a better coverage map: partial map -> ranked poses of the robot."""
+"""Partial map -> ranked poses of the robot for a better coverage map."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 """Largest numbers of returned poses and of predicted transmitters."""
 
 SPACING_M, MOST_RECEIVERS = 0.5, 1500
-"""Distance between predicted receivers [m], larger on large maps, and about their largest number."""
+"""Spacing of predicted receivers [m], larger on large maps, and their approximate largest number."""
 
 POSSIBLE_TRANSMITTERS = 3
-"""Number of positions that represent all possible ones of a transmitter."""
+"""Number of positions that represent an unknown transmitter."""
 
 LOOK_M = 1.25
 """Driving distance that takes as long as choosing a view and turning towards it [m]."""
@@ -125,8 +125,8 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     tx_m : (T, 3) float64 array
         Predicted transmitters [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        Entropy of each link on (tx, y, x) [bit], times the probability that the receiver is indoors and, for an unknown
-        transmitter, the relative probability of its position.
+        Entropy of links on (tx, y, x) [bit], times P(indoor) and, for an unknown transmitter, the relative probability
+        of its position.
     goal : {"coverage", "state", "area"}
     sensor : SensorSettings
     """
@@ -211,8 +211,8 @@ def next_views(
     scene : PartialMap or path
         The map, or a file for `load_map`.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        Transmitters [m]. By default the transmitters of the measurements, or one located by them; without measurements
-        the mean over positions in free cells.
+        Transmitters [m]; by default as in the measurements or located by them, and without measurements the mean over
+        positions in free cells.
     measurements : Measurements, mapping, data frame or path, optional
         Measured gains, as for `predict_map`.
     goal : {"coverage", "state", "area"}
@@ -222,7 +222,7 @@ def next_views(
     start : (2,) array-like, optional
         Position of the robot [m]; by default the middle of the largest free part.
     threshold_db : float
-        Path gain above which a receiver is covered [dB].
+        Path gain of a covered receiver [dB].
     sensor : SensorSettings, optional
     predictor, scene_settings, trace_settings, progress
         As for `predict_map`.
@@ -280,7 +280,7 @@ def _frontiers(partial: PartialMap, cell: tuple[int, int]) -> list[Frontier]:
 
 
 def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:
-    """Return a choice of frontiers for the coverage of transmitters; `corner` is the first cell of the robot's map."""
+    """Return a choice of frontiers for coverage; `corner` is the first cell of the robot's map."""
     if tx is not None:
         _transmitters(home, tx, None)
 
@@ -304,7 +304,7 @@ def _gains(
     sensor: SensorSettings,
     report: Progress = no_progress,
 ) -> tuple[list[float], list[float]]:
-    """Return the gain at each frontier, and the heading with the largest unknown area in view [degree]."""
+    """Return gains of frontiers, and headings with the largest unknown area in view [degree]."""
     x, y = np.meshgrid(uncertainty.x, uncertainty.y)
     rx = in_cells(partial, np.stack([x.ravel(), y.ravel()], axis=1))
     each_m2 = uncertainty.attrs["spacing_m"] ** 2 / max(1, len(tx_m))
@@ -395,7 +395,7 @@ def _uncertainty(
 def _located(
     model: LinkModel, measured: Measurements, threshold_db: float | None, report: Progress
 ) -> tuple[Floats, xr.DataArray]:
-    """Return possible positions (T, 3) [m] of the transmitter, and the contribution of each to the uncertainty."""
+    """Return possible transmitter positions (T, 3) [m], and their contributions to the uncertainty."""
     spacing_m = _spacing_m(model.partial)
     coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=report)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
@@ -406,7 +406,7 @@ def _located(
 
 
 def _entropy(coverage: xr.Dataset, threshold_db: float | None) -> xr.DataArray:
-    """Return the entropy of the coverage above a threshold, or of the link state, times P(indoor) [bit]."""
+    """Return the entropy of coverage or link state, times P(indoor) [bit]."""
     if threshold_db is None:
         p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
     else:

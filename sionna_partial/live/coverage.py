@@ -39,16 +39,14 @@ from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 LATE_S = 30.0
-"""Maps older than the last by less are dropped; by more, the robot's clock was restarted [s]."""
+"""Maps older than the last by less are dropped; by more, the clock was restarted [s]."""
 
 POSE_AGE_S = 2.0
-"""Time for which the last pose of the robot is used [s]."""
 
 POWER_CELL_M = 0.25
 """Edge of squares that keep the newest power of a transmitter [m]."""
 
 MOST_POWERS = 500
-"""Number of powers that are kept of a transmitter."""
 
 REPEATED_S, MOST_LINES = 60.0, 50
 """Time for which a line is not repeated [s], and number of remembered lines."""
@@ -176,7 +174,7 @@ class _Grid:
     def costs(
         self, coverage: xr.Dataset, threshold_db: float, max_cost: int
     ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the percentage of outage of free and of unknown cells, -1 elsewhere."""
+        """Return the outage of free and of unknown cells [percent], -1 elsewhere."""
         valid = coverage["valid"].to_numpy() == 1
         percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
         apart, nearest = distance_transform_edt(~valid, return_indices=True)
@@ -300,7 +298,7 @@ class LiveCoverage:
 
     @_refusing
     def on_pose(self, x_m: float, y_m: float, time_s: float) -> None:
-        """Take the position of the robot in the frame of the map [m], and its time."""
+        """Take position [m], in the frame of the map, and time of the robot."""
         values = tuple(map(number_of, (x_m, y_m, time_s)))
         if not all(map(math.isfinite, values)):
             raise PositionError(f"({shown(x_m)}, {shown(y_m)}) m at {shown(time_s)} s is no position.")
@@ -437,7 +435,6 @@ class LiveCoverage:
             self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
 
     def _give_way(self, fraction: float, message: str) -> None:
-        """Stop a final answer as soon as a newer map is waiting."""
         if self._waiting is not None:
             raise _NewerMap
 
@@ -502,7 +499,7 @@ def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Float
 
 
 def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return frame and stamp (seconds, nanoseconds) of a message; both may be missing."""
+    """Return frame and stamp (seconds, nanoseconds), which may be missing."""
     header = getattr(message, "header", None)
     stamp = getattr(header, "stamp", None)
     seconds, nanoseconds = (

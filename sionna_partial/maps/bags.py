@@ -24,7 +24,7 @@ from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, t
 from sionna_partial.resources import optional_packages
 
 MAX_BAG_BYTES = 10**12
-"""Largest file of a recording [bytes]; only requested messages are read."""
+"""Largest recording [bytes]; only requested messages are read."""
 
 MAX_MESSAGE_BYTES = MAX_CELLS + 100_000
 
@@ -80,7 +80,6 @@ class Recording:
             yield self.decoded(*each)
 
     def raw(self, *topics: str, until_s: float = math.inf) -> Iterator[tuple[float, bytes, str, str]]:
-        """Yield time, bytes, type and topic of messages."""
         links = [link for link in self._reader.connections if link.topic in topics]
         start = self._reader.start_time
         stop = None if until_s > self.duration_s else start + round(until_s * 1e9) + 1
@@ -111,7 +110,6 @@ def _plain_storage(files: Iterable[Path]) -> Iterator[None]:
 
 
 def _require_plain_mcap(stream: IO[bytes]) -> None:
-    """Raise a ValueError for chunks, or arrays of message types, that are larger than any map."""
     stream.seek(len(_MCAP_MAGIC))
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
@@ -131,7 +129,6 @@ def _require_plain_mcap(stream: IO[bytes]) -> None:
 
 @contextmanager
 def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
-    """Open a rosbag; all exceptions of its reader become an `error`."""
     with optional_packages(error):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -249,7 +246,7 @@ def map_of_percent(
     occupied_percent: float | None = None,
     free_percent: float | None = None,
 ) -> PartialMap:
-    """Make a map from occupancies in percent, x and y of the lower-left corner [m], and the yaw [rad]."""
+    """Make a map from percent, x and y of the lower-left corner [m], and the yaw [rad]."""
     values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
@@ -275,7 +272,7 @@ def map_of_percent(
 
 
 def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, float, float]]:
-    """Return cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
+    """Return cells (height, width), their edge, and x, y and yaw of the origin."""
     try:
         info, origin = message.info, message.info.origin
         size, resolution_m = (int(info.height), int(info.width)), number_of(info.resolution)

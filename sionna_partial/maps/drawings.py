@@ -48,14 +48,14 @@ OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
 
 MAX_ADDED, MAX_GROWTH = 8, 2.5
-"""Most layers that are tried if walls enclose hardly any area, and their largest relative extent."""
+"""Most layers tried if walls enclose hardly any area, and their largest relative extent."""
 
 THIN_M, FILLED_FRACTION = 0.06, 0.3
 """Width of thin lines (furniture, doors, dimensions) [m], and least fraction of dark pixels in wider lines on plans
 with filled walls."""
 
 MARK_M = 0.5
-"""Extent along x and y up to which separate marks are text or symbols [m]."""
+"""Largest extent along x and y of text or symbols [m]."""
 
 
 def map_from_drawing(
@@ -103,8 +103,7 @@ def map_from_drawing(
     Raises
     ------
     MapError
-        If the file is missing, damaged or too large, its unit is unclear, or its layers have no walls that enclose an
-        area.
+        For a missing, damaged or too large file, an unclear unit, or layers without walls around an area.
 
     Examples
     --------
@@ -306,7 +305,6 @@ def _height_given(name: str, value: object) -> float:
 def with_materials(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], materials: dict[Material, set[str]]
 ) -> PartialMap:
-    """Give each wall the material of the nearest line."""
     owner = _owners(partial, segments, on_layer, [*materials.values()])
     return replace(partial, wall_material=owner, wall_materials=tuple(materials))
 
@@ -329,7 +327,7 @@ def _with_heights(
 def _owners(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], groups: Sequence[set[str]]
 ) -> NDArray[np.uint8]:
-    """Return the number (from 1) of the group of layers with the nearest line to each cell (ny, nx), 0 for others."""
+    """Return the group of layers (from 1) with the nearest line to each cell (ny, nx), 0 for others."""
     lines = (segments - partial.origin_m) / partial.resolution_m
     drawn = np.zeros(partial.shape, dtype=np.uint8)
     for number, layers in enumerate([set(on_layer.tolist()), *groups]):
@@ -403,7 +401,7 @@ def read_picture(path: Path, *, resolution_m: float | None = None, threshold: in
 
 
 def wall_shades(path: Path) -> tuple[States, int, bool]:
-    """Return shades of grey (rows, columns), inverted if walls are bright, Otsu's threshold, and the inversion."""
+    """Return shades of grey (rows, columns), dark for walls, Otsu's threshold, and whether they were inverted."""
     shade = _shades(path)
     count = np.bincount(shade.ravel(), minlength=256)
     if np.count_nonzero(count) < 2:

@@ -38,7 +38,7 @@ DEGENERATE_M = 1e-6
 EnvironmentKind = Literal["plan", "mesh"]
 
 FAR_M = 1000.0
-"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Farther maps are moved."""
+"""Largest coordinate of a scene, with float32 steps of 0.06 mm [m]; farther maps are moved."""
 
 
 @read_only
@@ -183,7 +183,6 @@ def merged_mesh(
     material: NDArray[np.integer],
     materials: tuple[Material | None, ...],
 ) -> SceneMesh:
-    """Build a mesh whose triangles share equal vertices."""
     mesh = SceneMesh(vertices_m, triangles, material.astype(np.uint8), materials)
     return replace(mesh, triangles=merge_points(mesh.vertices_m)[mesh.triangles].astype(np.int64))
 
@@ -283,16 +282,16 @@ class FloorPlan:
         return 0.0, self.wall_height_m
 
     def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials that the map may need, also for floor and ceiling; `default` for unnamed ones."""
+        """Return materials that the map may need, also for floor and ceiling; `default` for unnamed ones."""
         return {default, *self.wall_materials}
 
     def scene_materials(self, default: Material) -> dict[str, Material]:
-        """Return the materials that the map uses, by their names in the scene."""
+        """Return used materials by their names in the scene."""
         used = [0] if self.wall_material is None else np.unique(np.append(self.wall_material, 0)).tolist()
         return {f"material{index or ''}": (default, *self.wall_materials)[index] for index in used}
 
     def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
-        """Return the fields of a map with other materials, by their names in the scene."""
+        """Return the fields of a map with other materials, by names in the scene."""
         of_walls = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.wall_materials, 1))
         return {"material": materials["material"], "wall_materials": of_walls}
 
@@ -314,7 +313,7 @@ class FloorPlan:
 
 
 def _whole_offset_m(low_m: float, high_m: float) -> float:
-    """Return the whole number of metres that moves a far axis to the origin without losing digits."""
+    """Return whole metres that move a far axis to the origin without losing digits."""
     if max(abs(low_m), abs(high_m)) <= FAR_M:
         return 0.0
     return float(np.floor(max(low_m, 0.0)) + np.ceil(min(high_m, 0.0)))

@@ -18,10 +18,10 @@ from sionna_partial.display import Shown
 from sionna_partial.process import njit
 
 MAX_ROOM_CELLS = 1_000_000
-"""Number of cells above which a plan is coarsened before rooms are counted."""
+"""Size above which plans are coarsened to count rooms [cells]."""
 
 OPENING_RATIO = 0.65
-"""Largest width of an opening, relative to the widest circle in the smaller of the rooms that it joins."""
+"""Largest width of an opening, relative to the widest circle in the smaller room beside it."""
 
 SMALLEST_RADIUS_CELLS = 4.0
 """Radius of the widest circle in the smallest room [cells]."""
@@ -38,7 +38,7 @@ _Map = TypeVar("_Map", bound=Any)
 
 
 class Rooms(NamedTuple):
-    """Number of rooms, and the widths of the widest openings that join them [m], one for each joined room."""
+    """Number of rooms, and widths of the widest openings between them [m], one for each joined room."""
 
     number: int
     openings_m: Floats
@@ -96,7 +96,7 @@ class MapWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of a file with one name or type, their number, and the reason for skipping them."""
+    """Elements of one name or type, their number, and the reason for skipping them."""
 
     name: str
     count: int
@@ -184,7 +184,7 @@ class ImportReport(ImportSource, Shown):
 
 @dataclass
 class ImportNotes:
-    """Notes of a reader: elements used, elements skipped with the reason, and the unit."""
+    """Notes of a reader for an `ImportReport`."""
 
     file: str | os.PathLike[str]
     unit_m: float = 1.0

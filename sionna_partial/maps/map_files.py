@@ -66,10 +66,10 @@ _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
 COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
-"""Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
+"""Habitat's top-down values: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
 
 HABITAT_COVERED = (6, 9)
-"""Drawings that may cover cells that are not navigable: target and its bounding box (habitat-lab, maps.py)."""
+"""Habitat's drawings that may cover cells that are not navigable: target and its box (maps.py)."""
 
 
 def load_map(
@@ -145,7 +145,7 @@ def load_map(
     Raises
     ------
     MapError
-        For a file that is missing, damaged, of another kind or out of range, or an argument for another kind of file.
+        For a missing, damaged or unknown file, a value out of range, or an argument for another kind of file.
 
     Examples
     --------
@@ -485,7 +485,7 @@ def _reader_of(source: Path) -> tuple[Path, _Reader]:
 
 
 def _reader_of_scene(source: Path) -> tuple[Path, _Reader]:
-    """Return the file of an exported scene, of the only Mitsuba scene, or of the map of a calibration."""
+    """Return the file of an exported scene, an only Mitsuba scene, or a calibration's map."""
     folder = source if source.is_dir() else source.parent
     scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
     if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):

@@ -46,7 +46,7 @@ MAX_YAML_BYTES = 1_000_000
 MAX_IMAGE_BYTES = 16 * MAX_CELLS
 
 DARK_OCCUPANCY = 0.51
-"""Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
+"""Occupancy from which a grey pixel looks like a wall; 127 and 128 often mean unknown."""
 
 SPREAD_FRACTION, REPORTED_FRACTION = 0.25, 0.1
 """Fractions of seen cells between the thresholds from which a map has continuous values, and from which a map of other
@@ -67,7 +67,7 @@ TOUCHED_WALLS = 0.1
 """Fraction of the walls that free cells touch up to which a map looks inflated."""
 
 MAX_YAW_RAD = 6.2832
-"""Largest yaw of an origin: one turn, as people round it. Larger values are degrees [rad]."""
+"""Largest yaw of an origin [rad]: one turn, rounded up; larger values are degrees."""
 
 
 class _Sheet(NamedTuple):
@@ -80,7 +80,7 @@ class _Sheet(NamedTuple):
 
 
 class _EachKeyOnce(yaml.SafeLoader):
-    """Loader that refuses duplicate keys, of which YAML keeps the last."""
+    """Loader that refuses duplicate keys; YAML keeps the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
@@ -214,7 +214,7 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
 
 
 def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
-    """Return the map_server keys of the YAML at `path`, for a PGM image of the same stem."""
+    """Return the map_server keys of a YAML, for a PGM image of the same stem."""
     return {
         "image": path.with_suffix(".pgm").name,
         "mode": mode,
@@ -399,7 +399,7 @@ _LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
     "room": ("names", "room_names", _room_name),
 }
-"""Layers of a map by their keys in the YAML: key of the values that the shades count, field of the map, reader."""
+"""Layers by their keys in the YAML: key of their values, field of the map, reader."""
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
@@ -482,7 +482,7 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 
 def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Image:
-    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`."""
+    """Return an image of at most `MAX_CELLS` pixels; errors begin with `given`."""
     try:
         with (
             open_regular(path, given.partition(" = ")[0], MapError, MAX_IMAGE_BYTES) as stream,
@@ -515,7 +515,7 @@ def bare_image(path: Path) -> MapError:
 
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
-    """Classify every pixel as nav2's loadMapFromFile does; occupancies between the thresholds are unknown."""
+    """Classify pixels as nav2's loadMapFromFile does, unknown between the thresholds."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
     if sheet.mode == "raw":
@@ -564,7 +564,7 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict:
 
 
 def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
-    """Warn if hardly any free cell touches a wall, as around the inflated obstacles of a costmap."""
+    """Warn if hardly any free cell touches a wall, as around inflated obstacles."""
     wall, free, square = state == CellState.WALL, state == CellState.FREE, np.ones((3, 3), dtype=bool)
     faces = wall & binary_dilation(~wall, square)
     apart = 1.0 - (faces & binary_dilation(free, square)).sum() / max(1, faces.sum())

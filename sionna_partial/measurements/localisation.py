@@ -23,7 +23,7 @@ Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
 """
 
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
-"""Number of candidate positions, their smallest spacing, and their largest distance from free cells [m]."""
+"""Number of candidates, their smallest spacing, and largest distance from free cells [m]."""
 
 MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements; one of each group is traced."""
@@ -78,7 +78,7 @@ class TransmitterPosterior:
         return float(np.sqrt(square @ self.probability.ravel()))
 
     def draw(self, count: int) -> tuple[Floats, Floats, list[float | None]]:
-        """Draw positions (K, 3) systematically [m]; return their weights (K,) and P(powers), too."""
+        """Draw positions (K, 3) systematically [m]; return also their weights (K,) and P(powers)."""
         weights = self.probability.ravel()
         drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
         chosen, times = np.unique(drawn, return_counts=True)
@@ -87,7 +87,7 @@ class TransmitterPosterior:
 
 
 def likely_region(probability: Floats) -> Bools:
-    """Return the smallest set of cells with 90 % of a posterior."""
+    """Return the smallest set of cells with 90 % probability."""
     order = np.argsort(-probability, axis=None, kind="stable")
     inside = np.cumsum(probability.ravel()[order]) < REGION * probability.sum()
     region = np.zeros(probability.size, dtype=bool)

@@ -1,4 +1,4 @@
-"""Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
+"""Measured path gains: mappings, data frames and CSV files -> Measurements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Largest gain that counts as an outage, with noise [dB]."""
 
 SAME_M, MOST_LINKS = 0.01, 3000
-"""Edge of the cubes in which ends of repeated links are equal [m]; largest number of links."""
+"""Edge of cubes for ends of repeated links [m]; largest number of links."""
 
 _ROUNDING_DB = 1e-6
 
@@ -45,7 +45,7 @@ SAME_TX_M = 0.5
 MOST_MEASUREMENTS = 20_000
 
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
-"""Number of other transmitters for learning the loss of walls, and of links of each of them."""
+"""Number of other transmitters, and of their links, for the loss of walls."""
 
 VACUUM_HEIGHT_M = 0.1
 
@@ -222,10 +222,10 @@ def load_measurements(
         powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same file; transmitters are
         unknown.
     columns : mapping, optional
-        Headers of these columns in the file, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db
-        without the word "gain" is a received power.
+        Headers of these columns, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db without the
+        word "gain" is a received power.
     tx : (3,) array-like, optional
-        Transmitter of all links [m], instead of the columns.
+        Transmitter of all links [m].
     tx_power_dbm : float
         Received power without path loss [dBm], subtracted from received powers only. Leave it out if unknown:
         `predict_map` and `calibrate_materials` estimate a common offset.
@@ -259,7 +259,7 @@ def _read(
     tx_power_dbm: float = 0.0,
     access_point: str | None = None,
 ) -> dict[str, Floats]:
-    """Read the columns of a file by our names; subtract `tx_power_dbm` from received powers."""
+    """Read the columns of a file; subtract `tx_power_dbm` from received powers."""
     is_recording = is_path(path) and Path(path).suffix.lower() == ".vwm"
     for name, value, other in (("columns", columns, is_recording), ("access_point", access_point, not is_recording)):
         if value is not None and other:
@@ -427,7 +427,7 @@ def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], re
 def measurements_of_each(
     partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
 ) -> list[Measurements | None]:
-    """Return the measurements of each transmitter, (1, 3) or unknown (0, 3) [m], or None; at least one has some."""
+    """Return measurements of transmitters, (1, 3) or unknown (0, 3) [m], or None; at least one has some."""
     measured = measurements_of(measurements)
     nearest = nearest_transmitters(measured.tx, sources_m)
     used = [bool(near.any()) or len(sources_m) == 1 for near in nearest]
@@ -470,7 +470,6 @@ def measurements_of_others(
 def _measured(
     partial: PartialMap, tx_m: Floats, measured: Measurements, nearest: Bools, frequency_hz: float
 ) -> Measurements:
-    """Return the usable measurements of one transmitter, (1, 3) or unknown (0, 3) [m]."""
     measured = _of_transmitter(measured, tx_m[0], nearest) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
@@ -492,7 +491,7 @@ def _measured(
 
 
 def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> Bools:
-    """Return whether receivers (N, 3) [m] are neither in walls nor at a transmitter (K, 3) [m]."""
+    """Return whether receivers (N, 3) [m] are outside walls and transmitters (K, 3) [m]."""
     usable = clear_of_walls(partial, rx_m)
     for each_m in tx_m:
         usable &= np.linalg.norm(rx_m - each_m, axis=1) >= nearest_m(frequency_hz)

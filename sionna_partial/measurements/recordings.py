@@ -265,7 +265,7 @@ def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]
 
 
 def _composed(chain: list[_Track]) -> _Track:
-    """Return poses of the first frame of a chain in the last one, at the times of the most frequent transform."""
+    """Return poses of a chain's first frame in the last one, at the times of the most frequent transform."""
     time_s = max(chain, key=lambda each: len(each.time_s)).time_s
     position_m, turn = np.zeros((len(time_s), 3)), Rotation.identity(len(time_s))
     for each in (link.at(time_s) for link in chain):

@@ -1,4 +1,4 @@
-"""Placement of several transmitters: draw candidates jointly, choose greedily, swap."""
+"""Placement of several transmitters: joint draws, greedy choice, swaps."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     values : (N,) float64 array
         Probability that at least one path gain exceeds the threshold.
     spacing_m : float
-        Distance between receivers [m].
+        Of the receivers [m].
     partial : PartialMap
     settings : PlacementSettings
 

@@ -1,4 +1,4 @@
-"""Figures of explorations: map of the robot, trajectory, field of view and next poses."""
+"""Figures of explorations and next poses."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ _PREDICTED = {
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw the map of the robot at each step, with its trajectory and field of view.
+    """Draw the robot's map at each step, with trajectory and field of view.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
 
 
 def _palette(frame: Image.Image) -> Image.Image:
-    """Return the drawn colours and their mixtures in the last frame, for all frames."""
+    """Return the colours of the last frame and their mixtures, for all frames."""
     drawn = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
     mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))

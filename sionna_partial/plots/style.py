@@ -64,7 +64,7 @@ def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> 
 
 
 def shade(where: Bools, grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
-    """Paint some cells, black by default, and leave the rest transparent: (ny, nx, 4)."""
+    """Paint cells, black by default, others transparent: (ny, nx, 4)."""
     picture = np.full((*where.shape, 4), grey, dtype=np.uint8)
     picture[..., 3] = np.uint8(255 * opacity) * where
     return picture

@@ -264,7 +264,7 @@ def _turns(points: NDArray[np.generic]) -> Bools:
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
-    """Return vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
+    """Return vectors from lattice points towards the peeled layer of a wall, or zero."""
     peeled = np.pad(peeled, 2)
     column, row = points.T // 2 + 2
     towards = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -314,7 +314,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
 
 
 def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points]:
-    """Return positions of chain ends and junctions, closest to the lines that meet there."""
+    """Return chain ends and junctions, closest to the lines that meet there."""
     lines: dict[int, list[Floats]] = {}
     pinned: set[int] = set()
     for chain in chains:
@@ -332,7 +332,7 @@ def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points
 
 
 def _closest(lines: Floats, near: Points) -> Points:
-    """Return the least-squares intersection of lines (k, 4), or the mean foot of `near` if that is far away."""
+    """Return the least-squares intersection of lines (k, 4), or the mean foot of `near` if far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (normal * (lines[:, :2] - near)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
@@ -385,7 +385,7 @@ def _assembled(lines: list[Points], cell_m: float) -> Outlines:
 
 
 def _extended(outlines: Outlines, state: States) -> Points:
-    """Return the vertices, with ends before UNKNOWN cells moved to the border of the last cell."""
+    """Return vertices, with ends before UNKNOWN cells moved to the border of the last cell."""
     vertices, segments = outlines.vertices_m.copy(), outlines.segments
     ends, tails = segments.ravel(), segments[:, ::-1].ravel()
     along = vertices[ends] - vertices[tails]
@@ -483,7 +483,7 @@ def prepare_plan(walls_m: Floats, low: Bools | None = None) -> Plan:
 
 
 def bin_points(points_m: Floats) -> PointBins:
-    """Sort points (N, 2) [m] into bins of a few points each."""
+    """Sort points (N, 2) [m] into bins of a few."""
     if len(points_m) == 0:
         return PointBins(points_m, np.zeros(0, np.int64), np.zeros(2, np.int64), np.array([0.0, 0.0, 1.0, 1.0]))
     low, high = points_m.min(axis=0), points_m.max(axis=0)
@@ -508,7 +508,7 @@ def grow(array, size):
 
 
 def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Cut segments where others cross them; return pieces (K, 2, 2) that meet only at ends, and their owners (K,)."""
+    """Cut segments where they cross; return pieces (K, 2, 2) that meet only at ends, and owners (K,)."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     lines = shapely.linestrings(walls)
     own, other = shapely.STRtree(lines).query(lines, predicate="intersects")
@@ -527,7 +527,7 @@ def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
 
 
 def _line_ids(walls: Floats) -> NDArray[np.int32]:
-    """Assign numbers to infinite lines of segments; collinear segments share one."""
+    """Return numbers of infinite lines; collinear segments share one."""
     if len(walls) == 0:
         return np.zeros(0, np.int32)
     along = walls[:, 1] - walls[:, 0]

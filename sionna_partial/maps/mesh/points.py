@@ -59,7 +59,7 @@ FLOOR_FRACTION = 0.3
 """Least fraction of the cells of the fullest layer in a floor or ceiling."""
 
 SLAB_M = 0.5
-"""Largest height of consecutive full layers of a floor or ceiling; more is a cloud of walls [m]."""
+"""Largest height of full layers of a floor or ceiling [m]; more is a cloud of walls."""
 
 LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
 """Least height of a ceiling; depth below the floor and height above the ceiling that count [m]."""
@@ -109,14 +109,14 @@ def map_from_points(
     height_band_m : (float, float) or None
         z of the cloud between which points are walls [m], which also selects a storey.
     observed, resolution_m, up, unit_m
-        As in `load_map`. By default the free and wall cells are observed. All other arguments are in metres.
+        As in `load_map`; by default free and wall cells are observed. Other arguments are in metres.
     wall_height_m : float or None
         Height of walls and ceiling [m]; by default the cloud's ceiling, or 3.
 
     Raises
     ------
     MapError
-        For a file that is damaged, too large or of another kind, a cloud in another unit, or other values.
+        For a damaged, too large or unknown file, a cloud in another unit, or other values.
 
     Examples
     --------
@@ -174,7 +174,7 @@ def _las(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _require_records(stream: IO[bytes]) -> None:
-    """Raise a ValueError for a LAS with more announced variable length records than space."""
+    """Raise a ValueError for a LAS that announces more variable length records than fit."""
     header, size = stream.read(247).ljust(247, b"\0"), os.fstat(stream.fileno()).st_size
     points_at, records = struct.unpack_from("<II", header, 96)
     extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
@@ -184,7 +184,7 @@ def _require_records(stream: IO[bytes]) -> None:
 
 
 def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
-    """Raise a ValueError for a LAZ with a wrong table of chunks: lazrs would exhaust the memory and abort."""
+    """Raise a ValueError for a LAZ with a wrong chunk table: lazrs would exhaust the memory and abort."""
     here, size = stream.tell(), os.fstat(stream.fileno()).st_size
     stream.seek(start)
     (table,) = struct.unpack("<q", stream.read(8))
@@ -239,7 +239,7 @@ def _ply(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _text(stream: IO[bytes]) -> Iterator[Floats]:
-    """Yield the first three columns of a text, after a header or a number of points."""
+    """Yield the first three columns, after a header or a number of points."""
     separator, first, announced, count = None, True, None, 0
     while block := stream.read(PART_BYTES):
         block += stream.readline(10_000)
@@ -378,7 +378,7 @@ def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple
 
 
 def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> Bools:
-    """Return cells (ny, nx) with points in enough layers of the height band that are not noise of a wall."""
+    """Return cells (ny, nx) with points in enough layers of the height band, without noise of walls."""
     size = shape[0] * shape[1]
     layers = np.bincount(cell, minlength=size).reshape(shape)
     points = np.bincount(cell, count, minlength=size).reshape(shape)
@@ -443,7 +443,7 @@ def _closed(free: Bools, wall: Bools, cell_m: float) -> Bools:
 
 
 def _enclosed(free: Bools, cell_m: float) -> Bools:
-    """Return cells of narrow or small free areas, as within walls, pillars and shelves."""
+    """Return narrow or small free areas, as within walls, pillars and shelves."""
     area, count = ndimage.label(free)
     small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
     return narrow_areas(free, cell_m) | (free & small[area])
@@ -455,7 +455,7 @@ def _beside(cells: Bools) -> Bools:
 
 @njit(cache=True)
 def _see_through(wall, targets, sensors, free):
-    """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
+    """Mark the cells between sensors and the cells seen (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):
         x0, y0 = sensors[sensor]
