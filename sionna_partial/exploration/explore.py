@@ -122,8 +122,8 @@ def explore(
     sensor : SensorSettings or None
         By default without errors: observations are exact.
     policy : {"random", "coverage"}
-        Choice of frontiers: at random, or by the expected decrease of the uncertainty of the coverage, as in
-        `next_views` (about a minute for 300 steps).
+        Choice of frontiers: random, or by the expected decrease of the coverage's uncertainty as in `next_views` (about
+        a minute for 300 steps).
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
         Transmitters [m] for the policy "coverage"; by default any position.
 

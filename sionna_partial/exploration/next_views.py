@@ -200,7 +200,7 @@ def next_views(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> NextViews:
-    """Rank poses by the expected decrease of the uncertainty of a coverage map per metre driven.
+    """Rank poses by the expected decrease of a coverage map's uncertainty per metre.
 
     Poses are in the middle of frontiers and face the largest unknown area. A view of a fraction of the unobserved part
     of a link's direct line is expected to lower its uncertainty by that fraction. Unknown cells count as free; unknown

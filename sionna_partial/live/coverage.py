@@ -105,8 +105,8 @@ class LiveGrid(NamedTuple):
     coverage : xarray.Dataset
         From `predict_map`.
     cost : (ny, nx) int8 array
-        P(path gain <= threshold) in percent, at most `LiveSettings.max_cost`, on the cells of the message; -1 in walls
-        and unknown cells.
+        P(path gain <= threshold) [percent], at most `LiveSettings.max_cost`, on the message's cells; -1 in walls and
+        unknown cells.
     unknown_cost : (ny, nx) int8 array
         Values of the unknown cells; -1 in all others.
     header, info : dict

@@ -206,8 +206,8 @@ def map_from_occupancy(
     Parameters
     ----------
     data : OccupancyGrid or (height, width) integers
-        A message (rclpy, rospy, rosbags; any object with its `info` and `data`), or an array: occupancy in percent,
-        0 to 100, and -1 (or 255) for unknown. Row 0 holds the smallest y, as in ROS.
+        Any object with `info` and `data` of the message (rclpy, rospy, rosbags), or an array: percent, and -1 (or 255)
+        for unknown. Row 0 holds the smallest y, as in ROS.
     resolution_m, origin_m, wall_height_m
         As of `map_from_array`. A message has its own resolution and origin, whose yaw is applied as in `load_map`.
     occupied_percent, free_percent : float or None

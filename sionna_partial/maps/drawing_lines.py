@@ -290,7 +290,7 @@ def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Flo
     """Return the length of a unit of a drawing [m] and its source, or raise a MapError if none fits best.
 
     `code` is `$INSUNITS`, `is_metric` is `$MEASUREMENT`, `segments` (N, 2, 2) are the lines of the walls, `texts` (T,)
-    the heights of texts. The header's unit is used unless one other unit fits the lengths in the drawing much better.
+    the heights of texts. The header's unit is used unless one other fits the lengths much better.
     """
     lengths, header_m = lengths_of(segments, texts), _header_unit(code)
     misfits = {name: misfit(lengths, unit_m) + RARE.get(name, 0.0) for name, unit_m in UNITS_M.items()}

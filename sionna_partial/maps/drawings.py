@@ -72,7 +72,8 @@ def map_from_drawing(
 
     Walls are lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space, also in
     blocks. Enclosed areas up to 0.5 m wide are solid walls drawn by both faces; others, doors included, are free, and
-    openings of up to 2 m in outer walls count as closed for that. All other cells are unknown.
+    openings of up to 2 m in outer walls count as closed for that. All other cells are unknown. `import_report` lists
+    the layers.
 
     Parameters
     ----------
@@ -94,11 +95,6 @@ def map_from_drawing(
         Edge of a cell [m].
     wall_height_m : float
         Height of walls and ceiling [m].
-
-    Returns
-    -------
-    PartialMap
-        Its `import_report` lists the unit and the layers read and skipped.
 
     Raises
     ------

@@ -60,8 +60,8 @@ class SceneMesh(Shown):
     materials : tuple of Material or None
         None is the material of SceneSettings.
     height_range_m : (float, float) or None
-        Lowest and highest world z for radios [m]. By default the ends of the mesh, or up to 3 m above a flat mesh.
-        Parts of a mesh keep its range.
+        Lowest and highest world z for radios [m], by default of the mesh, or up to 3 m above a flat one. Parts keep the
+        range.
 
     Raises
     ------

@@ -103,8 +103,8 @@ def load_map(
         - point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS): see `map_from_points`
         - DXF floor plan: see `map_from_drawing`
         - picture of a floor plan (PNG, JPEG, BMP), with `resolution_m`
-        - building model (IFC, extra `ifc`): walls, columns, windows and curtain walls are cut 1.2 m above a storey;
-          doors are open
+        - building model (IFC, extra `ifc`): walls, columns, windows and curtain walls, 1.2 m above a storey; doors are
+          open
         - map of a vacuum robot (Valetudo JSON, Valeronoi .vwm), whose segments become `PartialMap.room`
         - rosbag (.bag, .mcap, .db3, or a folder): see `map_from_bag`
     strict : bool
@@ -195,7 +195,7 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     MapError
         For anything but a PartialMap.
     OutputError
-        For another suffix, a mesh or `extra` in a format without them, or if writing fails. No partial file remains.
+        For another suffix, a mesh or `extra` in a format without them, or if writing fails; no partial file remains.
 
     Examples
     --------
@@ -285,8 +285,8 @@ def map_from_habitat(
     Parameters
     ----------
     top_down : (rows, columns) integers
-        `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. Rows run along Habitat's
-        +z, columns along +x. World x is Habitat's x and y is -z, so that row 0 holds the LARGEST y.
+        `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. World x is Habitat's x
+        (columns) and y is -z (rows), so that row 0 holds the LARGEST y.
     fog_of_war : (rows, columns) integers or booleans
         `info["top_down_map"]["fog_of_war_mask"]`: nonzero where the agent has seen.
     resolution_m : float
@@ -332,7 +332,7 @@ def map_from_slam(
     Parameters
     ----------
     obstacle, explored : (ny, nx) numbers in [0, 1]
-        Probability of an obstacle, and of having been explored (`map[0]` and `map[1]`). Row 0 holds the smallest y.
+        Probabilities `map[0]` and `map[1]`. Row 0 holds the smallest y.
     resolution_m, origin_m, wall_height_m
         As of `map_from_array`.
     threshold : float

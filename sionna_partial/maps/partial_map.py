@@ -317,7 +317,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def is_nearly_complete(self) -> bool:
-        """True if no unknown room can be entered; only pockets in furniture or thick walls are unknown.
+        """True if no unknown room can be entered.
 
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
         can enter it from free cells. Meshes are never nearly complete.

@@ -260,9 +260,9 @@ def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
 def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
     """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
 
-    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is ignored. Any other yaw
-    samples the grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs
-    (sqrt 2). Gaps where walls meet only at a corner are closed.
+    Quarter turns are exact. A tilt that moves no cell by more than half its size is ignored. Any other yaw samples the
+    grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs (sqrt 2). Gaps
+    where walls meet only at a corner are closed.
 
     Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
     """

@@ -284,11 +284,11 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
-    the line is steeper against. Ragged polylines, which turn back four times or more and at least once in 10 cells, get
+    A run is allowed if a line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
+    the line is steeper against. Ragged polylines, which turn back at least four times and once in 10 cells, get
     `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
-    variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
-    ragged runs if that moves their ends by at most half a cell.
+    variances, in squared tolerances. Lines are least-squares within the tolerance, or parallel to an axis for ragged
+    runs if that moves their ends by at most half a cell.
 
     Returns the first corner of every run (r,), and a point x, y and the direction x, y of its line (r, 4).
     """

@@ -577,8 +577,8 @@ class Assimilation(Shown):
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return the prediction of links given the measurements.
 
-        A predicted residual counts as a noisy measurement of the gain, which updates P(link state) and the gain given
-        each state by Bayes' rule.
+        A predicted residual counts as a noisy measurement of the gain, which updates P(link state) and the gains given
+        the state by Bayes' rule.
 
         Parameters
         ----------

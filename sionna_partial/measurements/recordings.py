@@ -55,8 +55,8 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     ----------
     path : path-like
     topic : str or None
-        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`. Default: transforms from the map to the
-        robot, else the first topic of these types.
+        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`; by default transforms from map to robot,
+        else the first topic of these types.
     frame : str or None
         Frame of the transforms, such as an antenna's; default `base_link`, or `base_footprint`.
 

@@ -301,15 +301,14 @@ def place_transmitter(
     cover different receivers are predicted. Around the best of these, neighbours at 0.6 and 0.25 m are tried; the
     results are compared at all receivers. Larger maps get more positions and steps.
 
-    Receivers are those of `predict_map`, 0.5 m apart, with weights as in `TransmitterPlacement`.
+    Receivers are as in `predict_map`, 0.5 m apart, with weights as in `TransmitterPlacement`.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
         A map, or a file that `load_map` reads.
     objective : {"coverage", "percentile"}
-        Mean probability that the path gain exceeds the threshold, or mean predicted gain of the worst tenth of the
-        receivers.
+        Mean P(gain > threshold), or mean predicted gain of the worst tenth of the receivers.
     threshold_db : float
         Path gain of a covered receiver [dB].
     tx_height_m, rx_height_m : float
@@ -324,7 +323,7 @@ def place_transmitter(
     MapError, PredictorError, BackendError
         As `predict_map`.
     PositionError
-        If there is no position for a transmitter or a receiver.
+        Without a position for transmitter or receivers.
     SettingsError
         For another objective, or a threshold, height, seed or frequency out of range.
 

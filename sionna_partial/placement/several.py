@@ -55,7 +55,7 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     values : (N,) float64 array
         Probability that at least one path gain exceeds the threshold.
     spacing_m : float
-        Of the receivers [m].
+        Distance between receivers [m].
     partial : PartialMap
     settings : PlacementSettings
 

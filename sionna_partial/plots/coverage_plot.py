@@ -108,7 +108,8 @@ def plot_coverage(
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
     Each transmitter has a row. Walls are black, the unobserved area hatched, the transmitter a star; a line encloses
-    90 % of the posterior of an unknown position. On a complete map the outside is blank.
+    90 % of the posterior of an unknown position. On a complete map the outside is blank. The figure is not
+    registered with pyplot.
 
     Parameters
     ----------
@@ -119,11 +120,6 @@ def plot_coverage(
         probability, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------

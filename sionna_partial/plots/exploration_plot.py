@@ -69,7 +69,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`. Each step has a panel, up to `MAX_PANELS`.
+        At most `MAX_PANELS` steps are drawn.
 
     Raises
     ------
@@ -110,7 +110,6 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], 
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`.
     path : path-like
         A `.gif` file. Equal explorations give equal bytes.
     tx : (3,) or (2,) array-like, optional

@@ -99,8 +99,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     """Outline the walls of a map by few straight segments, which meet only at shared vertices.
 
     A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Walls seen from
-    one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. Outlines turn,
-    mirror and move with the map, unless it equals its own mirror image.
+    one side are outlined there. Ends before UNKNOWN cells reach the border of the last cell. Outlines turn, mirror and
+    move with the map, unless it equals its mirror image.
 
     `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
     staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
@@ -130,8 +130,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 def lattice_outlines(partial: PartialMap) -> Outlines:
     """Outline wall cells without simplification: the staircase through the centres of boundary cells.
 
-    Cells that share a side are joined, and so are two that share only a corner. Steps between full blocks of two by two
-    cells are left out: thick walls have only faces. A lone cell is a square.
+    Cells that share a side, or two that share only a corner, are joined, except between full blocks of two by two
+    cells: thick walls have only faces. A lone cell is a square.
     """
     graph = _wall_graph(partial.state == CellState.WALL, cut_spurs=False)
     lines = []

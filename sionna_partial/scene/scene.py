@@ -224,10 +224,6 @@ def export_scene(
     frequency_hz : float
         Frequency [Hz] for ITU materials that Sionna RT cannot load by name.
 
-    Returns
-    -------
-    pathlib.Path
-
     Raises
     ------
     SettingsError

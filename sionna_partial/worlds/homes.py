@@ -127,8 +127,8 @@ def make_home(
     seed : int
         Seed, at least 0. Equal seeds give equal homes.
     kind : {"apartment", "house", "office", "floor", "hall", "warehouse"} or None
-        Kind of home; None draws one of the first three. The others are large, up to 100 x 60 m: an office floor with
-        corridors, a production hall with machines, a warehouse with shelves.
+        None draws one of the first three. The others are large, up to 100 x 60 m: an office floor, a production hall
+        with machines, a warehouse with shelves.
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; by default 0.05, or 0.1 for the large kinds.
     locked_rooms : bool

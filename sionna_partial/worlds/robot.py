@@ -1,7 +1,6 @@
 """The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-Each action is a quarter of a metre forward or a turn of ten degrees, with a goal every 25 steps. Randomly drawn
-frontiers and shortest paths over seen cells replace the learnt policies.
+Randomly drawn frontiers and shortest paths over seen cells replace the learnt policies.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Scanned and modelled meshes: mesh files through trimesh, and Mitsuba scene files, read without Mitsuba.
 
-Mitsuba would follow includes and paths out of the scene's folder, and abort on indices out of range. XML of others is
-parsed here (defusedxml), and meshes are checked before Mitsuba reads them.
+Mitsuba would follow includes and paths out of the scene's folder, and abort on indices out of range. XML is parsed here
+(defusedxml), and meshes are checked before Mitsuba reads them.
 """
 
 import io
@@ -71,10 +71,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 
 
 def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = None) -> SceneMesh:
-    """Read a mesh file, without colours and textures.
-
-    `up` is as in `load_map`.
-    """
+    """Read a mesh file, without colours and textures; `up` as in `load_map`."""
     notes = notes or ImportNotes(path)
     kind = path.suffix.lower().removeprefix(".")
     axis, other = (up or "y", "z") if kind in Y_UP_KINDS else (up or "z", "y")

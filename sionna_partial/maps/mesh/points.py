@@ -105,7 +105,7 @@ def map_from_points(
     points : (N, 3) array-like or path-like
         x, y, z [m]; or a PCD, PLY, LAS, LAZ or text file (XYZ, PTS). Points that are not finite are skipped.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
-        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free.
+        Sensor positions in the axes of the cloud [m]: the space to its points is free.
     height_band_m : (float, float) or None
         z of the cloud between which points are walls [m], which also selects a storey.
     observed, resolution_m, up, unit_m
