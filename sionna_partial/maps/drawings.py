@@ -73,7 +73,7 @@ def map_from_drawing(
     Walls are lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space, also in
     blocks. Enclosed areas up to 0.5 m wide are solid walls drawn by both faces; others, doors included, are free, and
     openings of up to 2 m in outer walls count as closed for that. All other cells are unknown. `import_report` lists
-    the layers.
+    unit and layers.
 
     Parameters
     ----------

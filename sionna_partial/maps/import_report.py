@@ -122,7 +122,7 @@ class ImportReport(ImportSource, Shown):
     Parameters
     ----------
     file : str
-        Its path.
+        Path of the file.
     unit_m : float
         Length of a unit of the file [m].
     unit_source : str

@@ -332,7 +332,7 @@ def map_from_slam(
     Parameters
     ----------
     obstacle, explored : (ny, nx) numbers in [0, 1]
-        Probabilities `map[0]` and `map[1]`. Row 0 holds the smallest y.
+        Probabilities of an obstacle (`map[0]`) and of exploration (`map[1]`). Row 0 holds the smallest y.
     resolution_m, origin_m, wall_height_m
         As of `map_from_array`.
     threshold : float

@@ -41,7 +41,7 @@ OUTLINE_M = 0.3
 """Largest distance of an outline from the cells of its wall [m]."""
 
 ROOM_M, BODY_M = 0.6, 0.3
-"""Radius of discs that fit an unknown region that may be a room, and that can enter it [m]."""
+"""Radius of a disc that fits into an unknown room, and of one that can enter it [m]."""
 
 POCKET_M = 0.4
 """Edge of a square in unknown regions that a robot would look into [m]."""

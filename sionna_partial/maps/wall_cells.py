@@ -18,7 +18,7 @@ MAX_FREE_GAP_M = 0.11
 """Longest gap of FREE cells that is closed [m]: log-odds mapping erases single wall cells."""
 
 MIN_RUN_CELLS = 3
-"""Length of wall on both sides of a gap in a seen wall [cells]."""
+"""Least length of wall on both sides of a gap in a seen wall [cells]."""
 
 DEEP_CELLS = 4
 """Depth behind the face of a deep wall in which cells are FREE [cells]."""

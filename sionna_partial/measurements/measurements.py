@@ -87,7 +87,7 @@ class Measurements(Shown):
     std_db : (N,) float64 array, optional
         Standard deviation of each gain, or one for all [dB], at least 0.1; by default estimated.
     sensitivity_db : float
-        Gain of the receiver's sensitivity [dB]; gains up to it are upper bounds.
+        Sensitivity of the receiver [dB]; gains up to it are upper bounds.
 
     Raises
     ------

@@ -323,7 +323,7 @@ def place_transmitter(
     MapError, PredictorError, BackendError
         As `predict_map`.
     PositionError
-        Without a position for transmitter or receivers.
+        If transmitter or receivers have no possible position.
     SettingsError
         For another objective, or a threshold, height, seed or frequency out of range.
 

@@ -173,7 +173,7 @@ def _rims(state: States, resolution_m: float) -> Bools:
 
 
 def fitted_grid(bounds_m: Floats, resolution_m: float) -> PartialMap:
-    """Return unknown cells within limits of x and y, on multiples of the resolution."""
+    """Return a map of unknown cells around limits of x and y, on multiples of the resolution."""
     one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
     cell = one.resolution_m
     first = np.floor(bounds_m[0, :2] / cell).astype(int) - 1
