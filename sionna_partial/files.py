@@ -195,7 +195,7 @@ class _Sink(io.RawIOBase):
 
 
 def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
-    """Compute dask arrays with equal numbers of blocks, block by block: `dask.array.store` varies the order."""
+    """Compute dask arrays with equal blocks, block by block: `dask.array.store` varies the order."""
     if not sources:
         return
     import dask
@@ -266,7 +266,7 @@ def _columns(
 def decoding(
     path: Path, fault: str, error: type[SionnaPartialError], remedy: str = "export it again."
 ) -> Iterator[None]:
-    """Convert the many exceptions that decoders raise on damaged files to an `error`; our own errors pass."""
+    """Convert exceptions of decoders on damaged files to an `error`; our own errors pass."""
     try:
         with optional_packages(error):
             yield
@@ -299,13 +299,12 @@ def output_path(path: object) -> Path:
 
 
 def lies_in(folder: Path, name: str) -> bool:
-    """Return whether a relative path, with links resolved, leads into a folder."""
     inside = bool(name) and is_path(name) and not Path(name).is_absolute() and ".." not in Path(name).parts
     return inside and Path(os.path.realpath(folder / name)).is_relative_to(os.path.realpath(folder))
 
 
 def require_plain_folder(folder: Path) -> None:
-    """Raise a ValueError for a folder with links, pipes or devices, which folder readers would follow."""
+    """Raise a ValueError for a folder with links, pipes or devices, which readers would follow."""
     for parent, folders, files in os.walk(folder):
         for name in (*folders, *files):
             mode = os.lstat(os.path.join(parent, name)).st_mode
@@ -314,7 +313,7 @@ def require_plain_folder(folder: Path) -> None:
 
 
 def unzipped(content: bytes, most: int) -> dict[str, bytes]:
-    """Return the files of a zip archive by name, or raise a ValueError if it is damaged or unpacks to more."""
+    """Return the files of a zip archive by name; a ValueError if it is damaged or unpacks to more."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [entry for entry in archive.infolist() if not entry.is_dir()]
@@ -410,7 +409,6 @@ def atomic_files(path: str | os.PathLike[str]) -> Iterator[Path]:
 
 @contextmanager
 def temporary_folder() -> Iterator[Path]:
-    """Open a folder for temporary files, and remove it at the end."""
 
     def failed(cause: OSError) -> OutputError:
         return OutputError(
@@ -434,7 +432,7 @@ def require_writable(folder: str | os.PathLike[str]) -> None:
 
 @contextmanager
 def locked_folder(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Make a folder and keep other processes from writing to it; the lock ends with the process."""
+    """Make a folder and lock it against other processes; the lock ends with the process."""
     from filelock import FileLock, Timeout
 
     target = output_path(folder)
@@ -483,7 +481,7 @@ def _require_file(path: Path) -> None:
 
 
 def _swap_entries(new: Path, target: Path, aside: Path) -> None:
-    """Move every entry of `new` into `target`, and replaced ones to `aside`; undo everything on failure."""
+    """Move entries of `new` into `target`, and replaced ones to `aside`; undo all on failure."""
     aside.mkdir()
     with signals_held(), ExitStack() as undo:
         for name in sorted(entry.name for entry in new.iterdir()):

@@ -25,7 +25,7 @@ from sionna_partial.worlds.robot import Choice, Robot
 MAX_STEPS = 100_000
 
 VAIN_STEPS = 1000
-"""Number of actions without progress after which a robot stops; errors of its map may block every route."""
+"""Actions without progress after which a robot stops: errors of its map may block every route."""
 
 PROGRESS = 0.005
 
@@ -42,17 +42,15 @@ class Exploration(Pictured, plot="plots.exploration_plot:plot_exploration"):
     Parameters
     ----------
     home : PartialMap
-        The complete home.
     sensor : SensorSettings
-        Sensor of the robot.
     steps : (M,) tuple of int
         Numbers of actions [1], increasing.
     states : (M, ny, nx) uint8 array of CellState
-        The robot's map after each of `steps`, on the grid of `home`.
+        Robot's map after each of `steps`, on the grid of `home`.
     poses : (N, 3) array
-        Pose of the robot after 0, 1, ... actions: world x, y [m], and heading from x towards y [degree].
+        World x, y [m], and heading from x towards y [degree] after 0, 1, ... actions.
     believed_poses : (N, 3) array
-        Pose in the robot's estimate; equal to `poses` without drift.
+        Robot's estimate; equal to `poses` without drift.
 
     Examples
     --------
@@ -108,33 +106,32 @@ def explore(
 ) -> list[PartialMap]:
     """Send a robot through a home and return its map at several moments.
 
-    The robot starts at a random free position and heading. Each step it drives towards a frontier between seen and
-    unseen cells, or turns, and then looks: rays run through the cells to the first wall. Observations are exact unless
-    `sensor` has errors. The robot stays when nothing is left to see.
+    The robot starts at a random free pose. Each step it drives towards a frontier between seen and unseen cells, or
+    turns, and then looks: rays run through the cells to the first wall. It stays when nothing is left to see.
 
     Parameters
     ----------
     home : PartialMap
-        The complete home. Unknown cells stop the robot and its view.
+        Complete; unknown cells stop the robot and its view.
     steps : sequence of int or float
-        Increasing numbers of actions [1], at most 100,000, after which the map is returned; empty after 0. Or
-        increasing fractions of the free area in [0, 1): the first map with that fraction, or the last map if nothing is
-        left to see or after 1000 actions without progress.
+        Increasing numbers of actions [1], at most 100,000; the map after 0 is empty. Or increasing fractions of the
+        free area in [0, 1): the first map with that fraction, or the last one if nothing is left to see or 1000 actions
+        made no progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
     sensor : SensorSettings or None
-        Sensor of the robot and its errors; by default without errors.
+        By default without errors: observations are exact.
     policy : {"random", "coverage"}
-        Choice of frontiers: at random, or by the expected decrease of the uncertainty of the coverage, as in
-        `next_views` (about a minute for 300 steps).
+        Choice of frontiers: random, or by the expected decrease of the coverage's uncertainty as in `next_views` (about
+        a minute for 300 steps).
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
         Transmitters [m] for the policy "coverage"; by default any position.
 
     Returns
     -------
     list of PartialMap
-        One for each of `steps`, on the grid of `home`, with its number of free cells as `interior_cells`. Known cells
-        stay known; without errors they keep their states. A mesh is cut to the known cells.
+        One for each of `steps`, on the grid of `home`, with `interior_cells`. Known cells stay known; without errors
+        they keep their states. A mesh is cut to the known cells.
 
     Raises
     ------
@@ -165,7 +162,7 @@ def explore_trajectory(
     tx: ArrayLike | None = None,
     progress: Progress | bool | None = None,
 ) -> Exploration:
-    """Explore a home as `explore` does, and return the trajectory of the robot too.
+    """Explore a home as `explore` does, and return the trajectory too.
 
     Parameters
     ----------
@@ -174,14 +171,10 @@ def explore_trajectory(
     progress : bool or callable, optional
         As in `predict_map`.
 
-    Returns
-    -------
-    Exploration
-
     Raises
     ------
     MapError, SettingsError, PositionError
-        As `explore` does.
+        As `explore`.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Next views for a better coverage map: partial map -> ranked poses of the robot."""
+"""Partial map -> ranked poses of the robot for a better coverage map."""
 
 from __future__ import annotations
 
@@ -59,10 +59,10 @@ MOST_VIEWS, MOST_TRANSMITTERS = 100, 20
 """Largest numbers of returned poses and of predicted transmitters."""
 
 SPACING_M, MOST_RECEIVERS = 0.5, 1500
-"""Distance between predicted receivers [m], larger on large maps, and about their largest number."""
+"""Spacing of predicted receivers [m], larger on large maps, and their approximate largest number."""
 
 POSSIBLE_TRANSMITTERS = 3
-"""Number of positions that represent all possible ones of a transmitter."""
+"""Number of positions that represent an unknown transmitter."""
 
 LOOK_M = 1.25
 """Driving distance that takes as long as choosing a view and turning towards it [m]."""
@@ -80,7 +80,7 @@ class NextView(Shown):
     position_m : (2,) float64 array
         World x and y [m], in a free cell.
     heading_deg : float
-        Direction of the view, from x towards y [degree].
+        From x towards y [degree].
     path_length_m : float
         Length of the shortest safe path from the start [m].
     gain : float
@@ -89,7 +89,7 @@ class NextView(Shown):
     gain_per_m : float
         `gain` per metre driven, with 1.25 m added to the path. Views are ranked by it.
     path_m : (K, 2) float64 array
-        The path, from the start to the pose [m].
+        From the start to the pose [m].
     frontier_m : (F, 2) float64 array
         Centres of the free cells of the frontier [m].
 
@@ -125,8 +125,8 @@ class NextViews(Sequence[NextView], Pictured, plot="plots.exploration_plot:plot_
     tx_m : (T, 3) float64 array
         Predicted transmitters [m]; none for the goal "area".
     uncertainty : xarray.DataArray
-        Entropy of each link on (tx, y, x) [bit], times the probability that the receiver is indoors and, for an unknown
-        transmitter, the relative probability of its position.
+        Entropy of links on (tx, y, x) [bit], times P(indoor) and, for an unknown transmitter, the relative probability
+        of its position.
     goal : {"coverage", "state", "area"}
     sensor : SensorSettings
     """
@@ -200,39 +200,32 @@ def next_views(
     trace_settings: TraceSettings | None = None,
     progress: Progress | bool | None = None,
 ) -> NextViews:
-    """Rank poses by the expected decrease of the uncertainty of a coverage map per metre driven.
+    """Rank poses by the expected decrease of a coverage map's uncertainty per metre.
 
     Poses are in the middle of frontiers and face the largest unknown area. A view of a fraction of the unobserved part
-    of a link's direct line is expected to lower the uncertainty of that link by that fraction. Unknown cells count as
-    free. Unknown pockets that no robot fits into are ignored.
+    of a link's direct line is expected to lower its uncertainty by that fraction. Unknown cells count as free; unknown
+    pockets that no robot fits into are ignored.
 
     Parameters
     ----------
     scene : PartialMap or path
         The map, or a file for `load_map`.
     tx : (3,), (2,), (T, 3) or (T, 2) array-like, optional
-        Transmitters [m]. By default the transmitters of the measurements, or one located by them; without measurements
-        the mean over positions in free cells.
+        Transmitters [m]; by default as in the measurements or located by them, and without measurements the mean over
+        positions in free cells.
     measurements : Measurements, mapping, data frame or path, optional
         Measured gains, as for `predict_map`.
     goal : {"coverage", "state", "area"}
-        Quantity to learn: whether the path gain exceeds the threshold, the link state, or the map alone, without
-        prediction.
+        Learn whether the path gain exceeds the threshold, the link state, or the map alone, without prediction.
     count : int
         Largest number of poses.
     start : (2,) array-like, optional
         Position of the robot [m]; by default the middle of the largest free part.
     threshold_db : float
-        Path gain above which a receiver is covered [dB].
+        Path gain of a covered receiver [dB].
     sensor : SensorSettings, optional
-        Sensor of the robot.
     predictor, scene_settings, trace_settings, progress
         As for `predict_map`.
-
-    Returns
-    -------
-    NextViews
-        At most `count` poses, the best first.
 
     Raises
     ------
@@ -287,7 +280,7 @@ def _frontiers(partial: PartialMap, cell: tuple[int, int]) -> list[Frontier]:
 
 
 def coverage_choice(home: PartialMap, corner: tuple[int, int], tx: ArrayLike | None, sensor: SensorSettings) -> Choice:
-    """Return a choice of frontiers for the coverage of transmitters; `corner` is the first cell of the robot's map."""
+    """Return a choice of frontiers for coverage; `corner` is the first cell of the robot's map."""
     if tx is not None:
         _transmitters(home, tx, None)
 
@@ -311,7 +304,7 @@ def _gains(
     sensor: SensorSettings,
     report: Progress = no_progress,
 ) -> tuple[list[float], list[float]]:
-    """Return the gain at each frontier, and the heading with the largest unknown area in view [degree]."""
+    """Return gains of frontiers, and headings with the largest unknown area in view [degree]."""
     x, y = np.meshgrid(uncertainty.x, uncertainty.y)
     rx = in_cells(partial, np.stack([x.ravel(), y.ravel()], axis=1))
     each_m2 = uncertainty.attrs["spacing_m"] ** 2 / max(1, len(tx_m))
@@ -402,7 +395,7 @@ def _uncertainty(
 def _located(
     model: LinkModel, measured: Measurements, threshold_db: float | None, report: Progress
 ) -> tuple[Floats, xr.DataArray]:
-    """Return possible positions (T, 3) [m] of the transmitter, and the contribution of each to the uncertainty."""
+    """Return possible transmitter positions (T, 3) [m], and their contributions to the uncertainty."""
     spacing_m = _spacing_m(model.partial)
     coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=report)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
@@ -413,7 +406,7 @@ def _located(
 
 
 def _entropy(coverage: xr.Dataset, threshold_db: float | None) -> xr.DataArray:
-    """Return the entropy of the coverage above a threshold, or of the link state, times P(indoor) [bit]."""
+    """Return the entropy of coverage or link state, times P(indoor) [bit]."""
     if threshold_db is None:
         p = np.stack([coverage[name].to_numpy() for name in ("p_los", "p_nlos", "p_outage")])
     else:

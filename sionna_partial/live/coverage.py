@@ -39,16 +39,14 @@ from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 LATE_S = 30.0
-"""Maps older than the last by less are dropped; by more, the robot's clock was restarted [s]."""
+"""Maps older than the last by less are dropped; by more, the clock was restarted [s]."""
 
 POSE_AGE_S = 2.0
-"""Time for which the last pose of the robot is used [s]."""
 
 POWER_CELL_M = 0.25
 """Edge of squares that keep the newest power of a transmitter [m]."""
 
 MOST_POWERS = 500
-"""Number of powers that are kept of a transmitter."""
 
 REPEATED_S, MOST_LINES = 60.0, 50
 """Time for which a line is not repeated [s], and number of remembered lines."""
@@ -100,7 +98,6 @@ class LiveGrid(NamedTuple):
     Parameters
     ----------
     name : str
-        Name of the transmitter.
     map_number : int
         Number of the map, from 1.
     is_final : bool
@@ -108,8 +105,8 @@ class LiveGrid(NamedTuple):
     coverage : xarray.Dataset
         From `predict_map`.
     cost : (ny, nx) int8 array
-        P(path gain <= threshold) in percent, at most `LiveSettings.max_cost`, on the cells of the message; -1 in walls
-        and unknown cells.
+        P(path gain <= threshold) [percent], at most `LiveSettings.max_cost`, on the message's cells; -1 in walls and
+        unknown cells.
     unknown_cost : (ny, nx) int8 array
         Values of the unknown cells; -1 in all others.
     header, info : dict
@@ -135,7 +132,7 @@ class LiveGrid(NamedTuple):
 
 
 class LiveViews(NamedTuple):
-    """Best next views on one map."""
+    """Next views on one map."""
 
     views: NextViews
     header: dict[str, Any]
@@ -147,8 +144,6 @@ class LiveViews(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class _Grid:
-    """A checked OccupancyGrid."""
-
     percent: NDArray[np.integer[Any]]
     resolution_m: float
     origin: tuple[float, float, float]
@@ -160,7 +155,6 @@ class _Grid:
 
     @property
     def key(self) -> tuple[object, ...]:
-        """Return the key that tells maps apart."""
         return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
 
     @property
@@ -180,7 +174,7 @@ class _Grid:
     def costs(
         self, coverage: xr.Dataset, threshold_db: float, max_cost: int
     ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the percentage of outage of free and of unknown cells, -1 elsewhere."""
+        """Return the outage of free and of unknown cells [percent], -1 elsewhere."""
         valid = coverage["valid"].to_numpy() == 1
         percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
         apart, nearest = distance_transform_edt(~valid, return_indices=True)
@@ -223,8 +217,8 @@ def _refusing(method: Callable[..., None]) -> Callable[..., None]:
 class LiveCoverage:
     """Coverage of the newest map of a robot, for any transport.
 
-    Any thread may pass messages; while one map is computed, newer ones replace each other. `start` computes in a
-    thread, `step` in the calling one. Refused messages are logged.
+    Any thread may pass messages; newer maps replace each other while one is computed. `start` computes in a thread,
+    `step` in the calling one. Refused messages are logged.
 
     Parameters
     ----------
@@ -304,7 +298,7 @@ class LiveCoverage:
 
     @_refusing
     def on_pose(self, x_m: float, y_m: float, time_s: float) -> None:
-        """Take the position of the robot in the frame of the map [m], and its time."""
+        """Take position [m], in the frame of the map, and time of the robot."""
         values = tuple(map(number_of, (x_m, y_m, time_s)))
         if not all(map(math.isfinite, values)):
             raise PositionError(f"({shown(x_m)}, {shown(y_m)}) m at {shown(time_s)} s is no position.")
@@ -441,7 +435,6 @@ class LiveCoverage:
             self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
 
     def _give_way(self, fraction: float, message: str) -> None:
-        """Stop a final answer as soon as a newer map is waiting."""
         if self._waiting is not None:
             raise _NewerMap
 
@@ -506,7 +499,7 @@ def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Float
 
 
 def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:
-    """Return frame and stamp (seconds, nanoseconds) of a message; both may be missing."""
+    """Return frame and stamp (seconds, nanoseconds), which may be missing."""
     header = getattr(message, "header", None)
     stamp = getattr(header, "stamp", None)
     seconds, nanoseconds = (

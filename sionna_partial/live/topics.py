@@ -1,4 +1,4 @@
-"""Topics of a robot, by recording, DDS (ROS 2) or rosbridge (ROS 1), to a LiveCoverage and back, without ROS."""
+"""Topics of a robot to a LiveCoverage and back: recordings, DDS (ROS 2) or rosbridge (ROS 1), without ROS."""
 
 import json
 import logging
@@ -37,7 +37,7 @@ TF_TYPE = "tf2_msgs/msg/TFMessage"
 HIGHEST_DOMAIN = 232
 
 MOST_AT_ONCE = 100
-"""Number of messages of a topic that are taken before the next topic's."""
+"""Messages of a topic that are taken before the next topic's."""
 
 POLL_S = 0.02
 """Time between two polls [s]."""
@@ -105,7 +105,7 @@ class Topics(Checked):
 
     @property
     def transmitters(self) -> str:
-        """Return the topic of `diagnostic_msgs/KeyValue` with names and positions of transmitters, see `Listener`."""
+        """Return the topic of `diagnostic_msgs/KeyValue` with positions of transmitters, see `Listener`."""
         return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
@@ -351,7 +351,7 @@ def _field_type(node: Any, description: Any) -> Any:
 
 
 def filled(kind: str, values: Mapping[str, Any]) -> Any:
-    """Return a message of a type from nested mappings."""
+    """Return a message from nested mappings."""
     given = {}
     for name, (node, description) in _store().fielddefs[kind][1]:
         value = values[name]
@@ -463,6 +463,6 @@ class Rosbridge:
 
 
 def _old(kind: str) -> str:
-    """Return a type as rosbridge of ROS 1 and 2 accepts it: without "msg"."""
+    """Return a type without "msg", as rosbridge of ROS 1 and 2 accepts it."""
     package, _, name = kind.split("/")
     return f"{package}/{name}"

@@ -24,7 +24,7 @@ from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, t
 from sionna_partial.resources import optional_packages
 
 MAX_BAG_BYTES = 10**12
-"""Largest file of a recording [bytes]; only requested messages are read."""
+"""Largest recording [bytes]; only requested messages are read."""
 
 MAX_MESSAGE_BYTES = MAX_CELLS + 100_000
 
@@ -80,7 +80,6 @@ class Recording:
             yield self.decoded(*each)
 
     def raw(self, *topics: str, until_s: float = math.inf) -> Iterator[tuple[float, bytes, str, str]]:
-        """Yield time, bytes, type and topic of messages."""
         links = [link for link in self._reader.connections if link.topic in topics]
         start = self._reader.start_time
         stop = None if until_s > self.duration_s else start + round(until_s * 1e9) + 1
@@ -111,7 +110,6 @@ def _plain_storage(files: Iterable[Path]) -> Iterator[None]:
 
 
 def _require_plain_mcap(stream: IO[bytes]) -> None:
-    """Raise a ValueError for chunks, or arrays of message types, that are larger than any map."""
     stream.seek(len(_MCAP_MAGIC))
     while len(head := stream.read(9)) == 9:
         kind, length = struct.unpack("<BQ", head)
@@ -131,7 +129,6 @@ def _require_plain_mcap(stream: IO[bytes]) -> None:
 
 @contextmanager
 def open_recording(path: str | os.PathLike[str], error: type[SionnaPartialError]) -> Iterator[Recording]:
-    """Open a rosbag; all exceptions of its reader become an `error`."""
     with optional_packages(error):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -157,16 +154,10 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
     Parameters
     ----------
     path : path-like
-        The recording.
     topic : str or None
         A topic of `nav_msgs/OccupancyGrid`; by default `/map`, or the only one.
     time_s : float or None
         Seconds since the start of the recording: the last map up to then, by default the last of all.
-
-    Returns
-    -------
-    PartialMap
-        See `map_from_occupancy`.
 
     Raises
     ------
@@ -215,17 +206,13 @@ def map_from_occupancy(
     Parameters
     ----------
     data : OccupancyGrid or (height, width) integers
-        A message (rclpy, rospy, rosbags; any object with its `info` and `data`), or an array: occupancy in percent,
-        0 to 100, and -1 (or 255) for unknown. Row 0 holds the smallest y, as in ROS.
+        Any object with `info` and `data` of the message (rclpy, rospy, rosbags), or an array: percent, and -1 (or 255)
+        for unknown. Row 0 holds the smallest y, as in ROS.
     resolution_m, origin_m, wall_height_m
         As of `map_from_array`. A message has its own resolution and origin, whose yaw is applied as in `load_map`.
     occupied_percent, free_percent : float or None
         From the first value a cell is wall; up to the second it is free. By default 65 and 25, as in nav2's map_saver,
         or, for continuous values as of Cartographer, one fitted threshold, with a `MapWarning`.
-
-    Returns
-    -------
-    PartialMap
 
     Raises
     ------
@@ -259,7 +246,7 @@ def map_of_percent(
     occupied_percent: float | None = None,
     free_percent: float | None = None,
 ) -> PartialMap:
-    """Make a map from occupancies in percent, x and y of the lower-left corner [m], and the yaw [rad]."""
+    """Make a map from percent, x and y of the lower-left corner [m], and the yaw [rad]."""
     values = grid_array("data", data, "iu")
     outside = ((values < -1) | (values > 100)) & (values != 255)
     if outside.any():
@@ -285,7 +272,7 @@ def map_of_percent(
 
 
 def occupancy_parts(message: Any) -> tuple[NDArray[Any], float, tuple[float, float, float]]:
-    """Return cells (height, width), their edge, and x, y and yaw of the origin of an OccupancyGrid."""
+    """Return cells (height, width), their edge, and x, y and yaw of the origin."""
     try:
         info, origin = message.info, message.info.origin
         size, resolution_m = (int(info.height), int(info.width)), number_of(info.resolution)

@@ -36,7 +36,7 @@ WALL_NAMES = re.compile(
     r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
     re.IGNORECASE,
 )
-"""Words in the names of layers with walls, columns and windows."""
+"""Words in names of layers with walls, columns and windows."""
 
 NO_WALL_NAMES = {
     reason: re.compile(words, re.IGNORECASE)
@@ -48,18 +48,18 @@ NO_WALL_NAMES = {
         "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
     }.items()
 }
-"""Words in the names of layers that describe walls, close doors, or contain walls to be demolished."""
+"""Words in names of layers that describe walls, close doors, or contain walls to be demolished."""
 
 AIA_WALLS = {"WALL", "GLAZ", "COLS", "PRTN"}
 """Major groups of the AIA/NCS standard with walls, windows and columns."""
 
 AIA_STATUS = {"D": "to be demolished", "F": "future work", "M": "to be moved", "T": "temporary"}
-"""Status fields of AIA/NCS names of walls that are not part of the finished building."""
+"""Status fields of AIA/NCS names of walls outside the finished building."""
 
 AIA_DEMOLITION = {"AD", "ID", "SD"}
 
 PARTIAL_HEIGHT = re.compile(r"(?<![a-z])prht(?![a-z])|partial.?height|halbhoch|brüstung", re.IGNORECASE)
-"""Words in the names of layers with walls that end below the ceiling."""
+"""Words in names of layers with walls that end below the ceiling."""
 
 NO_WALL = "name of no wall"
 
@@ -76,7 +76,7 @@ UNITS_M = {
 }
 
 RARE = {"decimetres": 8.0, "inches": 3.0, "feet": 3.0}
-"""Additional misfit of rare units, unless the header has them."""
+"""Additional misfit of rare units that the header does not have."""
 
 POSSIBLE_M = (1.0, 2000.0)
 """Plausible longer sides of a building [m]."""
@@ -89,7 +89,7 @@ RASTER_CELLS = 1000
 """Number of cells along the longer side of the plan in which openings are found."""
 
 MOST_LINES = 1500
-"""Number of the longest lines between which distances are computed."""
+"""Number of longest lines whose distances are computed."""
 
 
 def skip_reason(name: str) -> str:
@@ -111,7 +111,7 @@ def skip_reason(name: str) -> str:
 
 
 def opened(content: bytes) -> Any:
-    """Parse a complete DXF, with ezdxf's slow recovery as second choice."""
+    """Parse a complete DXF, if necessary by ezdxf's slow recovery."""
     from ezdxf import recover
     from ezdxf.document import Drawing
     from ezdxf.filemanagement import dxf_stream_info
@@ -133,7 +133,7 @@ def opened(content: bytes) -> Any:
 class DrawnLines:
     """Lines of a drawing by layer. Each block is read once.
 
-    `counts` is the number of entities by layer (in lower case) and type, including blocks, whose entities on layer 0
+    `counts` has the numbers of entities by layer (in lower case) and type, including blocks, whose entities on layer 0
     take the layer of the INSERT. `names` are the layers as written.
     """
 
@@ -284,14 +284,13 @@ SCALES = {
     "walls": _Scale(0.2, 3.0, 3.0),
     "texts": _Scale(0.2, 4.0, 3.0),
 }
-"""Lengths in drawings by which a unit is checked."""
 
 
 def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Floats) -> tuple[float, str]:
     """Return the length of a unit of a drawing [m] and its source, or raise a MapError if none fits best.
 
     `code` is `$INSUNITS`, `is_metric` is `$MEASUREMENT`, `segments` (N, 2, 2) are the lines of the walls, `texts` (T,)
-    the heights of texts. The header's unit is used unless one other unit fits the lengths in the drawing much better.
+    the heights of texts. The header's unit is used unless one other fits the lengths much better.
     """
     lengths, header_m = lengths_of(segments, texts), _header_unit(code)
     misfits = {name: misfit(lengths, unit_m) + RARE.get(name, 0.0) for name, unit_m in UNITS_M.items()}
@@ -321,7 +320,6 @@ def unit_of(path: Path, code: int, is_metric: bool, segments: Floats, texts: Flo
 
 
 def misfit(lengths: dict[str, float], unit_m: float) -> float:
-    """Return the sum of squared deviations of lengths from the usual ones, with a unit [m]."""
     found = 0.0
     for name, length in lengths.items():
         usual_m, factor, limit = SCALES[name]
@@ -371,7 +369,7 @@ def _raster(segments: Floats) -> tuple[Bools, float]:
 
 
 def _longest(segments: Floats) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return direction (radians, in a half turn), offset and two ends along it of the longest lines, each (N,)."""
+    """Return direction (radians, in a half turn), offset and two ends along it of the longest lines, (N,)."""
     along = segments[:, 1] - segments[:, 0]
     chosen = np.argsort(-np.hypot(*along.T), kind="stable")[:MOST_LINES]
     along, start = along[chosen], segments[chosen, 0] - segments.mean(axis=(0, 1))
@@ -385,7 +383,7 @@ def _longest(segments: Floats) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def wall_thickness(segments: Floats) -> float:
-    """Return the usual distance between neighbouring parallel lines, 0 for walls of single lines."""
+    """Return the usual distance between parallel neighbours, 0 for walls of single lines."""
     angle, offset, first, last = _longest(segments)
     length = last - first
     beside = np.minimum.outer(last, last) - np.maximum.outer(first, first) > 0.5 * np.minimum.outer(length, length)

@@ -48,14 +48,14 @@ OPENING_M, SOLID_M = 2.0, 0.5
 """Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
 
 MAX_ADDED, MAX_GROWTH = 8, 2.5
-"""Most layers that are tried if walls enclose hardly any area, and their largest relative extent."""
+"""Most layers tried if walls enclose hardly any area, and their largest relative extent."""
 
 THIN_M, FILLED_FRACTION = 0.06, 0.3
 """Width of thin lines (furniture, doors, dimensions) [m], and least fraction of dark pixels in wider lines on plans
 with filled walls."""
 
 MARK_M = 0.5
-"""Extent along x and y up to which separate marks are text or symbols [m]."""
+"""Largest extent along x and y of text or symbols [m]."""
 
 
 def map_from_drawing(
@@ -71,40 +71,35 @@ def map_from_drawing(
     """Make a map from a DXF floor plan.
 
     Walls are lines, polylines, arcs, circles, ellipses, splines and borders of hatches in the model space, also in
-    blocks, and enclosed areas at most 0.5 m wide: walls drawn by both faces are solid. Other enclosed areas, doors
-    included, are free; openings of up to 2 m in outer walls count as closed for that. All other cells are unknown.
+    blocks. Enclosed areas up to 0.5 m wide are solid walls drawn by both faces; others, doors included, are free, and
+    openings of up to 2 m in outer walls count as closed for that. All other cells are unknown. `import_report` lists
+    unit and layers.
 
     Parameters
     ----------
     path : path-like
-        The drawing (DXF, text or binary).
+        DXF, text or binary.
     wall_layers : sequence of str or None
-        Layers with the walls, with wildcards `*` and `?`. By default visible layers with names of walls, columns or
-        windows, in European languages or the AIA/NCS standard, except demolished ones. Without such layers, all visible
+        Layers with the walls, with wildcards `*` and `?`. By default visible layers named as walls, columns or
+        windows, in European languages or the AIA/NCS standard, except demolished ones. Without any, all visible
         ones; if they enclose hardly any area, also the layer that closes most rooms: both raise a `MapWarning`.
     layer_materials : mapping of str to Material or str, or None
-        Materials of the walls on layers, with wildcards. The last layer wins.
+        Materials of the walls on layers, with wildcards; the last layer wins.
     layer_heights_m : mapping of str to float, or None
         Heights of the walls on layers [m], with wildcards. By default walls reach the ceiling, with a `MapWarning` for
         layers whose names mean a partial height.
     unit_m : float or None
-        Length of a unit of the drawing [m], 0.001 for millimetres. By default the unit of its `$INSUNITS`, or another
-        one, with a `MapWarning`, if extent, doors, walls and texts fit only that.
+        Length of a unit of the drawing [m]. By default the unit of its `$INSUNITS`, or another one, with a
+        `MapWarning`, if extent, doors, walls and texts fit only that.
     resolution_m : float
         Edge of a cell [m].
     wall_height_m : float
         Height of walls and ceiling [m].
 
-    Returns
-    -------
-    PartialMap
-        Its `import_report` lists the unit, and the layers that were read and skipped.
-
     Raises
     ------
     MapError
-        If the file is missing, damaged or too large, its unit is unclear, or its layers have no walls that enclose an
-        area.
+        For a missing, damaged or too large file, an unclear unit, or layers without walls around an area.
 
     Examples
     --------
@@ -200,7 +195,6 @@ class _Plan(NamedTuple):
         return found
 
     def segments(self, layers: set[str]) -> tuple[Segments, NDArray[np.str_]]:
-        """Return pieces of lines on some layers as `DrawnLines.segments`, or raise a MapError."""
         segments, on_layer = self.lines.segments(layers)
         if not len(segments):
             remedy = f"name layers with lines as wall_layers; it has {self.listed()}."
@@ -307,7 +301,6 @@ def _height_given(name: str, value: object) -> float:
 def with_materials(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], materials: dict[Material, set[str]]
 ) -> PartialMap:
-    """Give each wall the material of the nearest line."""
     owner = _owners(partial, segments, on_layer, [*materials.values()])
     return replace(partial, wall_material=owner, wall_materials=tuple(materials))
 
@@ -330,7 +323,7 @@ def _with_heights(
 def _owners(
     partial: PartialMap, segments: Segments, on_layer: NDArray[np.str_], groups: Sequence[set[str]]
 ) -> NDArray[np.uint8]:
-    """Return the number (from 1) of the group of layers with the nearest line to each cell (ny, nx), 0 for others."""
+    """Return the group of layers (from 1) with the nearest line to each cell (ny, nx), 0 for others."""
     lines = (segments - partial.origin_m) / partial.resolution_m
     drawn = np.zeros(partial.shape, dtype=np.uint8)
     for number, layers in enumerate([set(on_layer.tolist()), *groups]):
@@ -368,10 +361,10 @@ def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None =
 
 
 def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
-    """Read a floor plan from a picture with dark walls on a bright ground, or the inverse.
+    """Read a floor plan from a picture with dark walls on bright ground, or the inverse.
 
-    `resolution_m` is the edge of a pixel [m], `threshold` the largest shade of walls in `wall_shades`, by default
-    Otsu's. The origin is the lower-left corner of the picture.
+    `resolution_m` is the edge of a pixel, `threshold` the largest shade of walls in `wall_shades`, by default
+    Otsu's. The origin is the lower-left corner.
     """
     if resolution_m is None:
         raise bare_image(path)
@@ -404,7 +397,7 @@ def read_picture(path: Path, *, resolution_m: float | None = None, threshold: in
 
 
 def wall_shades(path: Path) -> tuple[States, int, bool]:
-    """Return shades of grey (rows, columns), inverted if walls are bright, Otsu's threshold, and the inversion."""
+    """Return shades of grey (rows, columns), dark for walls, Otsu's threshold, and whether they were inverted."""
     shade = _shades(path)
     count = np.bincount(shade.ravel(), minlength=256)
     if np.count_nonzero(count) < 2:

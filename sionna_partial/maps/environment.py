@@ -1,7 +1,7 @@
 """Contents of a map: walls extruded from its cells (`FloorPlan`), or triangles (`SceneMesh`).
 
-`PartialMap.environment` selects one. Another kind, such as voxels, needs a class like these, a writer in
-`scene.write_map`, and a path finder in `tracing/finder.py`.
+Another kind, such as voxels, needs a class like these, a writer in `scene.write_map`, and a path finder in
+`tracing/finder.py`.
 """
 
 import json
@@ -38,7 +38,7 @@ DEGENERATE_M = 1e-6
 EnvironmentKind = Literal["plan", "mesh"]
 
 FAR_M = 1000.0
-"""Largest coordinate that a scene keeps [m]: float32 has steps of 0.06 mm there. Farther maps are moved."""
+"""Largest coordinate of a scene, with float32 steps of 0.06 mm [m]; farther maps are moved."""
 
 
 @read_only
@@ -46,22 +46,22 @@ FAR_M = 1000.0
 class SceneMesh(Shown):
     """Triangles in world axes (x right, y up, z up), in metres; none where nothing has been observed.
 
-    Triangles are sorted by material, vertices by their first use. Degenerate triangles and unused vertices are
-    dropped. Arrays are read-only.
+    Triangles are sorted by material, vertices by first use; degenerate triangles and unused vertices are dropped.
+    Arrays are read-only.
 
     Parameters
     ----------
     vertices_m : (V, 3) float64 array
-        Corners [m]; adjacent triangles share them.
+        Corners [m], shared by adjacent triangles.
     triangles : (F, 3) int64 array
-        Indices into `vertices_m`, at most `MAX_TRIANGLES` triangles.
+        Indices into `vertices_m`; at most `MAX_TRIANGLES` rows.
     material : (F,) uint8 array
         Index into `materials` of every triangle.
     materials : tuple of Material or None
         None is the material of SceneSettings.
     height_range_m : (float, float) or None
-        Lowest and highest world z for radios [m]. By default the ends of the mesh, or up to 3 m above a flat mesh.
-        Parts of a mesh keep its range.
+        Lowest and highest world z for radios [m], by default of the mesh, or up to 3 m above a flat one. Parts keep the
+        range.
 
     Raises
     ------
@@ -125,7 +125,7 @@ class SceneMesh(Shown):
     def within(self, area: Any) -> "SceneMesh":
         """Cut the mesh at the border of an area (shapely, world x and y [m]) seen from above.
 
-        Triangles inside, and walls on the border, are kept. Triangles that shared edges still do: an edge gets the cut
+        Triangles inside, and walls on the border, are kept. Shared edges stay shared: an edge gets the cut
         points of its neighbours. Cut points within `SEAM_M` of each other or of a vertex are merged.
         """
         whole, pieces, source = cut_triangles(self.corners_m, area)
@@ -183,7 +183,6 @@ def merged_mesh(
     material: NDArray[np.integer],
     materials: tuple[Material | None, ...],
 ) -> SceneMesh:
-    """Build a mesh whose triangles share equal vertices."""
     mesh = SceneMesh(vertices_m, triangles, material.astype(np.uint8), materials)
     return replace(mesh, triangles=merge_points(mesh.vertices_m)[mesh.triangles].astype(np.int64))
 
@@ -264,8 +263,8 @@ def height_pair(name: str, given: tuple[float, float]) -> tuple[float, float]:
 class FloorPlan:
     """Walls from floor to ceiling in all wall cells of a map.
 
-    `is_extruded`: the cells show the walls at any height. `suffixes`: possible suffixes of map files, the usual one
-    first. `receivers_at_once`: number of receivers whose paths are found at once, which bounds the memory.
+    `is_extruded`: the cells show the walls at any height. `suffixes`: suffixes of map files, the usual one first.
+    `receivers_at_once`: receivers whose paths are found at once, which bounds the memory.
     """
 
     wall_height_m: float
@@ -283,16 +282,16 @@ class FloorPlan:
         return 0.0, self.wall_height_m
 
     def known_materials(self, default: Material) -> set[Material]:
-        """Return the materials that the map may need, also for floor and ceiling; `default` for unnamed ones."""
+        """Return materials that the map may need, also for floor and ceiling; `default` for unnamed ones."""
         return {default, *self.wall_materials}
 
     def scene_materials(self, default: Material) -> dict[str, Material]:
-        """Return the materials that the map uses, by their names in the scene."""
+        """Return used materials by their names in the scene."""
         used = [0] if self.wall_material is None else np.unique(np.append(self.wall_material, 0)).tolist()
         return {f"material{index or ''}": (default, *self.wall_materials)[index] for index in used}
 
     def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
-        """Return the fields of a map with other materials, by their names in the scene."""
+        """Return the fields of a map with other materials, by names in the scene."""
         of_walls = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.wall_materials, 1))
         return {"material": materials["material"], "wall_materials": of_walls}
 
@@ -314,7 +313,7 @@ class FloorPlan:
 
 
 def _whole_offset_m(low_m: float, high_m: float) -> float:
-    """Return the whole number of metres that moves a far axis to the origin without losing digits."""
+    """Return whole metres that move a far axis to the origin without losing digits."""
     if max(abs(low_m), abs(high_m)) <= FAR_M:
         return 0.0
     return float(np.floor(max(low_m, 0.0)) + np.ceil(min(high_m, 0.0)))

@@ -29,7 +29,7 @@ from sionna_partial.settings import Material
 MAX_IFC_BYTES = 500_000_000
 
 CUT_M = 1.2001
-"""Height above the storey at which walls are cut [m]: above sills and tables, and not a round number."""
+"""Height of the cut above the storey [m]: above sills and tables, and not a round number."""
 
 LEAST_STOREY_M = 2.0
 """Height from which the next storey is the ceiling [m]; closer levels belong to stairs or foundations."""
@@ -70,7 +70,7 @@ SOLID = ("concrete", "reinforced concrete", "brick", "wood")
 
 
 class _Cut(NamedTuple):
-    """Lines of the body of an element in a horizontal plane, and the area that they enclose [m]."""
+    """Lines of an element's body in a horizontal plane, and the area inside [m]."""
 
     product: Any
     segments: Segments
@@ -78,7 +78,7 @@ class _Cut(NamedTuple):
 
 
 class _Piece(NamedTuple):
-    """Material of an element (None: default), its lines, and the area that they enclose [m]."""
+    """Material of an element (None: default), with lines and area as in `_Cut`."""
 
     material: Material | None
     segments: Segments
@@ -94,8 +94,7 @@ def map_from_ifc(
 ) -> PartialMap:
     """Make a map of a storey of an IFC model; see `load_map`.
 
-    Walls, columns, windows and the parts of curtain walls are cut 1.2 m above the storey; an element without a body has
-    the bodies of its parts. Doors are open unless `layer_materials` has a material for "IfcDoor".
+    An element without a body has the bodies of its parts.
     """
     with optional_packages(MapError):
         import ifcopenshell
@@ -131,7 +130,7 @@ def _map_of(path: Path, pieces: list[_Piece], resolution_m: float, height_m: flo
 
 
 def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tuple[float, float]:
-    """Return world z of the given storey, or the only one with walls, and the height of its ceiling above [m]."""
+    """Return world z of the given storey, or the only one with walls, and its height [m]."""
     from ifcopenshell.util.element import get_container
     from ifcopenshell.util.placement import get_local_placement
 
@@ -196,7 +195,7 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
 
 
 def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
-    """Return the type number and the wall of each element that may have a body: walls and parts of walls."""
+    """Return type number and wall of each element that may have a body: walls and their parts."""
     owner_of = {element.id(): (number, element) for number, kind in enumerate(kinds) for element in model.by_type(kind)}
     waiting = [(element, *owner) for owner in owner_of.values() for element in owner[1:]]
     while waiting:
@@ -258,10 +257,10 @@ def _covered(areas: list[shapely.Geometry], empty: PartialMap) -> Bools:
 
 
 def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) -> Material | None:
-    """Return the material of a wall, with the thickness of its layers of that material.
+    """Return the material of a wall, with the thickness of its layers.
 
-    It is the usual one of the type if that is named, else the one with the thickest layers of a known name. Drywall
-    keeps its thickness: its constants are of a whole wall with its cavity.
+    It is the usual one of the type if named, else the one with the thickest layers of a known name. Drywall keeps its
+    thickness: its constants are of a whole wall with its cavity.
     """
     from ifcopenshell.util.element import get_material
 
@@ -291,7 +290,7 @@ def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) 
 
 
 def _width_m(area: shapely.Geometry) -> float:
-    """Return the width of strips of any lengths from their area and perimeter [m]."""
+    """Return the width of strips from area and perimeter [m]."""
     count, perimeter_m = max(1, len(shapely.get_parts(area))), area.length
     return float(perimeter_m - math.sqrt(max(0.0, perimeter_m**2 - 16 * count * area.area))) / (4 * count)
 

@@ -18,10 +18,10 @@ from sionna_partial.display import Shown
 from sionna_partial.process import njit
 
 MAX_ROOM_CELLS = 1_000_000
-"""Number of cells above which a plan is coarsened before rooms are counted."""
+"""Size above which plans are coarsened to count rooms [cells]."""
 
 OPENING_RATIO = 0.65
-"""Largest width of an opening, relative to the widest circle in the smaller of the rooms that it joins."""
+"""Largest width of an opening, relative to the widest circle in the smaller room beside it."""
 
 SMALLEST_RADIUS_CELLS = 4.0
 """Radius of the widest circle in the smallest room [cells]."""
@@ -38,7 +38,7 @@ _Map = TypeVar("_Map", bound=Any)
 
 
 class Rooms(NamedTuple):
-    """Number of rooms, and the widths of the widest openings that join them [m], one for each joined room."""
+    """Number of rooms, and widths of the widest openings between them [m], one for each joined room."""
 
     number: int
     openings_m: Floats
@@ -96,7 +96,7 @@ class MapWarning(UserWarning):
 
 @dataclass(frozen=True)
 class Elements:
-    """Elements of a file with one name or type, their number, and the reason for skipping them."""
+    """Elements of one name or type, their number, and the reason for skipping them."""
 
     name: str
     count: int
@@ -117,7 +117,7 @@ class ImportSource:
 
 @dataclass(frozen=True)
 class ImportReport(ImportSource, Shown):
-    """Report of a map that was read from a file; size, rooms and doors are computed from the cells of the map.
+    """Report of a map that was read from a file; size, rooms and doors follow from its cells.
 
     Parameters
     ----------
@@ -126,19 +126,18 @@ class ImportReport(ImportSource, Shown):
     unit_m : float
         Length of a unit of the file [m].
     unit_source : str
-        Source of the unit: a header, an option, the file format, or a guess.
+        A header, an option, the file format, or a guess.
     used, skipped : tuple of Elements
         Elements of the file.
     notes : tuple of str
-        Further decisions of the reader.
+        Further decisions.
     extent_m : (float, float)
         Extent of the known cells along x and y [m].
     rooms : int
-        Number of rooms.
     free_area_m2 : float
         Area of the free cells [m^2].
     door_widths_m : tuple of float
-        Widths of the openings between rooms, to a cell [m], one for each joined room.
+        Widths of the openings between rooms, to a cell [m].
     """
 
     extent_m: tuple[float, float] = (0.0, 0.0)
@@ -169,7 +168,7 @@ class ImportReport(ImportSource, Shown):
         return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
 
     def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
-        """Yield implausible results with their remedies; checks without a remedy are skipped."""
+        """Yield implausible results with their remedies; an empty remedy skips its check."""
         (x, y), widths = self.extent_m, self.door_widths_m
         if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
             yield f"spans {x:.4g} x {y:.4g} m, with {self._unit}: {size}"
@@ -185,7 +184,7 @@ class ImportReport(ImportSource, Shown):
 
 @dataclass
 class ImportNotes:
-    """Notes of a reader: elements used, elements skipped with the reason, and the unit."""
+    """Notes of a reader for an `ImportReport`."""
 
     file: str | os.PathLike[str]
     unit_m: float = 1.0
@@ -200,10 +199,7 @@ class ImportNotes:
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
     def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
-        """Return a PartialMap with its report, and warn of implausible results.
-
-        `size`, `doors` and `area` are remedies; a check without a remedy is skipped.
-        """
+        """Return a PartialMap with its report, and warn of implausible results, as `ImportReport.faults`."""
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
         source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))

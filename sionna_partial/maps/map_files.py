@@ -66,10 +66,10 @@ _MESH_BYTES = 24 * 3 * MAX_TRIANGLES + 1000
 COVERAGE_SUFFIXES = (".nc", ".tif", ".tiff")
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
-"""Values of a Habitat top-down map: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
+"""Habitat's top-down values: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""
 
 HABITAT_COVERED = (6, 9)
-"""Drawings that may cover cells that are not navigable: target and its bounding box (habitat-lab, maps.py)."""
+"""Habitat's drawings that may cover cells that are not navigable: target and its box (maps.py)."""
 
 
 def load_map(
@@ -103,50 +103,49 @@ def load_map(
         - point cloud in metres (PCD, PLY, LAS, LAZ, XYZ, PTS): see `map_from_points`
         - DXF floor plan: see `map_from_drawing`
         - picture of a floor plan (PNG, JPEG, BMP), with `resolution_m`
-        - building model (IFC, extra `ifc`): walls, columns, windows and curtain walls are cut 1.2 m above a storey;
-          doors are open
+        - building model (IFC, extra `ifc`): walls, columns, windows and curtain walls, 1.2 m above a storey; doors are
+          open
         - map of a vacuum robot (Valetudo JSON, Valeronoi .vwm), whose segments become `PartialMap.room`
         - rosbag (.bag, .mcap, .db3, or a folder): see `map_from_bag`
     strict : bool
-        Read a ROS map exactly as map_server does. By default the shade 205, which means unknown in saved maps, and
-        transparent pixels of a trinary map stay unknown, with a `MapWarning`.
+        Read a ROS map exactly as map_server does. By default the shade 205 (unknown in saved maps) and transparent
+        pixels of a trinary map stay unknown, with a `MapWarning`.
     wall_height_m : float or None
-        Wall height [m] instead of the file's. For a mesh, the height above its lowest point up to which radios may be.
+        Instead of the file's wall height [m]. For a mesh, the height above its lowest point up to which radios may be.
     height_band_m : (float, float) or None
         World z between which surfaces of a mesh, or points of a cloud, are walls [m]. By default 1.0 to 1.8 m
         above the lowest point of a mesh, or the lowest floor of a cloud.
     observed : (M, 2) array-like, PartialMap or None
-        Observed part of a mesh: corners of a polygon in world x and y [m], or a map with known cells. By default all
-        cells above or below which the mesh has a surface.
+        Observed part of a mesh: polygon in world x and y [m], or a map with known cells. By default all cells above
+        or below which the mesh has a surface.
     resolution_m : float or None
-        Edge of the cells of a mesh, cloud, drawing or building model [m], 0.05 by default. For a picture, the metres
-        per pixel.
+        Edge of the cells of a mesh, cloud, drawing or building model [m], by default 0.05; for a picture, metres per
+        pixel (required).
     up : {"z", "y"} or None
-        Axis of a mesh or cloud that points up. By default y for glTF, as its specification says, and z for other
-        files, with a `MapWarning` if that looks wrong.
+        Axis of a mesh or cloud that points up: by default y for glTF (its specification) and z for others, with a
+        `MapWarning` if that looks wrong.
     layer_materials : mapping of str to Material or str, or None
-        Materials of the walls on layers of a drawing (see `map_from_drawing`), or by types of a building model, such
-        as "IfcWall". "IfcDoor" closes the doors.
+        Materials by layers of a drawing (see `map_from_drawing`), or by types of a building model, such as "IfcWall";
+        "IfcDoor" closes the doors.
     wall_layers : sequence of str or None
-        Layers of a drawing with the walls (see `map_from_drawing`).
+        As in `map_from_drawing`.
     unit_m : float or None
-        Length of a unit of a drawing, mesh or cloud [m]: 0.001 for millimetres. By default the unit in the header of
-        a drawing, and 1 for meshes and clouds.
+        Length of a unit of a drawing, mesh or cloud [m], by default the drawing's header, and 1 for meshes and clouds.
     storey : str or None
-        Name of a storey of a building model. Optional if only one has walls.
+        Storey of a building model; optional if only one has walls.
     obstacle_height_m : float or None
         Height of free-standing obstacles on a floor plan [m] (see `PartialMap.with_obstacle_height`).
 
     Returns
     -------
     PartialMap
-        In world axes. The yaw of the origin is applied: quarter turns are exact, any other yaw halves the size of the
-        cells. `import_report` lists what was used and skipped.
+        In world axes, with the yaw of the origin applied: quarter turns are exact, any other yaw halves the size of
+        the cells. `import_report` lists what was used and skipped.
 
     Raises
     ------
     MapError
-        For a file that is missing, damaged, of another kind or out of range, or an argument for another kind of file.
+        For a missing, damaged or unknown file, a value out of range, or an argument for another kind of file.
 
     Examples
     --------
@@ -189,14 +188,14 @@ def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mappin
     path : path-like
         `.yaml` or `.yml` (ROS map_server, with a `.pgm` of the same stem; not for meshes) or `.npz`.
     extra : mapping or None
-        Additional keys for the YAML.
+        Further keys for the YAML.
 
     Raises
     ------
     MapError
-        If `partial` is not a PartialMap.
+        For anything but a PartialMap.
     OutputError
-        For another suffix, a mesh or `extra` in a format without them, or if writing fails. No partial file remains.
+        For another suffix, a mesh or `extra` in a format without them, or if writing fails; no partial file remains.
 
     Examples
     --------
@@ -255,10 +254,6 @@ def map_from_array(
     wall_height_m : float
         Height of walls and ceiling [m].
 
-    Returns
-    -------
-    PartialMap
-
     Raises
     ------
     MapError
@@ -283,28 +278,22 @@ def map_from_habitat(
 ) -> PartialMap:
     """Make a map from Habitat's top-down map and its fog-of-war mask.
 
-    Revealed navigable cells are free. Revealed border cells, and cells that are not navigable (0) but share an edge
-    with a free one, are walls: the mask reveals no such cell. Cells under agent, path and start are navigable. Cells
-    under a target, and all others, are unknown.
+    Revealed navigable cells are free. Revealed border cells, and cells that are not navigable (0) beside a free one,
+    are walls: the mask reveals no such cell. Cells under agent, path and start are navigable; cells under a target,
+    and all others, are unknown.
 
     Parameters
     ----------
     top_down : (rows, columns) integers
-        `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. Rows run along Habitat's
-        +z, columns along +x. World x is Habitat's x and y is -z, so that row 0 holds the LARGEST y.
+        `info["top_down_map"]["map"]`, or `habitat.utils.visualizations.maps.get_topdown_map`. World x is Habitat's x
+        (columns) and y is -z (rows), so that row 0 holds the LARGEST y.
     fog_of_war : (rows, columns) integers or booleans
         `info["top_down_map"]["fog_of_war_mask"]`: nonzero where the agent has seen.
     resolution_m : float
         Metres per pixel.
-    origin_m : (float, float)
-        World x and y of the lower-left corner [m]: `(lower[0], -(lower[2] + rows * resolution_m))` for the lower bound
+    origin_m, wall_height_m
+        As of `map_from_array`; `origin_m` is `(lower[0], -(lower[2] + rows * resolution_m))` for the lower bound
         of Habitat's `pathfinder.get_bounds()`.
-    wall_height_m : float
-        Height of walls and ceiling [m].
-
-    Returns
-    -------
-    PartialMap
 
     Raises
     ------
@@ -343,15 +332,11 @@ def map_from_slam(
     Parameters
     ----------
     obstacle, explored : (ny, nx) numbers in [0, 1]
-        Probability of an obstacle, and of having been explored (`map[0]` and `map[1]`). Row 0 holds the smallest y.
+        Probabilities of an obstacle (`map[0]`) and of exploration (`map[1]`). Row 0 holds the smallest y.
     resolution_m, origin_m, wall_height_m
         As of `map_from_array`.
     threshold : float
         Smallest probability that counts.
-
-    Returns
-    -------
-    PartialMap
 
     Raises
     ------
@@ -385,7 +370,7 @@ def _require_equal_shapes(name: str, array: NDArray[Any], other: str, like: NDAr
 
 
 def _later(reader: str) -> Callable[..., PartialMap]:
-    """Return a reader, such as "ifc:map_from_ifc", whose module is imported when a file is read."""
+    """Return a reader, such as "ifc:map_from_ifc", that imports its module at the first call."""
     return lambda source, **options: resolve_name(f"sionna_partial.maps.{reader}")(source, **options)
 
 
@@ -436,8 +421,6 @@ def _read_npz(source: Path) -> PartialMap:
 
 
 class _Reader(NamedTuple):
-    """Name, reading function and `load_map` arguments of a kind of file."""
-
     what: str
     read: Callable[..., PartialMap]
     options: tuple[str, ...] = ()
@@ -482,7 +465,7 @@ _READERS = {
     **dict.fromkeys(PICTURE_SUFFIXES, _Reader("a picture", _later("drawings:read_picture"), ("resolution_m",))),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
-"""Readers by suffix. Their modules are imported when a file is read."""
+"""Readers by suffix."""
 
 
 def _reader_of(source: Path) -> tuple[Path, _Reader]:
@@ -502,7 +485,7 @@ def _reader_of(source: Path) -> tuple[Path, _Reader]:
 
 
 def _reader_of_scene(source: Path) -> tuple[Path, _Reader]:
-    """Return the file of an exported scene, of the only Mitsuba scene, or of the map of a calibration."""
+    """Return the file of an exported scene, an only Mitsuba scene, or a calibration's map."""
     folder = source if source.is_dir() else source.parent
     scenes = sorted(folder.glob("*.xml")) if source.is_dir() else [source]
     if folder / "scene.xml" in scenes and all((folder / name).is_file() for name in SCENE_FILES):

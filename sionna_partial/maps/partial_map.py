@@ -41,13 +41,13 @@ OUTLINE_M = 0.3
 """Largest distance of an outline from the cells of its wall [m]."""
 
 ROOM_M, BODY_M = 0.6, 0.3
-"""Radius of the largest disc in an unknown region that may be a room, and of a disc that can enter it [m]."""
+"""Radius of a disc that fits into an unknown room, and of one that can enter it [m]."""
 
 POCKET_M = 0.4
-"""Edge of a square that an unknown region must hold for a robot to look into it [m]."""
+"""Edge of a square in unknown regions that a robot would look into [m]."""
 
 FAR_EXTENTS = 2.0
-"""Distance from the middle of a map, in its extents, from which a position has another unit or map."""
+"""Distance from the middle of a map, in its extents, from which positions have another unit or map."""
 
 _BORDER_CELLS = 1e-6
 
@@ -70,7 +70,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     resolution_m : float
         Edge of a cell [m], between 1 mm and 10 m.
     origin_m : (float, float)
-        World x and y of the lower-left corner of the lower-left cell [m].
+        World x and y of the lower-left corner of the grid [m].
     wall_height_m : float
         Height of walls and ceiling of a plan [m]. A mesh has its own (`height_range_m`).
     interior_cells : int or None
@@ -80,13 +80,13 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     material : Material or None
         Material of walls, floor and ceiling, or of unnamed parts of the mesh; None is the material of SceneSettings.
     wall_material : (ny, nx) uint8 array or None
-        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material`. Not for meshes.
-        See `with_wall_material`.
+        Material of each wall cell: k for `wall_materials[k - 1]`, 0 for `material` (see `with_wall_material`). Not for
+        meshes.
     wall_materials : tuple of Material
         At most 255.
     obstacle : (ny, nx) uint8 array or None
-        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls.
-        Not for meshes. See `with_obstacle_height`.
+        Wall cells that end below the ceiling: k for the height `obstacle_heights_m[k - 1]`, 0 for full walls (see
+        `with_obstacle_height`). Not for meshes.
     obstacle_heights_m : tuple of float
         At most 255 [m].
     room : (ny, nx) uint8 array or None
@@ -94,7 +94,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     room_names : tuple of str
         At most 255 names, such as the segments of a vacuum robot's map.
     import_source : ImportSource or None
-        Facts about the source file, for `import_report`. Equality ignores it.
+        Facts about the source file, for `import_report`; ignored by equality.
 
     Raises
     ------
@@ -168,7 +168,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return equal_fields(self, other)
 
     def layers(self) -> dict[str, tuple[States, str, list[Any]]]:
-        """Return the cells of each layer, the field with its values, and the values as plain data."""
+        """Return each layer's cells, the field with its values, and these as plain data."""
         found = {}
         for name, (counted, _, _) in _LAYERS.items():
             if (cells := getattr(self, name)) is not None:
@@ -177,7 +177,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return found
 
     def window(self, row: int, column: int, shape: tuple[int, int], beyond: CellState) -> "PartialMap":
-        """Return the map of `shape` cells from a row and a column on; cells outside the grid are all `beyond`."""
+        """Return `shape` cells from a row and column on; cells outside the grid are `beyond`."""
         ny, nx = self.shape
         rows, columns = np.arange(row, row + shape[0]), np.arange(column, column + shape[1])
         inside = np.ix_((rows >= 0) & (rows < ny), (columns >= 0) & (columns < nx))
@@ -199,7 +199,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Parameters
         ----------
         material : Material or str
-            The material, or its name for `Material.named`.
+            The material, or a name for `Material.named`.
         where : (ny, nx) bool array, (M, 2) array-like, or shapely geometry
             Cells, or a polygon or geometry in world x and y [m] that contains the centres of cells.
 
@@ -229,10 +229,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         Parameters
         ----------
         height_m : float
-            Height of their tops [m]; from `wall_height_m` on they are walls.
+            Height of their tops [m]; from `wall_height_m` on they are full walls.
         where : (ny, nx) bool array, (M, 2) array-like, shapely geometry or None
-            The area as in `with_wall_material`. None selects free-standing walls: pieces within 2.5 m along x and y
-            with only free cells around them, pillars included.
+            As in `with_wall_material`. None selects free-standing walls, pillars included: pieces within 2.5 m along x
+            and y with only free cells around.
 
         Raises
         ------
@@ -280,7 +280,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Number of rows and columns (ny, nx)."""
+        """Rows and columns (ny, nx)."""
         ny, nx = self.state.shape
         return ny, nx
 
@@ -292,32 +292,32 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def environment(self) -> FloorPlan | SceneMesh:
-        """Walls extruded from its cells, or its mesh."""
+        """Walls extruded from the cells, or the mesh."""
         return self.mesh or FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
 
     @property
     def height_range_m(self) -> tuple[float, float]:
-        """World z of floor and ceiling, or of the ends of a mesh [m]; radios must be between them."""
+        """World z of floor and ceiling, or of the ends of a mesh [m], between which radios must be."""
         range_m = self.environment.height_range_m
         assert range_m is not None  # a mesh has it once it is built
         return range_m
 
     @cached_property
     def import_report(self) -> ImportReport | None:
-        """Report of the source file: unit, extent, rooms, doors, elements used and skipped. None without a file."""
+        """Report of the source file, None without one."""
         return None if self.import_source is None else report_of(self.import_source, self.state, self.resolution_m)
 
     @cached_property
     def is_complete(self) -> bool:
         """True if no free cell touches an unknown one by an edge; False without free cells.
 
-        The space beyond the grid is unknown: free cells at its border make a map incomplete.
+        The space beyond the grid is unknown.
         """
         return bool((self.state == CellState.FREE).any() and not frontier_cells(self.state).any())
 
     @cached_property
     def is_nearly_complete(self) -> bool:
-        """True if no unknown room can be entered; only pockets in furniture or thick walls are unknown.
+        """True if no unknown room can be entered.
 
         An unknown region is a room if it reaches beyond the grid or holds a disc of `ROOM_M`, and a disc of `BODY_M`
         can enter it from free cells. Meshes are never nearly complete.
@@ -328,7 +328,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_noise(self) -> float:
-        """Range noise of the walls, from their thickness where they are rough: 0 (exact) to 1."""
+        """Range noise from the thickness of rough walls: 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
 
     @property
@@ -341,21 +341,21 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def _near_named_walls(self) -> Bools:
-        """Cells (ny, nx) whose nearest wall is within `OUTLINE_M` and has a named material."""
+        """Cells (ny, nx) within `OUTLINE_M` of walls, whose nearest wall has a named material."""
         if self.wall_material is None:
             return np.zeros(self.shape, dtype=bool)
         away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
         return (self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)
 
     def at_named_walls(self, points_m: NDArray[np.floating]) -> Bools:
-        """Return whether points (..., 3) [m] on outlines, or NaN, are on walls with a named material."""
+        """Return whether points (..., 3) [m] on outlines, or NaN, are on named walls."""
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
         column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)
         return self._near_named_walls[row, column]
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:
-        """Number of cells in every direction, corners included, in the state of each cell (ny, nx)."""
+        """Result of the function `uniform_cells` for `state`."""
         return uniform_cells(self.state)
 
     @property
@@ -371,7 +371,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return float((self.state != CellState.UNKNOWN).mean())
 
     def cell_index(self, points_m: NDArray[np.floating]) -> tuple[Indices, Indices]:
-        """Row and column (...) of the cells that hold world points (..., 2 or 3) [m]; they may be outside the grid."""
+        """Rows and columns (...) of world points (..., 2 or 3) [m], possibly outside the grid."""
         points = np.asarray(points_m, dtype=float)
         column = np.floor((points[..., 0] - self.origin_m[0]) / self.resolution_m + 1e-9).astype(np.intp)
         row = np.floor((points[..., 1] - self.origin_m[1]) / self.resolution_m + 1e-9).astype(np.intp)
@@ -380,8 +380,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def state_at(self, points_m: NDArray[np.floating]) -> States:
         """Return the CellState at world points (..., 2 or 3) [m]; UNKNOWN outside the grid.
 
-        A point on a border belongs to the freest cell: FREE before UNKNOWN before WALL, since planners put radios on
-        corners of cells beside walls.
+        A point on a border is FREE before UNKNOWN before WALL: planners put radios on corners of cells beside walls.
         """
         cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m
         padded = np.pad(self.state, 1, constant_values=CellState.UNKNOWN)
@@ -395,9 +394,9 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
-        """Heights up to which walls reach [m], and a map with the walls of that height, full walls first.
+        """Heights up to which walls reach [m], and maps with the walls of that height, full walls first.
 
-        The first map has infinite height, and free cells instead of obstacles and the areas that they enclose.
+        The first height is infinite; its map has free cells instead of obstacles and the areas that they enclose.
         """
         if self.obstacle is None:
             return ((math.inf, self),)
@@ -422,13 +421,13 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def require_positions(self, name: str, points_m: object, *, least: int = 1, names: Sequence[str] = ()) -> Floats:
         """Check radio positions (3,) or (N, 3) [m], and return them as a float64 array.
 
-        Messages contain the argument `name` and the `names` of positions, if given.
+        Messages contain the argument's `name` and the `names` of positions.
 
         Raises
         ------
         PositionError
-            For another shape, fewer than `least`, a value that is not finite, or a point outside the map, inside a
-            wall, or not between floor and ceiling. Unknown cells are allowed (the paper needs them).
+            For another shape, fewer than `least`, values that are not finite, or points outside the map, in a wall,
+            or not between floor and ceiling. Unknown cells are allowed (the paper needs them).
         """
         points = position_array(name, points_m, least=least)
         flat = points.reshape(-1, 3)
@@ -442,7 +441,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return points
 
     def _turned_hint(self, points_m: Floats) -> str:
-        """Suggest a transposed array of states if it would make all positions (N, 3), at least three, free."""
+        """Suggest transposed states if positions (N, 3), at least three, would all be free."""
         turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
         can_tell = len(points_m) >= 3 and self.environment.is_extruded and bool((np.abs(points_m) < 1e8).all())
         for name, state in turns.items() if can_tell else ():
@@ -451,7 +450,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return ""
 
     def _unit_hint(self, point_m: Floats) -> str:
-        """Ask for metres if a position (3,) far outside would be on the map in another unit."""
+        """Ask for metres if a position (3,) would be on the map in another unit."""
         x0, y0, x1, y1 = self.bounds_m
         if not np.abs(point_m[:2] - ((x0 + x1) / 2, (y0 + y1) / 2)).max() > FAR_EXTENTS * max(x1 - x0, y1 - y0):
             return ""
@@ -547,7 +546,7 @@ def aligned_blocks(partial: PartialMap, factor: int) -> tuple[States, Floats]:
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
-    """Return unknown cells, as in furniture and pillars, of enclosed regions without a square of `POCKET_M`."""
+    """Return unknown cells of enclosed regions without a square of `POCKET_M`, as in furniture and pillars."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     size = max(1, math.ceil(POCKET_M / resolution_m - 1e-6))
     regions, count = ndimage.label(unknown, np.ones((3, 3), dtype=bool))
@@ -558,7 +557,7 @@ def unknown_pockets(state: States, resolution_m: float) -> Bools:
 
 
 def _has_unknown_room(state: States, resolution_m: float) -> bool:
-    """Return whether there is an unknown room as in `PartialMap.is_nearly_complete`, or there are no walls."""
+    """Return whether there is an unknown room as in `PartialMap.is_nearly_complete`, or no wall."""
     state = np.pad(state, math.ceil(BODY_M / resolution_m) + 1, constant_values=CellState.UNKNOWN)
     unknown, opened = state == CellState.UNKNOWN, state != CellState.WALL
     if opened.all():
@@ -574,14 +573,14 @@ def _has_unknown_room(state: States, resolution_m: float) -> bool:
 
 
 def frontier_cells(state: States) -> Bools:
-    """Return free cells that share an edge with an unknown one; all is unknown outside the grid."""
+    """Return free cells that share an edge with an unknown one, or the grid's border."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
     return np.asarray(touches & (state == CellState.FREE))
 
 
 def uniform_cells(state: States) -> NDArray[np.int32]:
-    """Return the number of cells in every direction, corners included, that have the state of each cell."""
+    """Return the number of cells in every direction, corners included, with the state of each cell."""
     uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
     for kind in CellState:
         cells = state == kind
@@ -591,7 +590,7 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
 
 
 def warn_of_odd_states(what: str, partial: PartialMap) -> None:
-    """Warn of a map, called `what`, without walls or free cells, or that looks inverted."""
+    """Warn of a map without walls or free cells, or that looks inverted."""
     count = np.bincount(partial.state.ravel(), minlength=len(CellState))
     free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
     if partial.state.size < ODD_CELLS or not free + wall:
@@ -636,7 +635,7 @@ def _checked_state(values: ArrayLike) -> States:
 
 
 def free_standing(state: States, resolution_m: float) -> Bools:
-    """Return free-standing wall cells (ny, nx): pieces within `FREE_STANDING_M`, with free cells around.
+    """Return free-standing wall cells (ny, nx), as `PartialMap.with_obstacle_height`.
 
     Unknown cells that only walls touch belong to them.
     """
@@ -684,11 +683,11 @@ _LAYERS: dict[str, tuple[str, CellState, Callable[[tuple[Any, ...]], tuple[Any, 
     "obstacle": ("obstacle_heights_m", CellState.WALL, _checked_heights),
     "room": ("room_names", CellState.FREE, _checked_names),
 }
-"""Layers of a map: field of its values, state of its cells, check of its values."""
+"""Layers: field of the values, state of the cells, check of the values."""
 
 
 def layers_of(found: Mapping[str, Any], cells: Callable[[Any], Any], values: Callable[[Any], Any]) -> dict[str, Any]:
-    """Return the fields of the layers of a file; two functions decode its cells and its plain values (`layers`)."""
+    """Return the layers of a file; two functions decode cells and plain values (`layers`)."""
     layers = {name: cells(found[name]) for name in _LAYERS if name in found}
     counted = {_LAYERS[name][0]: values(found[_LAYERS[name][0]]) for name in layers}
     return layers | {

@@ -46,7 +46,7 @@ MAX_YAML_BYTES = 1_000_000
 MAX_IMAGE_BYTES = 16 * MAX_CELLS
 
 DARK_OCCUPANCY = 0.51
-"""Occupancy from which a grey pixel looks like a wall; 127 and 128 of 255 often mean unknown."""
+"""Occupancy from which a grey pixel looks like a wall; 127 and 128 often mean unknown."""
 
 SPREAD_FRACTION, REPORTED_FRACTION = 0.25, 0.1
 """Fractions of seen cells between the thresholds from which a map has continuous values, and from which a map of other
@@ -67,7 +67,7 @@ TOUCHED_WALLS = 0.1
 """Fraction of the walls that free cells touch up to which a map looks inflated."""
 
 MAX_YAW_RAD = 6.2832
-"""Largest yaw of an origin: one turn, as people round it. Larger values are degrees [rad]."""
+"""Largest yaw of an origin [rad]: one turn, rounded up; larger values are degrees."""
 
 
 class _Sheet(NamedTuple):
@@ -80,7 +80,7 @@ class _Sheet(NamedTuple):
 
 
 class _EachKeyOnce(yaml.SafeLoader):
-    """Loader that refuses duplicate keys, of which YAML keeps the last."""
+    """Loader that refuses duplicate keys; YAML keeps the last."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         keys = [key.value for key, _ in node.value if isinstance(key, yaml.ScalarNode)]
@@ -193,7 +193,7 @@ def _layer(
 def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
     """Write a map as `path` (YAML) and a PGM image of the same stem.
 
-    The YAML of a map with a mesh completes the exported scene beside it.
+    With a mesh, the YAML completes the exported scene beside it.
     """
     sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
     if partial.interior_cells is not None:
@@ -214,7 +214,7 @@ def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] |
 
 
 def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
-    """Return the map_server keys of the YAML at `path`, for a PGM image of the same stem."""
+    """Return the map_server keys of a YAML, for a PGM image of the same stem."""
     return {
         "image": path.with_suffix(".pgm").name,
         "mode": mode,
@@ -260,9 +260,9 @@ def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
 def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
     """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
 
-    Quarter turns are exact. A remaining tilt that moves no cell by more than half its size is ignored. Any other yaw
-    samples the grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs
-    (sqrt 2). Gaps where walls meet only at a corner are closed.
+    Quarter turns are exact. A tilt that moves no cell by more than half its size is ignored. Any other yaw samples the
+    grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs (sqrt 2). Gaps
+    where walls meet only at a corner are closed.
 
     Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
     """
@@ -309,9 +309,9 @@ def fitted_threshold(
 ) -> float | None:
     """Return the occupancy that separates free cells and walls in a map of continuous values, else None.
 
-    Such a map, as of Cartographer, has many different values between the thresholds. The result is in the valley of the
+    Such a map, as of Cartographer, has many values between the thresholds. The result is in the valley of the
     histogram (V,), between two well separated distributions with means below and above 50 percent. An empty remedy
-    keeps the thresholds, which the caller chose.
+    keeps the caller's thresholds.
     """
     between, total = (percent > free_percent) & (percent < occupied_percent), int(count.sum())
     inside = int(count[between].sum())
@@ -399,7 +399,7 @@ _LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
     "room": ("names", "room_names", _room_name),
 }
-"""Layers of a map by their keys in the YAML: key of the values that the shades count, field of the map, reader."""
+"""Layers by their keys in the YAML: key of their values, field of the map, reader."""
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
@@ -482,7 +482,7 @@ def _decode(sheet: _Sheet) -> Image.Image:
 
 
 def opened_image(path: Path, given: str, formats: tuple[str, ...]) -> Image.Image:
-    """Return a decoded image of at most `MAX_CELLS` pixels; errors begin with `given`."""
+    """Return an image of at most `MAX_CELLS` pixels; errors begin with `given`."""
     try:
         with (
             open_regular(path, given.partition(" = ")[0], MapError, MAX_IMAGE_BYTES) as stream,
@@ -515,7 +515,7 @@ def bare_image(path: Path) -> MapError:
 
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
-    """Classify every pixel as nav2's loadMapFromFile does; occupancies between the thresholds are unknown."""
+    """Classify pixels as nav2's loadMapFromFile does, unknown between the thresholds."""
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
     if sheet.mode == "raw":
@@ -535,7 +535,7 @@ def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
 def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict: bool) -> States | None:
     """Return the states of a map of continuous values, with fitted thresholds; None for any other map.
 
-    Unknown are transparent pixels, and the shade 205, 127 or 128 if it is far more frequent than its neighbours.
+    Transparent pixels are unknown, and the shade 205, 127 or 128 if far more frequent than its neighbours.
     """
     full = 255 * pixels.per_shade + pixels.opaque
     shade = np.arange(full + 1) / full
@@ -564,7 +564,7 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict:
 
 
 def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
-    """Warn if hardly any free cell touches a wall, as around the inflated obstacles of a costmap."""
+    """Warn if hardly any free cell touches a wall, as around inflated obstacles."""
     wall, free, square = state == CellState.WALL, state == CellState.FREE, np.ones((3, 3), dtype=bool)
     faces = wall & binary_dilation(~wall, square)
     apart = 1.0 - (faces & binary_dilation(free, square)).sum() / max(1, faces.sum())
@@ -593,7 +593,7 @@ def _keep_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Keep transparent pixels and the shade 205 unknown, in place.
 
     With a free_thresh above 0.196 (older nav2 wrote 0.25), or an alpha channel, 205 reads as free. It stays unknown
-    where more cells would be lost that way than would be unknown.
+    where reading it as free would lose more cells than would be unknown.
     """
     shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)

@@ -33,7 +33,7 @@ _COLUMNS = {"pixels": 2, "compressedPixels": 3}
 
 
 class VacuumFrame(NamedTuple):
-    """Frame of a ValetudoMap, whose y points down, in world axes from the lower-left corner of its area."""
+    """Frame of a ValetudoMap, with y down, in world axes from the lower-left corner."""
 
     size_y_m: float
     pixel_m: float
@@ -47,7 +47,7 @@ class VacuumFrame(NamedTuple):
 def read_json(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError]
 ) -> tuple[dict[str, Any], dict[str, Any], VacuumFrame]:
-    """Return the content of a JSON file, its ValetudoMap and the frame; an `error` names `field`."""
+    """Return the content of a JSON file, its ValetudoMap and its frame."""
     content = read_bytes(path, field, error, MAX_BYTES)
     try:
         raw = json.loads(content)

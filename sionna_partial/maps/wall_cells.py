@@ -1,4 +1,4 @@
-"""Wall cells of a map -> cells that outlines pass through -> chains of cells -> straight runs that fit them."""
+"""Wall cells -> cells for outlines -> chains of cells -> straight runs."""
 
 import math
 from typing import NamedTuple
@@ -12,13 +12,13 @@ from sionna_partial.constants import CellState
 from sionna_partial.process import njit
 
 MAX_GAP_CELLS = 2
-"""Longest gap of FREE cells in a wall that is closed, and longest bump or notch that is levelled [cells]."""
+"""Longest FREE gap that is closed, and longest bump or notch that is levelled [cells]."""
 
 MAX_FREE_GAP_M = 0.11
 """Longest gap of FREE cells that is closed [m]: log-odds mapping erases single wall cells."""
 
 MIN_RUN_CELLS = 3
-"""Length of wall on both sides of a gap from which the gap belongs to a seen wall [cells]."""
+"""Least length of wall on both sides of a gap in a seen wall [cells]."""
 
 DEEP_CELLS = 4
 """Depth behind the face of a deep wall in which cells are FREE [cells]."""
@@ -35,15 +35,14 @@ _ROUGH, _DEEP = 0.05, 0.3
 
 _RAGGED = 0.006, 0.012
 """Fractions of ragged edges from which depth is a sign of noise, in part and in full.
-
-Plans have less than 0.001, and up to 0.01 where tilted; lidars with range noise have 0.007 to 0.1.
+Plans have less than 0.001 (0.01 where tilted); lidars with range noise have 0.007 to 0.1.
 """
 
 _DEPTH_M = 0.0125
 """Depth of the wall cells behind faces at which the noise is 1 - 1/e [m]."""
 
 LEAST_NOISE = 0.05
-"""Noise of walls up to which a map counts as exact; cells cut out of meshes have as much."""
+"""Noise up to which a map counts as exact, as of cells cut out of meshes."""
 
 RAGGED_FACTOR = 2.0
 """Largest distance of a line from ragged walls, in tolerances."""
@@ -65,9 +64,9 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) for outlines.
 
-    `peeled` (ny, nx) were removed from walls two cells thick: the outline is between both layers. `noise` is 0 for
-    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of thick
-    walls.
+    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `noise` is 0 for
+    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of
+    thick walls.
     """
 
     cells: Bools
@@ -79,7 +78,7 @@ class CleanWalls(NamedTuple):
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
     """Clean the wall cells of a map with states (ny, nx).
 
-    Enclosed pinholes are filled, notches and bumps of one by at most two cells are levelled, and gaps in seen walls are
+    Enclosed pinholes are filled, notches and bumps of one by at most two cells levelled, and gaps in seen walls
     closed: of UNKNOWN cells up to `bridge_gap_m`, of FREE cells in straight walls up to `MAX_FREE_GAP_M`. Of walls seen
     from FREE cells only the cells beside these, and inner corners of deep walls, are kept. Walls two cells thick are
     thinned.
@@ -106,8 +105,8 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
-    Both touch a FREE cell only by a corner. Behind an outer corner, and behind a step of a tilted face, another FREE
-    cell is beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
+    Both touch a FREE cell only by a corner. Behind an outer corner or a step of a tilted face, another FREE cell is
+    beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
@@ -128,8 +127,7 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     """Return the noise of `CleanWalls`.
 
-    Exact rays mark one layer of cells with smooth faces, noisy ones several with rough faces. Walls of plans are thick,
-    but smooth.
+    Exact rays mark one layer of cells, noisy ones several with rough faces. Walls of plans are thick, but smooth.
     """
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
@@ -169,7 +167,7 @@ def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     """Return the UNKNOWN cells that close gaps between two pieces of wall.
 
-    A gap is a row of at most `longest` UNKNOWN cells beside FREE ones. The shortest line between the pieces closes it,
+    A gap is a row of at most `longest` such cells beside FREE ones. The shortest line between the pieces closes it,
     or the row itself where rays passed that line.
     """
     gap = ndimage.binary_dilation(free) & ~free & ~wall
@@ -192,7 +190,7 @@ def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
 
 
 def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
-    """Return row, first column and end column of every horizontal run of True, in reading order."""
+    """Return row, first and end column of horizontal runs of True, in reading order."""
     step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
     row, start = np.nonzero(step == 1)
     return row, start, np.nonzero(step == -1)[1]
@@ -248,7 +246,7 @@ def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: flo
 
 
 def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
-    """Thin walls of two cells to one, keeping cells that face FREE ones if only one side does."""
+    """Thin walls of two cells to one; the only layer that faces FREE cells is kept."""
     label, _ = ndimage.label(wall, structure=_SQUARE)
     small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
     kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
@@ -267,7 +265,7 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
 
 
 def _peeled(wall: Bools, candidates: Bools) -> Bools:
-    """Return the candidates whose removal, one by one, neither splits, opens nor shortens the wall."""
+    """Return candidates whose removal, one by one, neither splits, opens nor shortens the wall."""
     left = wall.copy()
     rows, columns = np.nonzero(candidates)
     for parity in range(4):
@@ -286,14 +284,13 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
 def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if one line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
-    the line is steeper against. Ragged polylines, which turn back four times or more and at least once in 10 cells, get
+    A run is allowed if a line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
+    the line is steeper against. Ragged polylines, which turn back at least four times and once in 10 cells, get
     `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
-    variances, in squared tolerances. Lines are least-squares if that keeps the tolerance, or parallel to an axis for
-    ragged runs if that moves their ends by at most half a cell.
+    variances, in squared tolerances. Lines are least-squares within the tolerance, or parallel to an axis for ragged
+    runs if that moves their ends by at most half a cell.
 
-    Returns the index of the first corner of every run (r,), and a point x, y on and the direction x, y of its line (r,
-    4).
+    Returns the first corner of every run (r,), and a point x, y and the direction x, y of its line (r, 4).
     """
     upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
     tolerance = tolerance + 1e-6
@@ -321,7 +318,7 @@ def _find_runs(points, swapped, tolerance, cost, previous, along_y):
 
 @njit(cache=True)
 def _extend(points, tolerance, start, swap, cost, previous, along_y):
-    """Lengthen the run from `start` while a line fits, and note where that makes a split cheaper."""
+    """Lengthen the run from `start` while a line fits; note cheaper splits."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
     moments = np.zeros(6)
@@ -348,7 +345,7 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):
 
 @njit(cache=True)
 def _line(points, start, end, tolerance):
-    """Return a point on and the direction of the line that fits a run; a ragged one may be parallel to an axis."""
+    """Return a point and the direction of the line that fits a run."""
     for factor in (1.0, RAGGED_FACTOR):
         limit, moments = factor * tolerance, np.zeros(6)
         polygon, size = _all_lines()
@@ -402,7 +399,7 @@ def _middles(points, origin, k):
 
 @njit(cache=True)
 def _accumulate(moments, element):
-    """Add the middles of an element's unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
+    """Add the middles of unit edges to the moments: sums of 1, x, y, xx, xy, yy."""
     x0, y0, x1, y1, steps = element
     x, y = 0.5 * (x0 + x1), 0.5 * (y0 + y1)
     spread = (steps + 1.0) / (12.0 * (steps - 1.0)) if steps > 1 else 0.0

@@ -1,4 +1,4 @@
-"""Correction of predictions by measurements: a Gaussian process on the residuals, correlated over walking lengths."""
+"""Correction of predictions by measurements: a Gaussian process on residuals, over walking lengths."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ With `P_POWERS`, the 90 % regions of `locate_transmitter` contain 69 % of transm
 
 
 class Kind(NamedTuple):
-    """Kind of measurements, path gains or powers, with its priors."""
+    """Path gains or powers, with their priors."""
 
     mean: tuple[float, float]
     """Expected common offset [dB], and common factor on the loss over free space."""
@@ -79,7 +79,7 @@ class Kind(NamedTuple):
     """Standard deviation of measured gains from a trace through observed space [dB]."""
 
     deepest: float
-    """Limit of negative residuals when kinds are compared: unseen walls make single links arbitrarily deep."""
+    """Limit of negative residuals in comparisons: unseen walls make single links arbitrarily deep."""
 
     exact: bool
     """True if certain predictions stay certain; for a real radio no trace is certain."""
@@ -102,7 +102,7 @@ class Kind(NamedTuple):
         return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=covariance)
 
     def _learnt(self, others: Sequence[tuple[Floats, Floats]], within: Floats) -> tuple[float, Floats, Floats]:
-        """Return the log-evidence of a covariance (2, 2) between transmitters, and the prior's mean and covariance."""
+        """Return the log-evidence of a covariance (2, 2) between transmitters, and the new mean and covariance."""
         precision, shift, log_p = np.zeros((2, 2)), np.zeros(2), 0.0
         for own_precision, own_shift in others:
             scattered = np.linalg.inv(np.eye(2) + own_precision @ within)
@@ -120,15 +120,15 @@ KINDS = (
     Kind((0.0, 1.0), np.diag([2.0, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
     Kind((0.0, 0.5), np.diag([40.0, 0.2]) ** 2, 4.0, 3.0, math.inf, True),
 )
-"""Path gains as traced, and powers at a real radio, with shadows filled by objects that maps lack."""
+"""Traced path gains, and powers at a real radio, with shadows filled by objects missing on maps."""
 
 KINDS_THROUGH_WALLS = tuple(
     Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False) for offset_db in (2.0, 40.0)
 )
-"""Gains and powers at a real radio, through walls whose loss may be from zero to over twice the expected loss."""
+"""Gains and powers through walls whose loss is from zero to over twice the expected loss."""
 
 UNKNOWN_FACTOR_STD = 0.3
-"""Standard deviation of the factor where candidate materials have losses of their own."""
+"""Standard deviation of the factor if candidate materials have their own losses."""
 
 LEAST_WEIGHT = 0.01
 """Smallest probability of a candidate in predictions."""
@@ -140,7 +140,7 @@ LIKELY_BETWEEN, BETWEEN_SPREAD = (3.0, 0.2), 0.5
 """Most probable of them a priori, and the standard deviation of their logarithms."""
 
 MOST_POINTS = 500
-"""Number of measured positions above which neighbours are averaged."""
+"""Number of positions above which neighbours are averaged."""
 
 _SWEEPS, _DAMPING = 8, 0.5
 _RANGES = 5.0
@@ -150,7 +150,7 @@ _LEAST_P = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Walks:
-    """Lengths of walks from P points on a map, around walls; unknown cells make them longer."""
+    """Lengths of walks from P points around walls, longer through unknown cells."""
 
     partial: PartialMap
     points_m: Floats
@@ -242,7 +242,7 @@ class _Sample(NamedTuple):
         return np.bincount(self.group, weights=values) / self.size
 
     def noises_db(self) -> dict[float, Floats]:
-        """Return standard deviations (P,) of averages by the given or candidate noise of a measurement [dB]."""
+        """Return standard deviations (P,) of averages by the noise of a measurement [dB]."""
         std_db = self.measured.std_db
         if std_db is None:
             return {noise_db: noise_db / np.sqrt(self.size) for noise_db in NOISES_DB}
@@ -250,7 +250,7 @@ class _Sample(NamedTuple):
 
 
 class _Hypothesis(NamedTuple):
-    """Kind and noise of the measurements, and their process: dimensionless residuals, covariance and noise."""
+    """Kind and noise of measurements; dimensionless residuals, covariance and noise of their process."""
 
     log_p: float
     kind: Kind
@@ -311,7 +311,7 @@ class _Fit(NamedTuple):
         return cls(best.kind, best.noise_db, fading_db, offset_db, factor, weights, precision, common, coupling)
 
     def common_variance(self, across: Floats, scale_db: Floats, below_db: Floats) -> Floats:
-        """Return the variance (N,) added by uncertain offset and factor at other receivers [dB²]."""
+        """Return the variance (N,) added by uncertain offset and factor [dB²]."""
         design = np.stack([np.ones(len(below_db)), below_db])
         shared = self.common @ design - 2.0 * scale_db * (self.coupling @ across)
         return (design * shared).sum(axis=0)
@@ -338,10 +338,7 @@ def _hypotheses(
 
 
 class _Compared(NamedTuple):
-    """Measurements of one transmitter through walls under K candidate materials.
-
-    `kinds` are the kinds of measurements under each candidate.
-    """
+    """Measurements of one transmitter through walls, and their kinds under K candidate materials."""
 
     sample: _Sample
     links: _Links
@@ -427,7 +424,7 @@ class _Compared(NamedTuple):
 
 
 def _fitting(log_evidence: Floats, candidates: int) -> Floats:
-    """Return the evidence (K, S, N) of another transmitter, averaged over its candidates if they are different ones."""
+    """Return the evidence (K, S, N) of another transmitter, averaged over its candidates if they differ."""
     if len(log_evidence) in (1, candidates):
         return log_evidence
     return logsumexp(log_evidence, axis=0, keepdims=True) - math.log(len(log_evidence))
@@ -438,15 +435,14 @@ def _fitting(log_evidence: Floats, candidates: int) -> Floats:
 class Assimilation(Shown):
     """Posterior of the links to other receivers, given measurements of one transmitter (`fit`).
 
-    The residual of a link is its gain minus the predicted mean, in predicted standard deviations. Residuals are a
-    Gaussian process whose correlation decreases with the walking length between receivers. A measurement at or below
-    the sensitivity is an upper bound (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine
-    Learning, sections 3.6 and 3.9). Noise and common offset maximise the likelihood; with a large offset, as of a real
-    radio, the predicted loss over free space is scaled, too.
+    Residuals (gain minus predicted mean, in predicted standard deviations) are a Gaussian process whose correlation
+    decreases with the walking length between receivers. A measurement at or below the sensitivity is an upper bound
+    (expectation propagation; Rasmussen and Williams, Gaussian Processes for Machine Learning, sections 3.6 and 3.9).
+    Noise and common offset maximise the likelihood; with a large offset, as of a real radio, the predicted loss over
+    free space is scaled, too.
 
-    Through walls of an unknown material there is one process per candidate, weighted by its evidence and that of other
+    Through walls of an unknown material there is one process per candidate, weighted by its evidence, also from other
     transmitters.
-
 
     Examples
     --------
@@ -466,7 +462,7 @@ class Assimilation(Shown):
     """Standard deviation of the measurements, given noise and fading [dB]."""
 
     offset_db: float
-    """Common offset of the measurements above the predicted gains [dB]."""
+    """Common offset of measurements above predictions [dB]."""
 
     shadow_scale: float
     """Factor on the predicted loss over free space."""
@@ -508,22 +504,16 @@ class Assimilation(Shown):
         measured : Measurements
             M links of this transmitter.
         prior : LinkPrediction
-            Prediction of these links without the measurements.
+            Prediction of these links without measurements.
         antenna_db : float or (M,) array-like
-            Gain of the transmitter's antenna, which `measured` includes and `prior` does not [dB]; `update` works
-            without it.
+            Gain of the transmitter's antenna [dB], included in `measured`, not in `prior`; `update` excludes it.
         frequency_hz : float
         p_powers : float, optional
-            Prior probability that the measurements are powers with an unknown offset, not path gains.
+            Prior probability of powers with an unknown offset instead of path gains.
         through_walls : bool
-            True for a trace through walls. The measurements are then from a real radio: the loss of walls is inferred,
-            and no trace is certain.
+            True for a trace through walls, of a real radio: the loss of walls is inferred, and no trace is certain.
         others : sequence of Assimilation
             Fits to other transmitters of the building through walls, which inform losses and offsets.
-
-        Returns
-        -------
-        Assimilation
 
         Raises
         ------
@@ -587,19 +577,15 @@ class Assimilation(Shown):
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
         """Return the prediction of links given the measurements.
 
-        A predicted residual counts as a noisy measurement of the gain, which updates P(link state) and the gain given
-        each state by Bayes' rule.
+        A predicted residual counts as a noisy measurement of the gain, which updates P(link state) and the gains given
+        the state by Bayes' rule.
 
         Parameters
         ----------
         rx_m : (N, 3) array-like
             Receivers [m].
         prior : LinkPrediction
-            Prediction of these links without the measurements.
-
-        Returns
-        -------
-        LinkPrediction
+            Prediction of these links without measurements.
 
         Raises
         ------
@@ -618,7 +604,7 @@ class Assimilation(Shown):
         return LinkPrediction.mixture(updated, self.material_weights[self.material_weights > 0.0])
 
     def _updated(self, fit: _Fit, across: Floats, rx_m: Floats, prior: LinkPrediction) -> LinkPrediction:
-        """Update links under one material; `across` (P, N) are correlations with the measured residuals."""
+        """Update links under one material; `across` (P, N) are correlations with measured residuals."""
         kind, below_db = fit.kind, prior.gain_mean_db - self._links.free_space_db(rx_m)
         prior = self._shadowed(rx_m, prior, fit.factor)
         explained = np.clip(np.einsum("pn,pn->n", across, fit.precision @ across), 0.0, 1.0 - 1e-3)
@@ -675,7 +661,7 @@ def _positive(correlation: Floats) -> Floats:
 
 
 def _posterior(covariance: Floats, residual: Floats, received: Bools, noise: Floats) -> tuple[Floats, Floats]:
-    """Return weights (P,) and matrix (P, P) of predictions; residuals that were not received are upper bounds."""
+    """Return weights (P,) and matrix (P, P) of predictions; residuals not received are upper bounds."""
     precision = np.where(received, 1.0 / noise**2, 0.0)
     shift = precision * residual
     for _ in range(1 if received.all() else _SWEEPS):

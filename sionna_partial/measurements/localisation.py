@@ -18,12 +18,12 @@ from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.prediction.predictor import LinkPrediction
 
 Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
-"""Return the links from a position (3,) to others (N, 3) [m]: their prediction without the antenna at the others, its
-gain (N,) [dB], and P(indoor) of the others (N,).
+"""Return the links from a position (3,) to others (N, 3) [m]: prediction without the antenna at the others, its gain
+(N,) [dB], and P(indoor) of the others (N,).
 """
 
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
-"""Number of candidate positions, their smallest spacing, and their largest distance from free cells [m]."""
+"""Number of candidates, their smallest spacing, and largest distance from free cells [m]."""
 
 MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements; one of each group is traced."""
@@ -34,7 +34,7 @@ procedural homes, unreceived ones included.
 """
 
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
-"""Standard deviation of a trace through observed space [dB]; probability of an outlier, and its range [dB]."""
+"""Standard deviation of a trace through observed space [dB]; probability and range [dB] of outliers."""
 
 OFFSETS_DB, OFFSET_STD_DB = np.arange(-60.0, 61.0, 3.0), 40.0
 """Candidate offsets of powers, and the prior standard deviation of the offset [dB]."""
@@ -78,7 +78,7 @@ class TransmitterPosterior:
         return float(np.sqrt(square @ self.probability.ravel()))
 
     def draw(self, count: int) -> tuple[Floats, Floats, list[float | None]]:
-        """Draw positions (K, 3) systematically [m]; return their weights (K,) and P(powers), too."""
+        """Draw positions (K, 3) systematically [m]; return also their weights (K,) and P(powers)."""
         weights = self.probability.ravel()
         drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
         chosen, times = np.unique(drawn, return_counts=True)
@@ -87,7 +87,7 @@ class TransmitterPosterior:
 
 
 def likely_region(probability: Floats) -> Bools:
-    """Return the smallest set of cells with 90 % of a posterior."""
+    """Return the smallest set of cells with 90 % probability."""
     order = np.argsort(-probability, axis=None, kind="stable")
     inside = np.cumsum(probability.ravel()[order]) < REGION * probability.sum()
     region = np.zeros(probability.size, dtype=bool)
@@ -106,8 +106,8 @@ def locate_transmitter(
 ) -> TransmitterPosterior:
     """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
-    By reciprocity, links are predicted from the measured positions to all others; `allowed` returns the possible ones.
-    The log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
+    By reciprocity, links are predicted from the measured positions to all others that are `allowed`. The
+    log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
     with the positions.
     """
     posterior = _grid(partial, measured)

@@ -1,4 +1,4 @@
-"""Measured path gains at known positions: mappings, data frames and CSV files -> Measurements."""
+"""Measured path gains: mappings, data frames and CSV files -> Measurements."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Largest gain that counts as an outage, with noise [dB]."""
 
 SAME_M, MOST_LINKS = 0.01, 3000
-"""Edge of the cubes in which ends of repeated links are equal [m]; largest number of links."""
+"""Edge of cubes for ends of repeated links [m]; largest number of links."""
 
 _ROUNDING_DB = 1e-6
 
@@ -45,7 +45,7 @@ SAME_TX_M = 0.5
 MOST_MEASUREMENTS = 20_000
 
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
-"""Number of other transmitters for learning the loss of walls, and of links of each of them."""
+"""Number of other transmitters, and of their links, for the loss of walls."""
 
 VACUUM_HEIGHT_M = 0.1
 
@@ -85,9 +85,9 @@ class Measurements(Shown):
     gain_db : (N,) float64 array
         Omnidirectional path gain [dB], negative; -150 is an outage.
     std_db : (N,) float64 array, optional
-        Standard deviation of each gain, or one for all [dB], at least 0.1; estimated if not given.
+        Standard deviation of each gain, or one for all [dB], at least 0.1; by default estimated.
     sensitivity_db : float
-        Sensitivity of the receiver [dB]: a gain at or below it is an upper bound.
+        Sensitivity of the receiver [dB]; gains up to it are upper bounds.
 
     Raises
     ------
@@ -180,10 +180,6 @@ def measurements_of(source: Any) -> Measurements:
         `tx_z`, `rx_x`, ... (N,), as in a CSV with a header; heights are 1.5 m by default. Cells of a data frame may
         hold x, y, z. `std_db` (N,), `sensitivity_db` and `tx` are optional.
 
-    Returns
-    -------
-    Measurements
-
     Raises
     ------
     MeasurementError
@@ -221,24 +217,20 @@ def load_measurements(
     Parameters
     ----------
     path : path-like
-        A CSV with a header has the columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db
-        [dB]; power_dbm, rssi or rsrp are received powers, instead of gain_db. Missing heights are 1.5 m. A recording
-        (.vwm) has mean received powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same
-        file; transmitters are unknown.
+        A CSV with a header: columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db [dB], or
+        power_dbm, rssi or rsrp for received powers. Missing heights are 1.5 m. A recording (.vwm) has mean received
+        powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same file; transmitters are
+        unknown.
     columns : mapping, optional
-        Headers of these columns in the file, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db
-        without the word "gain" is a received power.
+        Headers of these columns, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db without the
+        word "gain" is a received power.
     tx : (3,) array-like, optional
-        Transmitter of all links [m], instead of the columns.
+        Transmitter of all links [m].
     tx_power_dbm : float
-        Received power without path loss [dBm], subtracted from received powers, never from gain_db. Leave it out if
-        unknown: `predict_map` and `calibrate_materials` estimate a common offset.
+        Received power without path loss [dBm], subtracted from received powers only. Leave it out if unknown:
+        `predict_map` and `calibrate_materials` estimate a common offset.
     access_point : str, optional
         BSSID or SSID in a recording; by default the access point with most measurements.
-
-    Returns
-    -------
-    Measurements
 
     Raises
     ------
@@ -267,7 +259,7 @@ def _read(
     tx_power_dbm: float = 0.0,
     access_point: str | None = None,
 ) -> dict[str, Floats]:
-    """Read the columns of a file by our names; subtract `tx_power_dbm` from received powers."""
+    """Read the columns of a file; subtract `tx_power_dbm` from received powers."""
     is_recording = is_path(path) and Path(path).suffix.lower() == ".vwm"
     for name, value, other in (("columns", columns, is_recording), ("access_point", access_point, not is_recording)):
         if value is not None and other:
@@ -350,8 +342,8 @@ def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
     """Merge repeated measurements: L links with mean gains, the link of each measurement (N,), and variances (L,).
 
-    The variance [dB^2] of a mean follows from the scatter of repetitions; without repetitions it is 0, and the noise is
-    part of the link.
+    The variance [dB^2] of a mean follows from the scatter of repetitions; without any it is 0, and the noise is part
+    of the link.
     """
     cubes = np.round(np.hstack([measured.tx, measured.rx]) / SAME_M)
     keys = np.column_stack([cubes, measured.is_outage])
@@ -435,7 +427,7 @@ def _require(good: NDArray[np.bool_], name: str, values: NDArray[np.float64], re
 def measurements_of_each(
     partial: PartialMap, sources_m: Sequence[NDArray[np.float64]], measurements: Any, frequency_hz: float
 ) -> list[Measurements | None]:
-    """Return the measurements of each transmitter, (1, 3) or unknown (0, 3) [m], or None; at least one has some."""
+    """Return measurements of transmitters, (1, 3) or unknown (0, 3) [m], or None; at least one has some."""
     measured = measurements_of(measurements)
     nearest = nearest_transmitters(measured.tx, sources_m)
     used = [bool(near.any()) or len(sources_m) == 1 for near in nearest]
@@ -478,7 +470,6 @@ def measurements_of_others(
 def _measured(
     partial: PartialMap, tx_m: Floats, measured: Measurements, nearest: Bools, frequency_hz: float
 ) -> Measurements:
-    """Return the usable measurements of one transmitter, (1, 3) or unknown (0, 3) [m]."""
     measured = _of_transmitter(measured, tx_m[0], nearest) if len(tx_m) else _of_unknown(measured)
     if len(measured) > MOST_MEASUREMENTS:
         raise MeasurementError(
@@ -500,7 +491,7 @@ def _measured(
 
 
 def can_be_used(partial: PartialMap, tx_m: Floats, rx_m: Floats, frequency_hz: float) -> Bools:
-    """Return whether receivers (N, 3) [m] are neither in walls nor at a transmitter (K, 3) [m]."""
+    """Return whether receivers (N, 3) [m] are outside walls and transmitters (K, 3) [m]."""
     usable = clear_of_walls(partial, rx_m)
     for each_m in tx_m:
         usable &= np.linalg.norm(rx_m - each_m, axis=1) >= nearest_m(frequency_hz)

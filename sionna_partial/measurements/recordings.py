@@ -54,10 +54,9 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     Parameters
     ----------
     path : path-like
-        A .bag, .mcap, .db3, or folder.
     topic : str or None
-        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`. Default: transforms from the map to the
-        robot, else the first topic of these types.
+        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`; by default transforms from map to robot,
+        else the first topic of these types.
     frame : str or None
         Frame of the transforms, such as an antenna's; default `base_link`, or `base_footprint`.
 
@@ -65,12 +64,12 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     -------
     xarray.Dataset
         On `time`: `time_s` since the start, `position_m` (time, 3) in the map's frame [m], and `yaw_rad`. Odometry
-        without a transform to the map drifts, and causes a `MapWarning`.
+        without a transform to the map drifts, and raises a `MapWarning`.
 
     Raises
     ------
     MeasurementError
-        If the file is no rosbag or damaged, or has no such poses.
+        If the file is no intact rosbag, or has no such poses.
 
     Examples
     --------
@@ -97,8 +96,8 @@ def measurements_from_bag(
 ) -> xr.Dataset:
     """Read received powers from a rosbag as a table of measurements.
 
-    Receivers are at the robot's interpolated poses at the stamps of the powers. Without stamps, the recording times of
-    powers and poses are used. Powers outside the time of the poses and powers that are not finite are left out.
+    Receivers are at the robot's poses, interpolated to the stamps of the powers, or the recording times if there are
+    none. Powers outside the time of the poses and powers that are not finite are left out.
 
     Parameters
     ----------
@@ -107,11 +106,11 @@ def measurements_from_bag(
     topic : str
         Topic of the received powers [dBm].
     tx : (3,) array-like, optional
-        Transmitter [m]; None (NaN in the table) if unknown.
+        Transmitter [m]; NaN in the table if unknown.
     tx_power_dbm : float
         Received power without path loss: transmit power and antenna gains less cable losses [dBm].
     field : str
-        Field of the messages with the power, by default as in `std_msgs/Float32`.
+        Field of the messages, by default as in `std_msgs/Float32`.
     pose_topic, frame : str or None
         As `topic` and `frame` of `poses_from_bag`.
     rx_height_m : float
@@ -126,7 +125,7 @@ def measurements_from_bag(
     Raises
     ------
     MeasurementError
-        If the file is no rosbag or damaged, has no such powers or poses, or the gains are invalid.
+        If the file is no intact rosbag, has no such powers or poses, or the gains are invalid.
 
     Examples
     --------
@@ -266,7 +265,7 @@ def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]
 
 
 def _composed(chain: list[_Track]) -> _Track:
-    """Return poses of the first frame of a chain in the last one, at the times of the most frequent transform."""
+    """Return poses of a chain's first frame in the last one, at the times of the most frequent transform."""
     time_s = max(chain, key=lambda each: len(each.time_s)).time_s
     position_m, turn = np.zeros((len(time_s), 3)), Rotation.identity(len(time_s))
     for each in (link.at(time_s) for link in chain):

@@ -1,4 +1,4 @@
-"""Placement of a transmitter: compare positions by visibility, trace and predict some, refine the best."""
+"""Placement of a transmitter by visibility, prediction and refinement."""
 
 import json
 import math
@@ -25,7 +25,7 @@ from sionna_partial.settings import Objective, PlacementSettings, SceneSettings,
 from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
-"""Smallest distance from known walls, and largest cells in which it is kept [m]."""
+"""Smallest distance from known walls, and largest cells that keep it [m]."""
 
 RECEIVER_SPACING_M, MAX_RECEIVERS = 0.5, 4000
 POSITION_SPACING_M, MAX_POSITIONS = 0.25, 500
@@ -35,7 +35,6 @@ NEGLIGIBLE = 0.02
 """Probability of being indoors below which a receiver is omitted."""
 
 _INDOOR_POSITIONS = 8
-"""Number of transmitter positions over which the probability of being indoors is averaged."""
 
 _UNSEEN_LENGTH_M, _WALL_LENGTH_M, _WALL_FACTOR = 4.0, 4.0, 0.8
 """Visibility is exp(-u / 4 m) with the unobserved length u, and 0.8 exp(-d / 4 m) of it at distance d behind walls.
@@ -45,7 +44,7 @@ RECEIVERS = 120
 """Largest number of receivers during the search."""
 
 STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
-"""Number of traced and of refined positions: fewest, most, and area for each [m^2]."""
+"""Number of traced and refined positions: fewest, most, and area for each [m^2]."""
 
 STEPS_M = (0.6, 0.25)
 """Distances of neighbours in the refinement [m]."""
@@ -68,8 +67,8 @@ FULL_FRACTION, LAST_FRACTION = 0.05, 0.15
 class PlacementArea:
     """Possible positions of a transmitter, and weighted receivers.
 
-    A receiver in a free cell has weight 1, one in an unknown cell its probability of being indoors, averaged over
-    transmitter positions: no position gains by making the building seem larger.
+    A receiver in a free cell has weight 1, in an unknown cell P(indoor), averaged over transmitter positions: no
+    position gains by making the building seem larger.
 
     Parameters
     ----------
@@ -89,7 +88,7 @@ class PlacementArea:
 
     @property
     def size_m2(self) -> float:
-        """Return the area of transmitter positions [m^2]."""
+        """Area of transmitter positions [m^2]."""
         return float((self.room.state == CellState.FREE).sum()) * self.room.resolution_m**2
 
     def stands(self, positions_m: Floats) -> Bools:
@@ -97,7 +96,7 @@ class PlacementArea:
         return self.room.state_at(positions_m) == CellState.FREE
 
     def positions(self, seed: int) -> Floats:
-        """Return positions (C, 3) [m] on a randomly offset grid, or cell centres if it has none."""
+        """Return positions (C, 3) [m] on a randomly offset grid, or else cell centres."""
         rng = np.random.default_rng(seed)
         spacing_m = max(POSITION_SPACING_M, math.sqrt(self.size_m2 / MAX_POSITIONS))
         x0, y0, x1, y1 = self.room.bounds_m
@@ -156,7 +155,6 @@ def placement_area(
 
 
 def _room(partial: PartialMap) -> PartialMap:
-    """Return a map whose free cells are the possible transmitter positions; all others are unknown."""
     fine = max(1, math.ceil(partial.resolution_m / FINEST_M - 1e-9))
     fine = max(1, min(fine, int(math.sqrt(4e6 / partial.state.size))))
     state = partial.state.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -174,7 +172,6 @@ def _room(partial: PartialMap) -> PartialMap:
 
 
 def _weights(area: PlacementArea, model: AnyPredictor | None, frequency_hz: float | None) -> Floats:
-    """Return weights (N,) of receivers: 1 in free cells, else the mean P(indoor) over transmitter positions."""
     weight = (area.partial.state_at(area.rx_m) == CellState.FREE).astype(np.float64)
     if model is None or weight.all():
         return weight
@@ -199,7 +196,7 @@ def grid_positions(x_m: tuple[float, float], y_m: tuple[float, float], spacing_m
 
 
 def _lines(partial: PartialMap, start_m: Floats, end_m: Floats) -> tuple[Bools, Floats, Floats]:
-    """Return for lines (A B,) whether they meet a wall, unobserved lengths and lengths [m]."""
+    """Return for lines (A B,) if they meet a wall, unobserved lengths and lengths [m]."""
     start_m, end_m = np.repeat(start_m, len(end_m), axis=0), np.tile(end_m, (len(start_m), 1))
     walled = walled_lengths_m(partial, start_m, end_m) > 1e-6
     return walled, unobserved_lengths_m(partial, start_m, end_m), np.linalg.norm(end_m - start_m, axis=1)
@@ -235,7 +232,7 @@ class TransmitterPlacement(Pictured, plot="plots.result_plots:plot_placement"):
     rx_m : (N, 3) float64 array
         Receivers [m].
     weight : (N,) float64 array
-        Weights of receivers: 1 in free cells, the probability of being indoors in unknown ones.
+        1 in free cells, P(indoor) in unknown ones.
     values : (N,) float64 array
         P(gain > threshold), or mean gain [dB], of each receiver.
     spacing_m : float
@@ -300,43 +297,33 @@ def place_transmitter(
 ) -> TransmitterPlacement:
     """Find the transmitter position with the best predicted coverage of a partly known building.
 
-    Positions in all free cells, at least 10 cm from known walls, are compared by visibility without tracing. The best
-    that cover different receivers are traced and predicted. Around the best of these, neighbours at 0.6 and 0.25 m are
-    tried; the results are compared at all receivers. Larger maps get more positions and steps.
+    Positions in free cells, at least 10 cm from known walls, are compared by visibility without tracing. The best that
+    cover different receivers are predicted. Around the best of these, neighbours at 0.6 and 0.25 m are tried; the
+    results are compared at all receivers. Larger maps get more positions and steps.
 
-    Receivers are those of `predict_map`, 0.5 m apart; one in a free cell has weight 1, one in an unknown cell its
-    probability of being indoors.
+    Receivers are as in `predict_map`, 0.5 m apart, with weights as in `TransmitterPlacement`.
 
     Parameters
     ----------
     scene : PartialMap, path, Simulation or LinkModel
         A map, or a file that `load_map` reads.
     objective : {"coverage", "percentile"}
-        Maximised quantity: mean probability that the path gain exceeds the threshold, or mean predicted gain of the
-        worst tenth of the receivers.
+        Mean P(gain > threshold), or mean predicted gain of the worst tenth of the receivers.
     threshold_db : float
         Path gain of a covered receiver [dB].
     tx_height_m, rx_height_m : float
         Heights of transmitter and receivers [m].
     seed : int
         Seed of the compared positions.
-    predictor : None, "map", "paper", path or Predictor
+    predictor, scene_settings, trace_settings, progress
         As in `predict_map`.
-    scene_settings : SceneSettings, optional
-    trace_settings : TraceSettings, optional
-    progress : bool or callable, optional
-        As in `predict_map`.
-
-    Returns
-    -------
-    TransmitterPlacement
 
     Raises
     ------
     MapError, PredictorError, BackendError
         As `predict_map`.
     PositionError
-        If there is no position for a transmitter or a receiver.
+        If transmitter or receivers have no possible position.
     SettingsError
         For another objective, or a threshold, height, seed or frequency out of range.
 
@@ -402,7 +389,7 @@ class Search:
         return cls(settings, model, area)
 
     def starts(self, area: PlacementArea, count: int) -> Floats:
-        """Return start positions (S, 3) [m] by visibility; receivers that other starts cover count less."""
+        """Return starts (S, 3) [m] by visibility; receivers that other starts cover count less."""
         positions_m, range_m = area.positions(self.settings.seed), math.inf
         if self.settings.objective == "coverage":  # by Friis' formula
             loss = 10.0 ** (-self.settings.threshold_db / 20.0)
@@ -421,7 +408,7 @@ class Search:
     def links(
         self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress
     ) -> tuple[LinkPrediction, Bools]:
-        """Predict links (P, N) from positions (P, 3) [m], and return which are long enough; others are outages."""
+        """Predict links (P, N) from positions (P, 3) [m]; return also which are long enough, not outages."""
         frequency_hz = self.model.simulation.trace_settings.frequency_hz
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]

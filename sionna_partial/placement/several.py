@@ -1,4 +1,4 @@
-"""Placement of several transmitters: draw candidates jointly, choose greedily, swap."""
+"""Placement of several transmitters: joint draws, greedy choice, swaps."""
 
 from __future__ import annotations
 
@@ -48,11 +48,10 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     scores : (K,) float64 array
         Scores of the first, the first two etc. before any swap, at some of the receivers.
     candidates_m : (C, 3) float64 array
-        Candidates [m].
     rx_m : (N, 3) float64 array
         Receivers [m].
     weight : (N,) float64 array
-        Weights of receivers: 1 in free cells, the probability of being indoors in unknown ones.
+        Weights of receivers, as in `TransmitterPlacement`.
     values : (N,) float64 array
         Probability that at least one path gain exceeds the threshold.
     spacing_m : float
@@ -110,24 +109,18 @@ def place_transmitters(
 ) -> NetworkPlacement:
     """Find positions of several transmitters with the best joint coverage of a partly known building.
 
-    Candidates are positions that cover different receivers. Their links are drawn jointly (`JointLatents`), because
-    transmitters behind one unseen wall are correlated. Transmitters are chosen greedily, and then swapped for other
-    candidates while that increases the score.
+    Candidates cover different receivers. Their links are drawn jointly (`JointLatents`), because transmitters behind
+    one unseen wall are correlated. Transmitters are chosen greedily, then swapped for other candidates while that
+    increases the score.
 
     Parameters
     ----------
-    scene : PartialMap, path, Simulation or LinkModel
-        A map, or a file that `load_map` reads.
     count : int
         Number of transmitters K, up to 16.
     rx : (N, 3) array-like, optional
         Receivers [m] with equal weights; by default as in `place_transmitter`.
-    threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
+    scene, threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
         As in `place_transmitter`.
-
-    Returns
-    -------
-    NetworkPlacement
 
     Raises
     ------

@@ -53,7 +53,7 @@ _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc"
 
 @dataclass(frozen=True)
 class Layer:
-    """A quantity: picture (ny, nx) with its colour scale, or (ny, nx, 3); no label, no colour bar."""
+    """Picture (ny, nx) of a quantity with its colour scale, or (ny, nx, 3); no label, no colour bar."""
 
     title: str
     picture: Callable[[xr.Dataset], NDArray[Any]]
@@ -69,7 +69,7 @@ def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) 
 
 
 def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> dict[str, Layer]:
-    """Return all layers by name; gains of a coverage through walls are less spread."""
+    """Return layers by name; gains through walls are less spread."""
     through_walls = coverage is not None and coverage.attrs.get("walls") == "through walls"
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
@@ -107,23 +107,19 @@ def plot_coverage(
 ) -> Figure:
     """Draw link state, mean gain, its standard deviation, and where the gain exceeds a threshold.
 
-    Each transmitter has a row. Walls are black, the unobserved area is hatched, the transmitter is a star; a line
-    encloses 90 % of the posterior of an unknown position. On a complete map the outside is blank.
+    Each transmitter has a row. Walls are black, the unobserved area hatched, the transmitter a star; a line encloses
+    90 % of the posterior of an unknown position. On a complete map the outside is blank. The figure is not
+    registered with pyplot.
 
     Parameters
     ----------
     coverage : xarray.Dataset
         From `predict_map` or `load_coverage`.
     layers : sequence of str
-        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by the
-        probabilities, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
+        Panels: "link_state" (the most probable), "p_los", "p_nlos", "p_outage", "state_mixture" (colours mixed by
+        probability, as in the paper), "gain_mean_db", "gain_std_db", "p_above".
     threshold_db : float
         Path gain of the panel "p_above", P(gain > threshold), in [-150, 0] dB.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
-        Not registered with pyplot.
 
     Raises
     ------
@@ -177,7 +173,7 @@ def _plot_rows(maps: Mapping[str, xr.Dataset], layers: Sequence[Layer]) -> Figur
 def plot_comparison(
     coverages: Mapping[str, xr.Dataset], layers: Sequence[str] = ("link_state", "gain_mean_db")
 ) -> Figure:
-    """Draw coverage maps of one area: columns of titles, rows of layers (paper, Fig. 5).
+    """Draw coverage maps of one area: a column per title, a row per layer (paper, Fig. 5).
 
     Walls that only the first map contains are grey in the others.
     """
@@ -209,7 +205,7 @@ def _choose(layers: Sequence[str], threshold_db: float, coverage: xr.Dataset) ->
 
 
 def headline(what: str, maps: Mapping[str, xr.Dataset]) -> str:
-    """Return a title with transmitters, frequency, walls and, for a partial map, receivers."""
+    """Return a title: transmitters, frequency, walls and, for a partial map, receivers."""
     attributes = next(iter(maps.values())).attrs
     if attributes.get("receivers") == "indoor" and not attributes["map_complete"]:
         what = f"{what} for receivers that are indoors"
@@ -224,7 +220,7 @@ def _heading(title: str, coverage: xr.Dataset) -> str:
 
 
 def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[Figure, list[list[Axes]]]:
-    """Make a page-wide figure with panels of one scale; its colour bars take `keys_in`."""
+    """Make a page-wide figure with panels of one scale; colour bars take `keys_in`."""
     page = _NARROW_IN if columns < 3 else _WIDE_IN
     highest = 12.0 if rows == 1 else max(_HIGHEST_IN / rows, 2.5)
     height = min(max(((page - 0.55 - keys_in) / columns - 0.1) / aspect, 0.4), highest)
@@ -237,7 +233,6 @@ def _panels(rows: int, columns: int, aspect: float, *, keys_in: float) -> tuple[
 
 
 def _add_key(axes: Sequence[Axes], layer: Layer, pad_below: float = 0.0) -> None:
-    """Draw a colour bar, or the triangle of mixed state colours; link states are in the legend."""
     if layer.label:
         colours = ScalarMappable(layer.norm, layer.cmap)
         where: dict[str, Any] = {"location": "right", "pad": 0.05}
@@ -321,7 +316,7 @@ def outside(coverage: xr.Dataset) -> Bools:
 def _fill(picture: Floats, valid: Bools, wall: Bools) -> Floats:
     """Refine a picture to the size of `wall`, and fill cells without receiver by the nearest.
 
-    Walls thinner than a cell would have a white border otherwise.
+    Otherwise walls thinner than a cell would have a white border.
     """
     fine = wall.shape[0] // valid.shape[0]
     bare = ~valid.repeat(fine, axis=0).repeat(fine, axis=1)
@@ -336,7 +331,7 @@ def _hatched(coverage: xr.Dataset) -> Bools:
 
 
 def unobserved_area(coverage: xr.Dataset) -> tuple[Floats, Floats, Floats]:
-    """Return cell centres x (nx + 2,) and y (ny + 2,) with a border, and hatched cells as 1."""
+    """Return x (nx + 2,) and y (ny + 2,) of cells with a border, and hatched cells as 1."""
     step = coverage.attrs["spacing_m"] * np.array([-1.0, 1.0])
     x, y = (np.r_[axis_m[0] + step[0], axis_m, axis_m[-1] + step[1]] for axis_m in (coverage["x"], coverage["y"]))
     return x, y, np.pad(_hatched(coverage), 1, mode="edge").astype(float)
@@ -353,7 +348,7 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
 
 
 def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
-    """Return as `unobserved_area` the cells with 90 % of an unknown transmitter's posterior, or nothing."""
+    """Return, as `unobserved_area`, cells with 90 % of an unknown transmitter's posterior, or nothing."""
     if "p_transmitter" not in coverage:
         return []
     x, y = (coverage[f"tx_{name}"].to_numpy() for name in "xy")
@@ -394,7 +389,7 @@ def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, 
 def report_figure(
     coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
 ) -> Figure:
-    """Draw a page on the coverage of named transmitters: maps, covered area, uncertainty."""
+    """Draw a page on named transmitters: maps, covered area, uncertainty."""
     maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
     notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
@@ -413,7 +408,7 @@ def report_figure(
 def _report_grid(most: int, aspect: float, height_in: float) -> tuple[int, int]:
     """Return the number of panels, two or more, and the columns that give them most of the page.
 
-    Colour bars are beside the panels of one column, and else below each panel.
+    Colour bars are beside the panels of one column, else below each panel.
     """
 
     def area(grid: tuple[int, int]) -> float:
@@ -433,7 +428,6 @@ def _draw_report(
     threshold_dbm: float,
     height_in: float,
 ) -> None:
-    """Draw received power, its probability, and as it fits the strongest transmitter and the uncertainty."""
     power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
     strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
     thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
@@ -535,10 +529,6 @@ def plot_network(network: xr.Dataset) -> Figure:
     ----------
     network : xarray.Dataset
         From `network_map`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

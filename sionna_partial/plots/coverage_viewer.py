@@ -226,7 +226,7 @@ def _rectangle(coverage: xr.Dataset) -> dict[str, float]:
 def add_layer(
     plot: Any, geometry: Mapping[str, Any], name: str, layer: Layer, words: Sequence[str], side: Any = "right"
 ) -> list[Any]:
-    """Draw a layer with its colour bar, and return both; only the first is visible."""
+    """Draw a layer and colour bar, and return both; only the first is visible."""
     from bokeh.models import FixedTicker, LinearColorMapper
     from bokeh.models.annotations.legends import ColorBar
 

@@ -1,4 +1,4 @@
-"""Figures of explorations: map of the robot, trajectory, field of view and next poses."""
+"""Figures of explorations and next poses."""
 
 from __future__ import annotations
 
@@ -64,16 +64,12 @@ _PREDICTED = {
 
 
 def plot_exploration(exploration: Exploration) -> Figure:
-    """Draw the map of the robot at each step, with its trajectory and field of view.
+    """Draw the robot's map at each step, with trajectory and field of view.
 
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`. Each step has a panel, up to `MAX_PANELS`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
+        At most `MAX_PANELS` steps are drawn.
 
     Raises
     ------
@@ -109,12 +105,11 @@ def plot_exploration(exploration: Exploration) -> Figure:
 def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], tx: ArrayLike | None = None) -> None:
     """Write a GIF of an exploration, with a frame for each of its `steps`.
 
-    With a transmitter, predicted path gain and uncertainty are beside the map; each frame takes a prediction.
+    With a transmitter, each frame takes a prediction and has path gain and uncertainty beside the map.
 
     Parameters
     ----------
     exploration : Exploration
-        From `explore_trajectory`.
     path : path-like
         A `.gif` file. Equal explorations give equal bytes.
     tx : (3,) or (2,) array-like, optional
@@ -191,7 +186,7 @@ def _beside(left: Image.Image, right: Image.Image) -> Image.Image:
 
 
 def _palette(frame: Image.Image) -> Image.Image:
-    """Return the drawn colours and their mixtures in the last frame, for all frames."""
+    """Return the colours of the last frame and their mixtures, for all frames."""
     drawn = np.array([to_rgb(colour) for colour in (_FREE, WALL, UNKNOWN, _UNSEEN_WALL, YELLOW, RED, BLUE)])
     exact = np.rint(255 * drawn).astype(int)
     mixed = np.reshape(frame.quantize(_MIXED_COLOURS, dither=Image.Dither.NONE).getpalette() or [], (-1, 3))
@@ -266,10 +261,6 @@ def plot_next_views(views: NextViews) -> Figure:
     ----------
     views : NextViews
         From `next_views`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

@@ -68,17 +68,13 @@ _IDEAL: dict[str, Any] = {"color": "0.3", "linewidth": 0.9, "linestyle": "--"}
 def plot_placement(placement: TransmitterPlacement) -> Figure:
     """Draw the map, the traced starts, the refinement, and the best position with its coverage.
 
-    Squares are receivers in the colour of their probability of coverage (or mean gain), paler where they are less
-    probably indoors. The refinement that led to the best position is red.
+    Squares are receivers in the colour of their probability of coverage (or mean gain), paler where less probably
+    indoors. The refinement that led to the best position is red.
 
     Parameters
     ----------
     placement : TransmitterPlacement
         From `place_transmitter`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------
@@ -121,10 +117,6 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     ----------
     placement : NetworkPlacement
         From `place_transmitters`.
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------
@@ -201,16 +193,12 @@ def _draw_search(axis: Axes, placement: TransmitterPlacement) -> None:
 def plot_calibration(calibration: MaterialCalibration) -> Figure:
     """Draw a calibration of materials.
 
-    Left: the loss after each step. Middle: measured gains against gains traced with the initial and the calibrated
-    material. Right: the loss of a reflection with two standard deviations, a panel for each material.
+    Left: loss by step. Middle: measured gains against gains traced with the initial and the calibrated
+    material. Right: loss of a reflection with two standard deviations, a panel for each material.
 
     Parameters
     ----------
     calibration : MaterialCalibration
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------
@@ -314,8 +302,8 @@ def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
 def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
     """Draw reliability diagrams of the link state (above) and histograms of the gain's transform (below), by stage.
 
-    Calibrated states are on the dashed line (area: number of links), calibrated gains fill all bins up to the dashed
-    line. A hill shows a standard deviation that is too large, a bowl one that is too small.
+    Calibrated states are on the dashed line (area: number of links), calibrated gains fill all bins up to it. A hill
+    shows a standard deviation that is too large, a bowl one that is too small.
     """
     require(len(stages) > 0, "stages", dict(stages), "give at least one calibration.")
     figure = Figure(figsize=(max(1.8 * len(stages), 5.4), 4.6), dpi=170, layout="constrained")

@@ -64,7 +64,7 @@ def figure_png(figure: matplotlib.figure.Figure, width_px: float = math.inf) -> 
 
 
 def shade(where: Bools, grey: int = 0, opacity: float = 1.0) -> NDArray[np.uint8]:
-    """Paint some cells, black by default, and leave the rest transparent: (ny, nx, 4)."""
+    """Paint cells, black by default, others transparent: (ny, nx, 4)."""
     picture = np.full((*where.shape, 4), grey, dtype=np.uint8)
     picture[..., 3] = np.uint8(255 * opacity) * where
     return picture
@@ -107,9 +107,7 @@ def legend_below(
 
 
 def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike | None = None) -> Figure:
-    """Draw a map and the positions of radios on it, to check scale and orientation.
-
-    Positions outside the map are included.
+    """Draw a map and radios on it, also outside the map, to check scale and orientation.
 
     Parameters
     ----------
@@ -118,10 +116,6 @@ def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike 
         Transmitters [m].
     rx : (2,), (3,), (N, 2) or (N, 3) array-like, optional
         Receivers [m].
-
-    Returns
-    -------
-    matplotlib.figure.Figure
 
     Raises
     ------

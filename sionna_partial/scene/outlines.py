@@ -1,7 +1,6 @@
 """PartialMap -> wall outlines -> plan for beams.
 
-Outlines are straight segments through the centres of boundary wall cells. A plan has walls that meet only at ends,
-their lines, and an index of them.
+Outlines are straight segments through the centres of boundary wall cells. Walls of a plan meet only at ends.
 """
 
 import itertools
@@ -73,8 +72,8 @@ class _Graph:
 class _FittedChain:
     """A chain of points (n,) of a graph, and the straight runs that fit it.
 
-    Runs have lines (R, 4) of a point x, y and a direction x, y [cells], and begin at `first` (R,). `corners` are the
-    indices of points where the chain turns. `plain` (R,) runs keep their corners.
+    Runs have lines (R, 4) of a point x, y and a direction x, y [cells], and begin at `first` (R,). The chain turns at
+    the indices `corners`. `plain` (R,) runs keep their corners.
     """
 
     points: NDArray[np.int64]
@@ -100,11 +99,11 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     """Outline the walls of a map by few straight segments, which meet only at shared vertices.
 
     A wall one or two cells thick becomes one line, a thicker one its two faces, a lone cell a square. Walls seen from
-    one side are outlined on that side. An end before UNKNOWN cells reaches the border of the last cell. Outlines turn,
-    mirror and move with the map, unless it equals its own mirror image.
+    one side are outlined there. Ends before UNKNOWN cells reach the border of the last cell. Outlines turn, mirror and
+    move with the map, unless it equals its mirror image.
 
-    `tolerance_cells` is the largest distance of an outline from the lattice line through the cell centres; from 0.5 on,
-    the staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
+    `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
+    staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
     ragged faces (`fit_runs`).
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
@@ -131,8 +130,8 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 def lattice_outlines(partial: PartialMap) -> Outlines:
     """Outline wall cells without simplification: the staircase through the centres of boundary cells.
 
-    Cells that share a side are joined, and so are two that share only a corner. Steps between full blocks of two by two
-    cells are left out: thick walls have only faces. A lone cell is a square.
+    Cells that share a side, or two that share only a corner, are joined, except between full blocks of two by two
+    cells: thick walls have only faces. A lone cell is a square.
     """
     graph = _wall_graph(partial.state == CellState.WALL, cut_spurs=False)
     lines = []
@@ -148,7 +147,7 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
 def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
     """Turn or mirror a grid to the orientation with the smallest bytes, so that outlines turn with the map.
 
-    Returns the grid, whether it was transposed, and whether columns and rows were flipped then.
+    Returns the grid, whether it was transposed, and whether columns and rows were then flipped.
     """
 
     def turned(transpose: bool, flip_y: bool, flip_x: bool) -> States:
@@ -201,8 +200,8 @@ def _indexed(ends: NDArray[np.int64]) -> _Graph:
 def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
     """Split a graph into chains of points (n,) that contain every edge once.
 
-    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops begin at
-    the point farthest from their centre, which is their first and last.
+    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops start and
+    end at the point farthest from their centre.
     """
     beside: list[list[int]] = [[] for _ in range(len(graph.points))]
     for a, b in graph.edges.tolist():
@@ -265,7 +264,7 @@ def _turns(points: NDArray[np.generic]) -> Bools:
 
 
 def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
-    """Return vectors from lattice points towards the layer that was peeled off a wall two cells thick, or zero."""
+    """Return vectors from lattice points towards the peeled layer of a wall, or zero."""
     peeled = np.pad(peeled, 2)
     column, row = points.T // 2 + 2
     towards = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])
@@ -315,7 +314,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
 
 
 def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points]:
-    """Return positions of chain ends and junctions, closest to the lines that meet there."""
+    """Return chain ends and junctions, closest to the lines that meet there."""
     lines: dict[int, list[Floats]] = {}
     pinned: set[int] = set()
     for chain in chains:
@@ -333,7 +332,7 @@ def _placed_nodes(graph: _Graph, chains: list[_FittedChain]) -> dict[int, Points
 
 
 def _closest(lines: Floats, near: Points) -> Points:
-    """Return the least-squares intersection of lines (k, 4), or the mean foot of `near` if that is far away."""
+    """Return the least-squares intersection of lines (k, 4), or the mean foot of `near` if far away."""
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
     offset = (normal * (lines[:, :2] - near)).sum(axis=1)
     moved = np.linalg.lstsq(normal, offset, rcond=0.05)[0]
@@ -386,7 +385,7 @@ def _assembled(lines: list[Points], cell_m: float) -> Outlines:
 
 
 def _extended(outlines: Outlines, state: States) -> Points:
-    """Return the vertices, with ends before UNKNOWN cells moved to the border of the last cell."""
+    """Return vertices, with ends before UNKNOWN cells moved to the border of the last cell."""
     vertices, segments = outlines.vertices_m.copy(), outlines.segments
     ends, tails = segments.ravel(), segments[:, ::-1].ravel()
     along = vertices[ends] - vertices[tails]
@@ -484,7 +483,7 @@ def prepare_plan(walls_m: Floats, low: Bools | None = None) -> Plan:
 
 
 def bin_points(points_m: Floats) -> PointBins:
-    """Sort points (N, 2) [m] into bins of a few points each."""
+    """Sort points (N, 2) [m] into bins of a few."""
     if len(points_m) == 0:
         return PointBins(points_m, np.zeros(0, np.int64), np.zeros(2, np.int64), np.array([0.0, 0.0, 1.0, 1.0]))
     low, high = points_m.min(axis=0), points_m.max(axis=0)
@@ -509,7 +508,7 @@ def grow(array, size):
 
 
 def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
-    """Cut segments where others cross them; return pieces (K, 2, 2) that meet only at ends, and their owners (K,)."""
+    """Cut segments where they cross; return pieces (K, 2, 2) that meet only at ends, and owners (K,)."""
     start, along = walls[:, 0], walls[:, 1] - walls[:, 0]
     lines = shapely.linestrings(walls)
     own, other = shapely.STRtree(lines).query(lines, predicate="intersects")
@@ -528,7 +527,7 @@ def _split_at_crossings(walls: Floats) -> tuple[Floats, NDArray[np.int32]]:
 
 
 def _line_ids(walls: Floats) -> NDArray[np.int32]:
-    """Assign numbers to infinite lines of segments; collinear segments share one."""
+    """Return numbers of infinite lines; collinear segments share one."""
     if len(walls) == 0:
         return np.zeros(0, np.int32)
     along = walls[:, 1] - walls[:, 0]

@@ -34,7 +34,7 @@ FLAT_SHAPES = ("floor", "ceiling")
 
 
 SIONNA_LOAD_GHZ = 3.5
-"""Frequency at which Sionna RT evaluates the materials of a scene while loading it [GHz]."""
+"""Frequency at which Sionna RT evaluates materials while loading [GHz]."""
 
 
 VERTEX_STD_M = 0.03
@@ -50,7 +50,7 @@ class _Walls(NamedTuple):
 
 
 class Lid(NamedTuple):
-    """Top of an obstacle: corners (K, 2) [m], triangles (T, 3), height [m], and index of the material."""
+    """Top of an obstacle: corners (K, 2) [m], triangles (T, 3), height [m], index of the material."""
 
     corners_m: Floats
     triangles: NDArray[np.int64]
@@ -74,7 +74,7 @@ class SceneGeometry:
     open_end : (V,) bool array
         True where a wall ends because observation ended.
     wall_material : (S,) int64 array
-        Index into `materials`; the first of these is also the material of floor and ceiling.
+        Index into `materials`, whose first is also the material of floor and ceiling.
     top_m : (S,) float64 array
         Height of each wall [m]; less than `height_m` for obstacles.
     lids : tuple of Lid
@@ -115,7 +115,7 @@ class SceneGeometry:
 
     @property
     def floor_face(self) -> int:
-        """First face of the floor, -1 without a floor; faces are counted through walls, floor and ceiling."""
+        """First face of the floor, -1 without one, counted through walls, floor and ceiling."""
         return 2 * len(self.segments) if len(self.floor_m) else -1
 
     @property
@@ -134,7 +134,7 @@ class SceneGeometry:
 
 
 def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> SceneSettings:
-    """Return the settings of a map's scene, with None replaced by the map's own material or the default."""
+    """Return settings with None replaced by the map's own material or the default."""
     settings = settings_or_default("scene_settings", settings, SceneSettings)
     default = partial.material or settings.traced_material
     used = partial.environment.known_materials(default)
@@ -148,7 +148,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
 
 
 def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
-    """Return whether settings and map leave the material of some walls open."""
+    """Return whether some walls have no material in settings and map."""
     if partial.mesh is None:
         return settings.material is None and partial.unnamed_walls > 0.0
     named = partial.environment.known_materials(_NO_MATERIAL) != {_NO_MATERIAL}
@@ -156,7 +156,7 @@ def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw: int = 0) -> SceneGeometry:
-    """Convert a map to walls, floor and ceiling; `draw` >= 1 moves the vertices of walls at random."""
+    """Convert a map to walls, floor and ceiling; `draw` >= 1 moves wall vertices at random."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
     walls = _walls(partial, settings)
@@ -208,11 +208,11 @@ def export_scene(
 ) -> Path:
     """Write a map as a scene folder that stock Sionna RT loads.
 
-    The folder holds `scene.xml`, the non-empty ones of `meshes/walls.ply`, `meshes/walls1.ply` (and so on, for
-    `wall_materials`), `meshes/floor.ply` and `meshes/ceiling.ply`, or `meshes/part0.ply` and so on for the materials
-    of a mesh, and the map as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates
-    minus `scene_offset` in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the
-    map, or whole metres on the far axes of a mesh.
+    The folder holds `scene.xml`; the non-empty meshes `meshes/walls.ply`, `walls1.ply` and so on (for
+    `wall_materials`), `floor.ply` and `ceiling.ply`, or `part0.ply` and so on for the materials of a mesh; and the map
+    as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates minus `scene_offset`
+    in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the map, or whole metres on
+    the far axes of a mesh.
 
     Parameters
     ----------
@@ -223,11 +223,6 @@ def export_scene(
         Tolerances, floor extent and material.
     frequency_hz : float
         Frequency [Hz] for ITU materials that Sionna RT cannot load by name.
-
-    Returns
-    -------
-    pathlib.Path
-        The folder.
 
     Raises
     ------
@@ -285,8 +280,8 @@ def write_scene(
 ) -> Path:
     """Write `scene.xml` and its meshes into an existing folder, and return the path of `scene.xml`.
 
-    World x and y `offset_m` become the origin; `geometry.origin_m` gives local coordinates. Wall i has the triangles 2
-    i and 2 i + 1, counted through `geometry.shapes`. Adjacent walls of one material share vertices and so form wedges.
+    World x and y `offset_m` become the origin (`geometry.origin_m` gives local coordinates). Wall i has the triangles
+    2 i and 2 i + 1, counted through `geometry.shapes`. Adjacent walls of one material share vertices, forming wedges.
     """
     shift = np.array([*np.subtract(geometry.origin_m, offset_m), 0.0])
     scene = _new_scene(folder)
@@ -312,7 +307,7 @@ def write_mesh_scene(
 ) -> Path:
     """Write `scene.xml` and the meshes of a SceneMesh, and return the path of `scene.xml`.
 
-    The shapes `part0`, `part1`, ... have the triangles of each material in order; empty ones are left out. The world
+    Shapes `part0`, `part1`, ... have the triangles of each material in order; empty ones are left out. The world
     position `offset_m`, (x, y) or (x, y, z), becomes the origin.
     """
     shift = np.zeros(3)
@@ -371,7 +366,7 @@ def _add_shape(scene: ET.Element, name: str, material: str) -> None:
 
 
 def _add_material(scene: ET.Element, name: str, material: Material, frequency_hz: float) -> None:
-    """Add an ITU material by name if Sionna RT can load it so, any other by its constants."""
+    """Add an ITU material by name if Sionna RT can load it so, others by constants."""
     itu = material.itu
     # Sionna RT 2.2.0 has no display colour for vacuum, and fails.
     if itu is not None and itu != "vacuum" and any(low <= SIONNA_LOAD_GHZ <= high for low, high in ITU_BANDS_GHZ[itu]):
@@ -405,7 +400,7 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64
 
 
 def _lids(partial: PartialMap, walls: _Walls) -> Iterator[Lid]:
-    """Cover the areas inside outlines of obstacles of one height, except mostly free ones."""
+    """Cover areas inside outlines of obstacles of one height, except mostly free ones."""
     free = partial.state == CellState.FREE
     row, column = np.indices(partial.shape)
     centres_m = (np.stack([column, row], axis=-1) + 0.5) * partial.resolution_m
@@ -450,7 +445,7 @@ def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.
 
 
 def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:
-    """Return triangles of an area with integer corners, cut into strips where GEOS fails (docs/development.md)."""
+    """Return triangles with integer corners, in strips where GEOS fails (docs/development.md)."""
     strips, count = area, 1
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Layouts of large buildings, up to 100 x 60 m (office floors, halls, warehouses), and the furniture of rooms."""
+"""Layouts of large buildings (office floors, halls, warehouses), and furniture of rooms."""
 
 import math
 from collections.abc import Callable, Iterable, Iterator
@@ -73,8 +73,8 @@ def furnish(
 ) -> Iterator[Polygon]:
     """Yield furniture and pillars (they may overlap) that leave a room and its doors passable.
 
-    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number of
-    trials for every 4 m2, `pillars` the probability of pillars in a large room.
+    `room` is the outline through the middle of its walls, `walls` includes door leaves. `clutter` is the mean number
+    of trials for every 4 m2, `pillars` the probability of pillars in a large room.
     """
     near = [opening for opening in openings if opening.distance(room) < NEAR_M]
     doorsteps = union_of([opening.buffer(walk_m, cap_style="flat") for opening in near])
@@ -128,7 +128,7 @@ def _block(rng: Rng, half_width: tuple[float, float], depth: tuple[float, float]
 
 
 def _heap(rng: Rng) -> Polygon:
-    """Irregular block: a star of random radii, as plants, chairs and piles in scans."""
+    """Return an irregular star, as plants, chairs and piles in scans."""
     count = int(rng.integers(5, 9))
     angle = np.sort(rng.uniform(0, 1 / count, count) + np.arange(count) / count) * 2 * math.pi
     radius = rng.uniform(0.2, 0.5) * rng.uniform(0.6, 1.8, count)
@@ -146,18 +146,18 @@ _KINDS: tuple[tuple[Callable[[Rng], Polygon], float], ...] = (
 
 
 class Layout(NamedTuple):
-    """Rooms, through the middle of their walls, and fixed objects in them: columns, machines, shelves [m]."""
+    """Rooms, through the middle of their walls, and columns, machines and shelves in them [m]."""
 
     rooms: list[Polygon]
     fixtures: list[Polygon]
 
 
 LayoutMaker = Callable[[Rng, float, float], Layout]
-"""Draws a layout from the area of the building and a typical area of its small rooms [m2]."""
+"""Draws a layout from the area of the building and of a typical small room [m2]."""
 
 
 def floor_layout(rng: Rng, area_m2: float, room_m2: float) -> Layout:
-    """Draw an office floor: rows of rooms along one corridor, or along several, with large rooms and services."""
+    """Draw an office floor: rooms along one or several corridors, with large rooms and services."""
     length_m, width_m = _sides(rng, area_m2, (1.4, 4.0))
     outline = _notched(rng, box(0, 0, length_m, width_m))
     across, services = _corridors(rng, length_m, width_m)
@@ -233,7 +233,7 @@ def _sections(rng: Rng, corridor: shapely.Geometry) -> list[Polygon]:
 
 
 def _row(rng: Rng, part: Polygon, room_m2: float) -> Iterator[Polygon]:
-    """Divide a band into rooms side by side, of widths that are multiples of one module; some have an anteroom."""
+    """Divide a band into rooms, of multiples of one module in width; some have an anteroom."""
     x0, y0, x1, y1 = part.bounds
     upright = y1 - y0 > x1 - x0
     start, end, deep_m = (y0, y1, x1 - x0) if upright else (x0, x1, y1 - y0)
@@ -248,7 +248,6 @@ def _row(rng: Rng, part: Polygon, room_m2: float) -> Iterator[Polygon]:
 
 
 def _halved(rng: Rng, part: Polygon, largest_m2: float) -> Iterator[Polygon]:
-    """Halve an area across its longer side until no part is larger than wanted."""
     if part.area <= largest_m2:
         yield part
         return
@@ -300,7 +299,7 @@ def _machines(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
 
 
 def _shelves(rng: Rng, hall: Polygon) -> Iterator[Polygon]:
-    """Yield blocks of shelves with aisles between; for some, only legs and goods on the floor are as low as a robot."""
+    """Yield shelves with aisles between; for some, only legs and goods are as low as a robot."""
     inner = hall.buffer(-rng.uniform(1.5, 4.0), join_style="mitre")
     if inner.is_empty:
         return

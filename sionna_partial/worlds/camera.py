@@ -1,4 +1,4 @@
-"""Camera of a robot: range readings of walls, their errors, and the resulting map."""
+"""Camera of a robot: range readings, their errors, and the resulting map."""
 
 import math
 from typing import NamedTuple
@@ -17,7 +17,7 @@ MISSED_PATCH_M = 0.5
 """Edge of the squares whose walls are missed together, like a pane or a mirror [m]."""
 
 GRAZING_DEG = 5.0
-"""Angle to the face of a wall below which a sensor with errors gets no return [degree]."""
+"""Angle to a wall's face below which sensors with errors get no return [degree]."""
 
 
 RAY_DEG = 0.5
@@ -25,12 +25,11 @@ RAY_DEG = 0.5
 
 
 class Fusion(NamedTuple):
-    """Rule of a mapper that classifies cells by rays that end in them (hits) and cross them (passes).
+    """Rule of a mapper for cells by rays that end in them (hits) and cross them (passes).
 
     `by_scan` counts each picture once in a cell, as a hit if any of its rays ends there. A hit adds `passes_of_hit`
     passes. From `min_passes` a cell is known, and wall if hits / passes exceeds `max_free`. A distance of `travel_m`
-    [m] or a turn of `turn_deg` [degree] triggers the next picture. Rays without a wall in range clear up to `cleared_m`
-    [m].
+    or a turn of `turn_deg` triggers the next picture. Rays without a wall in range clear up to `cleared_m`.
     """
 
     by_scan: bool
@@ -59,8 +58,8 @@ FUSIONS = {
 }
 """Rules of mappers, with their default parameters.
 
-- slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from more
-  than two passes; a hit adds two passes. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
+- slam_toolbox (`OccupancyGrid::UpdateCell` in `karto_sdk/Karto.h`): wall where hits / passes > 0.1, known from three
+  passes; a hit adds two. `minimum_travel_distance` and `minimum_travel_heading` are 0.5.
 - gmapping (`slam_gmapping.cpp`): wall where hits / (hits + passes) > `occ_thresh`, 0.25. `linearUpdate` is 1 m,
   `angularUpdate` 0.5.
 - Cartographer (`trajectory_builder_2d.lua`): `hit_probability` 0.55, `miss_probability` 0.49; wall where the log odds
@@ -141,7 +140,7 @@ class Camera:
 def unknown_in_view(
     state: States, cell: Indices, headings_deg: Floats, cell_m: float, sensor: SensorSettings
 ) -> list[Indices]:
-    """Return the unknown cells (N, 2) in view from a cell if none were walls, for each heading."""
+    """Return for each heading the unknown cells (N, 2) in view if none were walls."""
     range_cells = sensor.range_m / cell_m
     low = np.maximum(cell - math.ceil(range_cells) - 2, 0)
     window = state[tuple(slice(start, end + math.ceil(range_cells) + 3) for start, end in zip(low, cell, strict=True))]
@@ -159,7 +158,7 @@ def unknown_in_view(
 
 
 def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Floats:
-    """Return the corners (N, 2) [m] of the view from a pose (x, y [m], heading [degree]), the first at the camera."""
+    """Return the corners (N, 2) [m] of the view from a pose (x, y [m], heading [degree]), the camera first."""
     truth = np.pad(home.state, 1, constant_values=_UNKNOWN)
     range_cells = sensor.range_m / home.resolution_m
     x, y = (pose[:2] - home.origin_m) / home.resolution_m + 1
@@ -170,7 +169,7 @@ def view_corners_m(home: PartialMap, pose: Floats, sensor: SensorSettings) -> Fl
 
 
 def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_deg: float = 0.0) -> Floats:
-    """Return directions of rays [radian], at most half a cell apart at their ends, but at least `apart_deg`."""
+    """Return directions of rays [radian], up to half a cell apart at their ends, at least `apart_deg`."""
     rays = int(2 * math.radians(view_deg) * range_cells) + 2
     if apart_deg > 0.0:
         rays = min(rays, int(view_deg / apart_deg) + 2)
@@ -181,7 +180,7 @@ class _Rays(NamedTuple):
     """Rays of one picture: start, believed minus true position, and angles [radian].
 
     `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall [cells],
-    `turn` is the error of the heading [radian], `grazing` the sine of the smallest angle to a face with a reading.
+    `turn` is the heading error [radian], `grazing` the sine of the smallest angle to a face with a reading.
     """
 
     start: tuple[float, float]
@@ -215,7 +214,7 @@ class _Walk(NamedTuple):
 
 @njit(cache=True)
 def _cast_rays(truth, missed, hits, passes, corner, rays):
-    """Count the rays of one picture that end in walls and that cross cells, from the cell `corner` on."""
+    """Count rays of one picture that end in walls and cross cells, from the cell `corner` on."""
     (x, y), shift, angles, noise, range_cells, cleared_cells, turn, grazing = rays
     for ray in range(len(angles)):
         echo, reading = _read(truth, missed, x, y, angles[ray], range_cells, grazing)

@@ -1,8 +1,8 @@
 """Procedural homes: complete floor plans from a seed.
 
 A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
-furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on maps of
-robots. `docs/researchers.md` compares the plans with real homes.
+furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on robots'
+maps. `docs/researchers.md` compares the plans with real homes.
 """
 
 import math
@@ -53,7 +53,7 @@ LOCKED_FRACTION = 0.25
 """Mean fraction of dead-end rooms that are locked."""
 
 SHUT_FRACTION = 0.9
-"""Fraction of the homes in which locked rooms are free, without a door, as on scans of real homes."""
+"""Fraction of homes whose locked rooms are free, without a door, as on scans."""
 
 SHUT_AREA = 0.2
 """Largest area of locked free rooms, relative to the reachable area."""
@@ -62,7 +62,7 @@ LEAF_FRACTION = 0.2
 """Fraction of the doors whose leaf is open into a room."""
 
 CLOSED_DOORS = (0.3, 0.5, 0.2)
-"""Fractions of the office floors with no, some, and all doors closed, as on plans of real floors."""
+"""Fractions of office floors with no, some, and all doors closed, as on real plans."""
 
 _MARGIN_M = 0.3
 _JAMB_M = 0.05
@@ -78,7 +78,7 @@ _WAVE_PER_M = 0.5
 
 @dataclass(frozen=True)
 class _Style:
-    """Ranges and probabilities of a kind of home, or values of one home; lengths in metres, areas in square metres."""
+    """Ranges and probabilities of a kind of home, or values of one home [m, m2]."""
 
     frequency: float
     area: tuple[float, float]
@@ -127,18 +127,18 @@ def make_home(
     seed : int
         Seed, at least 0. Equal seeds give equal homes.
     kind : {"apartment", "house", "office", "floor", "hall", "warehouse"} or None
-        Kind of home; None draws one of the first three. The others are large, up to 100 x 60 m: an office floor with
-        corridors, a production hall with machines, a warehouse with shelves.
+        None draws one of the first three. The others are large, up to 100 x 60 m: an office floor, a production hall
+        with machines, a warehouse with shelves.
     resolution_m : float or None
         Edge of a cell [m], 0.01 to 0.2; by default 0.05, or 0.1 for the large kinds.
     locked_rooms : bool
-        True if the home may have free rooms that cannot be reached, also behind closed doors.
+        Allow free rooms that cannot be reached, also behind closed doors.
 
     Returns
     -------
     PartialMap
-        Complete (`is_complete`): free inside, with walls around everything free, unknown outside and in furniture. Free
-        cells are connected, except in locked rooms. Walls are one or more cells thick and meet at least at corners.
+        Complete (`is_complete`): free inside, with walls around, unknown outside and in furniture. Free cells are
+        connected, except in locked rooms. Walls are at least one cell thick and meet at least at corners.
 
     Raises
     ------
@@ -175,7 +175,7 @@ def make_home(
 
 @dataclass(frozen=True)
 class _Plan:
-    """One home: free area, locked rooms, wall lines, closed doors, swelling of walls and furniture [m], and waves."""
+    """Free area, locked rooms, wall lines, closed doors, swelling [m] and waves of a home."""
 
     free: Polygon
     shut: shapely.GeometryCollection
@@ -252,7 +252,7 @@ def _varied(rng: Rng, style: _Style) -> _Style:
 
 
 def _outline(rng: Rng, area: float) -> Polygon:
-    """Outline of a home: a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
+    """Draw a rectangle with corners cut out (L, T, U, Z, chamfers), a turned wing, and bays."""
     width, height = rng.uniform(1.0, 2.0), 1.0
     outline = box(0, 0, width, height)
     corners = [(0, 0), (width, 0), (width, height), (0, height), (width / 2, 0)]
@@ -296,7 +296,7 @@ def _rooms(rng: Rng, outline: Polygon, style: _Style) -> Iterator[Polygon]:
 
 
 def _divide(rng: Rng, part: Polygon, style: _Style) -> Iterator[Polygon]:
-    """Halve an area across its longer side until its parts are of the size of rooms; carve closets from some."""
+    """Halve an area across its longer side to sizes of rooms; carve closets from some."""
     x0, y0, x1, y1 = part.bounds
     long, short = max(x1 - x0, y1 - y0), min(x1 - x0, y1 - y0)
     big = part.area > 1.6 * log_uniform(rng, style.room_area) or long > 3.5 * short
@@ -368,7 +368,7 @@ def _opening(rng: Rng, wall: LineString, style: _Style, jamb_m: float) -> LineSt
 
 
 def _cells(plan: _Plan, resolution_m: float, wall_cells: int, corners: bool) -> States:
-    """Rasterise a plan: a cell is free if its centre is in the free area and no wall line touches it."""
+    """Rasterise a plan: cells are free with centres in the free area, away from wall lines."""
     with optional_packages():
         from rasterio.features import rasterize
         from rasterio.transform import Affine

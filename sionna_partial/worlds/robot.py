@@ -1,7 +1,6 @@
 """The exploring robot: frontiers, goals and routes, after Active Neural SLAM (Chaplot et al., ICLR 2020).
 
-Each action is a quarter of a metre forward or a turn of ten degrees, with a long-term goal every 25 steps. Frontiers
-drawn at random and shortest paths over seen cells replace the learnt policies.
+Randomly drawn frontiers and shortest paths over seen cells replace the learnt policies.
 """
 
 import math
@@ -31,7 +30,7 @@ TURN_DEG = 10
 """Angle of a turn [degree] (Active Neural SLAM, Section 4)."""
 
 ROBOT_RADII_M = (0.18, 0.14, 0.1, 0.06, 0.0)
-"""Possible radii of the robot [m]; it has the largest that fits the home."""
+"""Possible radii of the robot [m]; the largest fitting one is used."""
 
 ROAMED_FRACTION = 0.95
 """Fraction of the free area that the robot must reach."""
@@ -45,7 +44,7 @@ GOAL_RANGES = 2.0
 GOAL_SHARPNESS = 3.0
 """Exponent of a frontier's promise in its odds to become the goal [1].
 
-Fitted to the mean observed fractions of the paper on real homes; the best frontier every time would see more.
+Fitted to the paper's mean observed fractions on real homes; always taking the best frontier would see more.
 """
 
 _AHEAD_M = 0.3
@@ -68,7 +67,7 @@ _TIGHT_COST = 15.0
 
 
 class Frontier(NamedTuple):
-    """Free cells (n, 2) beside unseen ones, and the route (m, 2) to their middle cell, rows and columns."""
+    """Free cells (n, 2) beside unseen ones, and the route (m, 2) to their middle."""
 
     cells: Indices
     route: Indices
@@ -82,8 +81,8 @@ Choice = Callable[["Robot", list[Frontier]], int]
 class Robot:
     """Pose, map and plan of a robot in a home (ny, nx) with free cells, and unknown cells all around.
 
-    Lengths are in cells; x runs along columns, y along rows. The robot is at `position` and plans with
-    `believed_position` on its map `seen`.
+    Lengths are in cells, x along columns, y along rows. The robot at `position` plans with `believed_position` on its
+    map `seen`.
     """
 
     def __init__(
@@ -125,7 +124,7 @@ class Robot:
         return self.position[0] + self._shift[0], self.position[1] + self._shift[1]
 
     def act(self) -> None:
-        """Do one action towards a frontier, and look; do nothing if no frontier can be reached."""
+        """Do one action towards a frontier, and look; do nothing if none can be reached."""
         if self.is_finished:
             return
         route = self._route
@@ -211,7 +210,7 @@ class Robot:
         return made >= length / 2
 
     def _has_room(self, x: float, y: float, cell: tuple[int, int]) -> bool:
-        """Return whether the robot fits at x, y and gets there from a cell; walls that meet at a corner block it."""
+        """Return whether the robot fits at x, y and gets there; walls that meet at a corner block it."""
         row, column = int(y), int(x)
         beside = self._roomy[row, cell[1]] or self._roomy[cell[0], column]
         return bool(self._roomy[row, column] and beside)
@@ -235,7 +234,7 @@ class Robot:
 
 
 def _fitting_radius(free: Bools, resolution_m: float) -> tuple[float, Bools]:
-    """Return the largest radius [cells] of a robot that gets around, and the possible cells of its centre."""
+    """Return the largest radius [cells] that gets around, and the possible cells of its centre."""
     distance = ndimage.distance_transform_edt(free) - 0.5
     part = largest_part(free)
     for radius in np.array(ROBOT_RADII_M) / resolution_m:
@@ -279,12 +278,12 @@ def wide_frontiers(frontiers: list[Frontier], cell_m: float) -> list[Frontier]:
 
 
 def part_of(low: Sequence[int], high: Sequence[int]) -> tuple[slice, slice]:
-    """Return a part of a map from one row and column up to others, clipped to the map."""
+    """Return a part of a map, clipped to it."""
     return slice(max(0, int(low[0])), int(high[0])), slice(max(0, int(low[1])), int(high[1]))
 
 
 def _travel_cost(state: States, cell_m: float, radius: float, tight: Bools) -> Floats:
-    """Return the cost of crossing a cell: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
+    """Return costs of cells: 1 in the open, more beside walls, 0 (impassable) where not seen free."""
     distance = ndimage.distance_transform_edt(state != _WALL) - 0.5
     nearness = np.clip(1.0 - distance * cell_m / _COMFORT_M, 0.0, 1.0)
     cost = 1.0 + _COMFORT_COST * nearness
@@ -294,7 +293,7 @@ def _travel_cost(state: States, cell_m: float, radius: float, tight: Bools) -> F
 
 
 class _Router:
-    """Shortest paths from one cell to all others, in eight directions; cells of cost 0 are blocked."""
+    """Shortest paths from one cell in eight directions; cost 0 blocks."""
 
     def __init__(self, cost: Floats, start: tuple[int, ...]) -> None:
         self._cells = np.argwhere(cost > 0)

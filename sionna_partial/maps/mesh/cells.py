@@ -23,7 +23,7 @@ from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)
-"""Height band of walls above the lowest point of a mesh [m]: above tables, below lintels of doors."""
+"""Height band of walls above the lowest point [m]: above tables, below lintels."""
 
 DEFAULT_RESOLUTION_M = 0.05
 
@@ -42,7 +42,7 @@ LEVEL_M, LEVEL_FRACTION = 0.1, 0.3
 ceiling."""
 
 RIM_M = 0.3
-"""Largest width of free rims beyond walls, beside unknown cells, that become unknown [m]."""
+"""Largest width of free rims between walls and unknown cells, which become unknown [m]."""
 
 
 UNIT_REMEDY = "give unit_m, the length of its unit in metres"
@@ -50,7 +50,7 @@ UNIT_REMEDY = "give unit_m, the length of its unit in metres"
 
 @dataclass(frozen=True)
 class MeshReading:
-    """Options for the conversion of a mesh to a map; None is the default. See `load_map`."""
+    """Options of `load_map` for meshes."""
 
     height_band_m: tuple[float, float] | None = None
     observed: ArrayLike | PartialMap | None = None
@@ -80,8 +80,7 @@ def require_unit(unit_m: object) -> None:
 def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
     """Convert a mesh to a map that carries it, cut to its known cells.
 
-    Known cells with a surface in the height band are walls. Walls along lattice lines are in the cells above or to the
-    right, or on the other side if those are unknown.
+    Walls along lattice lines are in the cells above or to the right, or on the other side if those are unknown.
     """
     if reading.unit_m is not None:
         mesh = replace(mesh, vertices_m=mesh.vertices_m * reading.unit_m, height_range_m=None)
@@ -113,7 +112,7 @@ def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
 
 
 def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshReading) -> None:
-    """Warn of a wide storey whose height is usual in feet, unless a unit is given."""
+    """Warn of a wide storey with a height usual in feet, unless a unit is given."""
     x, y, _ = np.ptp(bounds_m, axis=0)
     if reading.unit_m is None and FEET_STOREY[0] <= storey_m <= FEET_STOREY[1] and min(x, y) >= WIDE_RATIO * storey_m:
         size = f"{what} spans {x:.3g} x {y:.3g} m, with a storey of {storey_m:.3g} m, as if it were in feet"
@@ -121,7 +120,7 @@ def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshRead
 
 
 def _storey_m(mesh: SceneMesh) -> float:
-    """Return the height from the lowest floor to the surface above it, or of the mesh if there is none [m]."""
+    """Return the height from the lowest floor to the next surface, or of the mesh without one [m]."""
     corners = mesh.corners_m
     area = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(area, axis=1)
@@ -142,7 +141,6 @@ def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
 
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
-    """Cut the mesh of a map, if any, to its known cells."""
     if partial.mesh is None:
         return partial
     row, start, end = row_runs(partial.state != CellState.UNKNOWN)
@@ -157,7 +155,7 @@ def cut_to_known(partial: PartialMap) -> PartialMap:
 
 
 def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bools:
-    """Return the cells (ny, nx) of free areas that are narrower than a width everywhere."""
+    """Return free cells (ny, nx) of areas narrower than a width everywhere."""
     area, count = ndimage.label(np.pad(free, 1))
     to_border_m = (ndimage.distance_transform_edt(area > 0) - 0.5) * resolution_m
     widest_m = 2.0 * largest_by_area(to_border_m, area, count)
@@ -175,7 +173,7 @@ def _rims(state: States, resolution_m: float) -> Bools:
 
 
 def fitted_grid(bounds_m: Floats, resolution_m: float) -> PartialMap:
-    """Return a map of unknown cells around the lowest and highest x and y, on multiples of the resolution."""
+    """Return a map of unknown cells around limits of x and y, on multiples of the resolution."""
     one = PartialMap(np.full((1, 1), CellState.UNKNOWN), resolution_m)
     cell = one.resolution_m
     first = np.floor(bounds_m[0, :2] / cell).astype(int) - 1
@@ -201,7 +199,7 @@ def _band(mesh: SceneMesh, given: tuple[float, float] | None) -> tuple[float, fl
 
 
 def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools:
-    """Return the cells (ny, nx) whose centre is in the polygon, or in a known cell of the other map."""
+    """Return the cells (ny, nx) with centres in the polygon or in known cells of the other map."""
     (ny, nx), cell = empty.shape, empty.resolution_m
     x = empty.origin_m[0] + cell * (np.arange(nx) + 0.5)
     y = empty.origin_m[1] + cell * (np.arange(ny) + 0.5)
@@ -225,7 +223,7 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
 
 
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
-    """Return the cells (ny, nx) with a surface of the mesh between two heights; touching borders does not count."""
+    """Return the cells (ny, nx) with a surface between two heights; touching borders does not count."""
     corners = mesh.corners_m
     z = corners[..., 2]
     low, high = band_m
@@ -239,7 +237,7 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
 
 
 def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools:
-    """Return the cells (ny, nx) that lines (N, 2, 2) [cells] cross by more than a margin."""
+    """Return the cells (ny, nx) that lines (N, 2, 2) [cells] cross by over a margin."""
     corners, cells = np.zeros((len(lines), 5, 2)), np.zeros(shape, dtype=np.bool_)
     corners[:, :2] = lines
     mark_cells(corners, np.full(len(lines), 2), cells, margin, True)

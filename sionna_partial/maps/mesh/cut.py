@@ -21,7 +21,7 @@ UPRIGHT_M = 1e-4
 MERGE_M = 1e-6
 
 SEAM_M = 1e-4
-"""Distance within which a cut point is on a vertex or an edge [m]: `UPRIGHT_M` moves it that far."""
+"""Distance within which a cut point is on a vertex or edge [m]: `UPRIGHT_M` moves it that far."""
 
 Triangles = Floats
 
@@ -81,7 +81,7 @@ def clip_slab(corners_m, values, low, high):
 
 
 def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
-    """Return the index (V,) of the first point within the distance of each point."""
+    """Return for each point (V,) the first one within the distance."""
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
     if not len(unique):
         return np.zeros(0, np.intp)
@@ -96,8 +96,8 @@ def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
 def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple[Indices, Indices]:
     """Split triangles at vertices from `first_new` on that are on their open edges, so that neighbours share edges.
 
-    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns the
-    triangles (G, 3), and the source triangle of each (G,), rising.
+    An edge that its neighbour has in two parts would look like the rim of a screen, which diffracts. Returns triangles
+    (G, 3), and their source triangles (G,), rising.
     """
     source = np.arange(len(triangles))
     while True:
@@ -125,7 +125,7 @@ def close_seams(vertices_m: Floats, triangles: Indices, first_new: int) -> tuple
 def _points_on_edges(
     vertices_m: Floats, triangles: Indices, first_new: int
 ) -> tuple[Indices, Indices, Indices, Floats]:
-    """Return triangle, corner at which its open edge starts, new vertex on that edge, and fraction of its length."""
+    """Return triangle, corner where its open edge starts, new vertex on it, and fraction of its length."""
     edges = np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=2).reshape(-1, 2)
     _, index, counts = np.unique(np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True)
     open_edges = np.nonzero((counts[index.ravel()] == 1) & (edges[:, 0] != edges[:, 1]))[0]
@@ -159,7 +159,7 @@ def _doubled_area(flat_m: Floats) -> Floats:
 
 
 def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Triangles, Indices]:
-    """Cut triangles with a width seen from above; new corners are in the plane of their triangle."""
+    """Cut triangles with a width seen from above, within their planes."""
     parts, source = shapely.get_parts(shapely.intersection(shapes, area), return_index=True)
     wide = 2 * shapely.area(parts) > MERGE_M * shapely.length(parts)
     pieces, index = shapely.get_parts(shapely.constrained_delaunay_triangles(parts[wide]), return_index=True)
@@ -177,7 +177,7 @@ def _cut_flat(corners_m: Triangles, shapes: NDArray[Any], area: Any) -> tuple[Tr
 
 
 def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Triangles, Indices]:
-    """Cut triangles that are lines seen from above, where these lines leave the area."""
+    """Cut triangles that are lines seen from above."""
     source, low, high = _spans_inside(ends_m, area)
     start, along = ends_m[source, 0], ends_m[source, 1] - ends_m[source, 0]
     offset = corners_m[source][..., :2] - start[:, None]
@@ -189,7 +189,7 @@ def _cut_upright(corners_m: Triangles, ends_m: Floats, area: Any) -> tuple[Trian
 
 
 def _spans_inside(ends_m: Floats, area: Any) -> tuple[Indices, Floats, Floats]:
-    """Return line, start and end (fractions of length) of the parts of lines (L, 2, 2) in an area or on its border."""
+    """Return line, start and end (fractions) of parts of lines (L, 2, 2) in an area or on its border."""
     lengths = np.linalg.norm(ends_m[:, 1] - ends_m[:, 0], axis=1)
     line, fraction = _border_stops(ends_m, area)
     line = np.concatenate([np.repeat(np.arange(len(ends_m)), 2), line])
@@ -211,7 +211,7 @@ def _spans_inside(ends_m: Floats, area: Any) -> tuple[Indices, Floats, Floats]:
 
 
 def _border_stops(ends_m: Floats, area: Any) -> tuple[Indices, Floats]:
-    """Return line and fraction of its length where lines (L, 2, 2) cross the border of an area or touch its corners."""
+    """Return line and fraction where lines (L, 2, 2) cross the border of an area or touch corners."""
     rings, ring = shapely.get_coordinates(shapely.get_parts(shapely.boundary(area)), return_index=True)
     edges = np.stack([rings[:-1], rings[1:]], axis=1)[ring[:-1] == ring[1:]]
     tree = shapely.STRtree(shapely.linestrings(edges))

@@ -1,7 +1,7 @@
 """Scanned and modelled meshes: mesh files through trimesh, and Mitsuba scene files, read without Mitsuba.
 
-Mitsuba would follow includes and paths out of the scene's folder, and abort on indices out of range. XML of others is
-parsed here (defusedxml), and meshes are checked before Mitsuba reads them.
+Mitsuba would follow includes and paths out of the scene's folder, and abort on indices out of range. XML is parsed here
+(defusedxml), and meshes are checked before Mitsuba reads them.
 """
 
 import io
@@ -48,7 +48,7 @@ MATERIAL_PROPERTIES = (
     *("type", "thickness", "relative_permittivity", "conductivity", "scattering_coefficient", "xpd_coefficient"),
     *("scattering_pattern", "alpha_r", "alpha_i", "lambda_", "color"),
 )
-"""Properties of shapes and radio materials that are read or have no effect here."""
+"""Properties of shapes and radio materials that are read or have no effect."""
 
 _CORNERS = np.array([[x, y, z] for z in (-1.0, 1.0) for y in (-1.0, 1.0) for x in (-1.0, 1.0)])
 _SIDES = np.array([[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]])
@@ -71,10 +71,7 @@ class _Neighbours(trimesh.resolvers.FilePathResolver):  # type: ignore[misc]
 
 
 def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = None) -> SceneMesh:
-    """Read a mesh file, without colours and textures.
-
-    `up` is the axis of the file that points up: by default y of glTF, as its specification says, and z of others.
-    """
+    """Read a mesh file, without colours and textures; `up` as in `load_map`."""
     notes = notes or ImportNotes(path)
     kind = path.suffix.lower().removeprefix(".")
     axis, other = (up or "y", "z") if kind in Y_UP_KINDS else (up or "z", "y")
@@ -91,7 +88,7 @@ def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = Non
 
 
 def confined_path(folder: Path, name: str, what: str) -> Path:
-    """Return the path of a file that another one names; a MapError (`what` ...) if it is not in the folder."""
+    """Return the path of a file named by another; a MapError (`what` ...) if it is not in the folder."""
     if not lies_in(folder, name):
         raise MapError(f"{what} {name!r}, which is not allowed: put it into '{folder}' and give its relative path.")
     if not (folder / name).is_file():
@@ -120,7 +117,7 @@ def _read_triangles(path: Path, kind: str, notes: ImportNotes) -> Triangles:
 
 
 def _require_whole(kind: str, content: bytes, triangles: int) -> None:
-    """Raise a ValueError if a file is shorter or longer than it announces: trimesh would read a part of it."""
+    """Raise a ValueError if a file has another length than announced: trimesh would read a part."""
     is_text = kind == "stl" and content[:5].lower() == b"solid" and b"facet" in content[:1000]
     if is_text and not content.rstrip().splitlines()[-1].strip().startswith(b"endsolid"):
         raise ValueError("it ends before its endsolid")
@@ -225,7 +222,7 @@ def read_exported_mesh(folder: Path, record: Mapping[str, Any], offset_m: object
 
 
 def _read_shapes(path: Path, notes: ImportNotes) -> tuple[ET.Element, list[tuple[ET.Element, Triangles]]]:
-    """Read a scene file and its shapes; DOCTYPE (entities) and references to other files are refused."""
+    """Read a scene file and its shapes, without DOCTYPE (entities) and references to other files."""
     content = read_bytes(path, "path", MapError, MAX_XML_BYTES, "split the scene.")
     try:
         root: ET.Element = defusedxml.ElementTree.fromstring(content, forbid_dtd=True)

@@ -59,7 +59,7 @@ FLOOR_FRACTION = 0.3
 """Least fraction of the cells of the fullest layer in a floor or ceiling."""
 
 SLAB_M = 0.5
-"""Largest height of consecutive full layers of a floor or ceiling; more is a cloud of walls [m]."""
+"""Largest height of full layers of a floor or ceiling [m]; more is a cloud of walls."""
 
 LOWEST_CEILING_M, BELOW_FLOOR_M, ABOVE_CEILING_M = 1.9, 0.2, 0.15
 """Least height of a ceiling; depth below the floor and height above the ceiling that count [m]."""
@@ -96,31 +96,27 @@ def map_from_points(
 ) -> PartialMap:
     """Make a map from a point cloud.
 
-    Floor and ceiling are the layers with points in most cells. Cells with points in the height band are walls, other
-    cells with points between floor and ceiling are free, and so are small gaps. Heights of the map start at the floor.
-    Files are read in parts, except PCD and PLY: memory grows with the building, not with the number of points.
+    Floor and ceiling are the layers with points in most cells. Cells with points in the height band are walls; others
+    with points between floor and ceiling, and small gaps, are free. Heights of the map start at the floor. Except PCD
+    and PLY, files are read in parts: memory grows with the building, not with the number of points.
 
     Parameters
     ----------
     points : (N, 3) array-like or path-like
-        x, y, z [m]; or a file: PCD, PLY, LAS, LAZ, or text (XYZ, PTS). Points that are not finite are skipped.
+        x, y, z [m]; or a PCD, PLY, LAS, LAZ or text file (XYZ, PTS). Points that are not finite are skipped.
     sensor_positions_m : (M, 2) or (M, 3) array-like, or None
-        Positions of the sensor in the axes of the cloud [m]: the space between it and a point is free.
+        Sensor positions in the axes of the cloud [m]: the space to its points is free.
     height_band_m : (float, float) or None
         z of the cloud between which points are walls [m], which also selects a storey.
     observed, resolution_m, up, unit_m
-        As in `load_map`. By default the free and wall cells are observed. All other arguments are in metres.
+        As in `load_map`; by default free and wall cells are observed. Other arguments are in metres.
     wall_height_m : float or None
-        Height of walls and ceiling [m]; by default the height of the ceiling of the cloud, or 3.
-
-    Returns
-    -------
-    PartialMap
+        Height of walls and ceiling [m]; by default the cloud's ceiling, or 3.
 
     Raises
     ------
     MapError
-        For a file that is damaged, too large or of another kind, a cloud in another unit, or other values.
+        For a damaged, too large or unknown file, a cloud in another unit, or other values.
 
     Examples
     --------
@@ -178,7 +174,7 @@ def _las(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _require_records(stream: IO[bytes]) -> None:
-    """Raise a ValueError for a LAS with more announced variable length records than space."""
+    """Raise a ValueError for a LAS that announces more variable length records than fit."""
     header, size = stream.read(247).ljust(247, b"\0"), os.fstat(stream.fileno()).st_size
     points_at, records = struct.unpack_from("<II", header, 96)
     extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
@@ -188,7 +184,7 @@ def _require_records(stream: IO[bytes]) -> None:
 
 
 def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
-    """Raise a ValueError for a LAZ with a wrong table of chunks: lazrs would exhaust the memory and abort."""
+    """Raise a ValueError for a LAZ with a wrong chunk table: lazrs would exhaust the memory and abort."""
     here, size = stream.tell(), os.fstat(stream.fileno()).st_size
     stream.seek(start)
     (table,) = struct.unpack("<q", stream.read(8))
@@ -243,7 +239,7 @@ def _ply(stream: IO[bytes]) -> Iterator[Floats]:
 
 
 def _text(stream: IO[bytes]) -> Iterator[Floats]:
-    """Yield the first three columns of a text, after a header or a number of points."""
+    """Yield the first three columns, after a header or a number of points."""
     separator, first, announced, count = None, True, None, 0
     while block := stream.read(PART_BYTES):
         block += stream.readline(10_000)
@@ -341,10 +337,7 @@ def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
 def _occupied_voxels(
     what: str, parts: Iterable[NDArray[Any]], cell_m: float, reading: MeshReading, notes: ImportNotes
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
-    """Return indices x, y, z (V, 3) of the voxels with points, and their numbers of points.
-
-    The third value has the number of points, and the sum of their heights [m], of each layer.
-    """
+    """Return voxels x, y, z (V, 3), their numbers of points, and count and sum of heights [m] of each layer."""
     heights_m: dict[int, tuple[int, float]] = {}
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for part in parts:
@@ -385,7 +378,7 @@ def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple
 
 
 def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, int]) -> Bools:
-    """Return cells (ny, nx) with points in enough layers of the height band that are not noise of a wall."""
+    """Return cells (ny, nx) with points in enough layers of the height band, without noise of walls."""
     size = shape[0] * shape[1]
     layers = np.bincount(cell, minlength=size).reshape(shape)
     points = np.bincount(cell, count, minlength=size).reshape(shape)
@@ -450,7 +443,7 @@ def _closed(free: Bools, wall: Bools, cell_m: float) -> Bools:
 
 
 def _enclosed(free: Bools, cell_m: float) -> Bools:
-    """Return cells of narrow or small free areas, as within walls, pillars and shelves."""
+    """Return narrow or small free areas, as within walls, pillars and shelves."""
     area, count = ndimage.label(free)
     small = np.bincount(area.ravel(), minlength=count + 1) * cell_m**2 < HOLE_M2
     return narrow_areas(free, cell_m) | (free & small[area])
@@ -462,7 +455,7 @@ def _beside(cells: Bools) -> Bools:
 
 @njit(cache=True)
 def _see_through(wall, targets, sensors, free):
-    """Mark the cells between a sensor and the cells that it sees (row, column) as free."""
+    """Mark the cells between sensors and the cells seen (row, column) as free."""
     ny, nx = wall.shape
     for sensor in range(len(sensors)):
         x0, y0 = sensors[sensor]
