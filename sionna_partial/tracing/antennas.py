@@ -4,7 +4,7 @@ import logging
 import math
 import re
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -229,7 +229,7 @@ class AntennaPattern(Shown):
         require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
         return self
 
-    @property
+    @cached_property
     def radiated(self) -> float:
         """Radiated fraction of the fed power."""
         angles_rad, weights = _sphere()
