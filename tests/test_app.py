@@ -4,6 +4,7 @@ import base64
 import io
 import itertools
 import json
+import math
 import os
 import re
 import socket
@@ -37,7 +38,8 @@ from sionna_partial.app.files import FILES, stored_map
 from sionna_partial.app.jobs import Status
 from sionna_partial.app.page import Page
 from sionna_partial.app.picture import Picture
-from sionna_partial.app.radio import PRESETS, RadioSettings, Transmitter
+from sionna_partial.app.radio import Transmitter
+from sionna_partial.app.server import AppServer
 from sionna_partial.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
@@ -133,20 +135,15 @@ class TestJobs:
         assert window.session.status.message == "Cancelled."
         assert window.put((1.0, 1.0)) == "Ready."
 
-    @pytest.mark.parametrize(
-        ("act", "search"), [(Session.place, "place_transmitter"), (Session.find_views, "next_views")]
-    )
-    def test_searches_take_turns_with_other_windows(
-        self, window: Window, monkeypatch: pytest.MonkeyPatch, act: Callable[[Session], None], search: str
-    ) -> None:
-        other, ended, steps, function = Window(), threading.Event(), list[str](), getattr(app_session, search)
+    def test_searches_take_turns_with_other_windows(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+        other, ended, steps, search = Window(), threading.Event(), list[str](), app_session.place_transmitter
 
         def counted(*given: Any, progress: Any, **named: Any) -> Any:
             def report(fraction: float, message: str) -> None:
                 steps.append("search")
                 progress(fraction, message)
 
-            return function(*given, progress=report, **named)
+            return search(*given, progress=report, **named)
 
         def endless(report: Any) -> Iterator[Callable[[], None]]:
             while not ended.is_set():
@@ -154,13 +151,9 @@ class TestJobs:
                 steps.append("other")
             yield lambda: None
 
-        unseen = ROOM.copy()
-        unseen[:, 30:] = 2
-        window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
-        window.put((1.0, 1.0))
-        monkeypatch.setattr(app_session, search, counted)
+        monkeypatch.setattr(app_session, "place_transmitter", counted)
         other.session.begin(endless)
-        act(window.session)
+        window.session.place()
         assert window.settle() == "Ready."
         ended.set()
         assert other.settle() == "Ready."
@@ -169,18 +162,26 @@ class TestJobs:
         assert during.count("search") > 4
         assert ("search", "search") not in {*itertools.pairwise(during)}
 
-    def test_a_drag_keeps_the_model(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_a_drag_keeps_the_model_and_the_warning_of_the_predictor(
+        self, window: Window, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
         made: list[Any] = []
         monkeypatch.setattr(
             app_session, "LinkModel", lambda *given, **named: made.append(sp.LinkModel(*given, **named)) or made[-1]
         )
-        for x_m in (1.0, 1.5, 3.0):
+        unseen = ROOM.copy()
+        unseen[:, 30:] = 2
+        window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
+        window.session.set(frequency_hz=60e9)
+        for x_m in (1.0, 1.5):
             window.session.put([("tx1" if made else "", x_m, 1.0)])
             assert window.settle() == "Ready."
+            (warning,) = window.session.warnings
+            assert "at 28 GHz, and is used at 60 GHz" in warning
         assert len(made) == 1
-        window.session.set(frequency_hz=60e9)
+        window.session.set(frequency_hz=28e9)
         window.settle()
-        assert len(made) == 2
+        assert (len(made), window.session.warnings) == (2, [])
 
 
 class TestTransmitters:
@@ -233,26 +234,9 @@ class TestTransmitters:
             window.session.change("tx1", z_m=9.0)
         assert window.session.transmitters == {"tx1": Transmitter(1.0, 1.0)}
         assert window.answer.is_final
-
-    def test_low_rooms(self, window: Window) -> None:
         window.session.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
         assert window.put((1.0, 1.0)) == "Ready."
         assert window.session.transmitters["tx1"].z_m == window.session.settings.rx_height_m == 0.6
-
-
-def test_the_warning_of_the_predictor_stays_with_the_settings(window: Window) -> None:
-    unseen = ROOM.copy()
-    unseen[:, 30:] = 2
-    window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
-    window.session.set(frequency_hz=60e9)
-    for x_m in (1.0, 1.5):
-        window.session.put([("tx1" if window.session.transmitters else "", x_m, 1.0)])
-        window.settle()
-        (warning,) = window.session.warnings
-        assert "at 28 GHz, and is used at 60 GHz" in warning
-    window.session.set(frequency_hz=28e9)
-    window.settle()
-    assert window.session.warnings == []
 
 
 class TestPresets:
@@ -281,10 +265,12 @@ class TestPresets:
         assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
         assert server.major_label_overrides == {0: "tx1", 1: "hall"}
         assert (len(server.color_mapper.palette), server.color_mapper.high) == (2, 1.5)
-
-    @pytest.mark.parametrize("name", PRESETS)
-    def test_each_is_a_setting_and_names_itself(self, name: str) -> None:
-        assert RadioSettings(**PRESETS[name]._asdict()).preset == name
+        drawn = {name: column[0] for name, column in picture.values.data.items()}
+        levels = drawn["power_mean_dbm"]
+        row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
+        x_m = drawn["x"] + (column + 0.5) / levels.shape[1] * drawn["dw"]
+        y_m = drawn["y"] + (row + 0.5) / levels.shape[0] * drawn["dh"]
+        assert min(math.dist((x_m, y_m), tx_m) for tx_m in ((1.0, 1.0), (3.0, 1.0))) < 0.5
 
     def test_the_page_shows_the_material_that_was_found(self, window: Window) -> None:
         window.put((1.0, 1.0))
@@ -300,48 +286,89 @@ class TestPresets:
         assert page.links.text.count("<a ") == len(FILES)
         page.session.close()
 
+    def test_the_fields_of_the_page_change_the_chosen_transmitter(self) -> None:
+        page = Page(Document(), "/files/key")
+        page.session.open_map(PARTIAL, "room.yaml")
+        page.session.put([("", 1.0, 1.0)])
+        page.show()
+        page.fields["x_m"].value_throttled = 3.0
+        page.pattern.value = "tr38901"
+        page.aims["azimuth_deg"].value_throttled = 90.0
+        changed = Transmitter(3.0, 1.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+        assert page.session.transmitters == {"tx1": changed}
+        page.session.close()
+
 
 class TestRobot:
     def test_prediction_meets_the_truth(self, window: Window) -> None:
+        with pytest.raises(SettingsError, match="examples alone"):
+            window.session.explore_more()
         window.session.open_example("apartment")
         window.settle()
         session = window.session
         assert (session.steps, [*session.transmitters]) == (100, ["tx1"])
+        wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
         session.set(spacing_m=0.6)
+        session.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
         session.explore_more(400)
         window.settle()
         assert session.steps == 500
+        assert session.partial.wall_materials == (sp.Material.named("metal"),)
         found = window.answer.agreement()
         assert found[0] > 0.9
         session.find_views()
         window.settle()
         assert session.views is not None
 
-    def test_a_map_has_no_robot(self, window: Window) -> None:
-        with pytest.raises(SettingsError, match="examples alone"):
-            window.session.explore_more()
-
 
 class TestFiles:
     def test_each_kind(self, window: Window) -> None:
-        with pytest.raises(SettingsError, match="no coverage yet"):
-            window.session.file("png")
         window.put((1.0, 1.0))
-        starts = {
-            "png": b"\x89PNG",
-            "html": b"<!doctype html",
-            "nc": b"\x89HDF",
-            "tif": b"II*",
-            "yaml": b"PK",
-            "pdf": b"%PDF",
-            "project": b"PK",
-        }
-        for kind in FILES:
+        starts = b"\x89PNG", b"<!doctype html", b"\x89HDF", b"II*", b"PK", b"%PDF", b"PK"
+        for kind, start in zip(FILES, starts, strict=True):
             content = window.session.file(kind)
-            assert content.startswith(starts[kind])
+            assert content.startswith(start)
             assert content == window.session.file(kind)
         with zipfile.ZipFile(io.BytesIO(window.session.file("yaml"))) as archive:
             assert archive.namelist() == ["coverage.pgm", "coverage.yaml"]
+
+    def test_measurements_are_counted_kept_dropped_and_forgotten(self, window: Window) -> None:
+        session = window.session
+        session.put([("", 1.0, 1.0)])
+        session.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
+        assert window.settle() == "Ready."
+        assert "measured.csv" in session.python()
+        points_m, used = session.measured_points()
+        assert (len(points_m), used.tolist()) == (3, [True, True, False])
+        unused, offset = session.warnings
+        assert unused.startswith("1 of 3 measurements are not used")
+        assert "taken for an offset" in offset
+        before = session.measured, session.answer
+        for csv, message in (
+            (b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n", "move one to (3, 1, 1.5)"),
+            (b"x,y,rssi\n2.05,1.0,-60\n", "are in walls"),
+            (b"x,y,rssi\n70,1,-60\n", "is outside the map"),
+            (b"\xff\x00", "measured.csv"),
+        ):
+            session.learn(csv)
+            assert message in window.settle()
+            assert session.status.is_error
+            assert (session.measured, session.answer, session.warnings) == (*before, [unused, offset])
+        session.put([("tx1", 3.0, 1.0)])
+        window.settle()
+        assert session.measured is None
+        assert "no transmitter is within" in session.warnings[0]
+        session.measured = sp.Measurements((3.0, 1.0, 1.5), [(2.05, 1.0, 1.5)], [-60.0])
+        session.predict()
+        assert window.settle() == "Ready."
+        assert session.measured is None
+        assert "are in walls" in session.warnings[0]
+        session.learn(b"x,y,rssi\n1.5,2.0,-60\n")
+        window.settle()
+        session.forget_measurements()
+        window.settle()
+        assert "measured_links" not in window.answer.coverage.attrs
+        assert (len(session.measured_points()[0]), session.warnings) == (0, [])
 
     def test_python_computes_the_same(self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.chdir(tmp_path)
@@ -353,59 +380,6 @@ class TestFiles:
         names: dict[str, Any] = {}
         exec(window.session.python(), names)
         assert names["coverage"].identical(window.answer.coverage)
-
-    def test_measurements_without_a_transmitter_are_of_the_chosen_one(self, window: Window) -> None:
-        window.put((1.0, 1.0))
-        window.session.learn(b"x,y,rssi\n1.5,2.0,-60\n3.0,2.5,-70\n")
-        window.settle()
-        assert window.session.measured is not None
-        assert "measured.csv" in window.session.python()
-        window.session.put([("tx1", 3.0, 1.0)])
-        window.settle()
-        assert window.session.measured is None
-
-        assert "no transmitter is within" in window.session.warnings[0]
-
-    def test_measurements_that_are_refused_change_nothing(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
-        window.session.learn(b"x,y,rssi\n1.5,2.0,-60\n3.0,2.5,-70\n")
-        window.settle()
-        before = window.session.measured, window.session.answer
-        for csv, message in (
-            (b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n", "move one to (3, 1, 1.5)"),
-            (b"x,y,rssi\n2.05,1.0,-60\n", "are in walls"),
-            (b"x,y,rssi\n70,1,-60\n", "is outside the map"),
-            (b"\xff\x00", "measured.csv"),
-        ):
-            window.session.learn(csv)
-            assert message in window.settle()
-            assert window.session.status.is_error
-            assert (window.session.measured, window.session.answer) == before
-
-    def test_measured_points_are_counted_and_forgotten(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
-        window.session.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
-        assert window.settle() == "Ready."
-        points_m, used = window.session.measured_points()
-        assert (len(points_m), used.tolist()) == (3, [True, True, False])
-        unused, offset = window.session.warnings
-        assert unused.startswith("1 of 3 measurements are not used")
-        assert "taken for an offset" in offset
-        window.session.learn(b"\xff\x00")
-        window.settle()
-        assert window.session.warnings == [unused, offset]
-        window.session.forget_measurements()
-        window.settle()
-        assert "measured_links" not in window.answer.coverage.attrs
-        assert (len(window.session.measured_points()[0]), window.session.warnings) == (0, [])
-
-    def test_measurements_with_which_nothing_can_be_predicted_are_dropped(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
-        window.session.measured = sp.Measurements((1.0, 1.0, 1.5), [(2.05, 1.0, 1.5)], [-60.0])
-        window.session.predict()
-        assert window.settle() == "Ready."
-        assert window.session.measured is None
-        assert "are in walls" in window.session.warnings[0]
 
 
 def uploaded(tmp_path: Path) -> list[tuple[str, bytes]]:
@@ -433,14 +407,10 @@ class TestUploads:
         ("names", "message"),
         [
             ("map.exe", "cannot be read"),
-            ("map", "cannot be read"),
             ("a.yaml b.yml", "cannot be read"),
-            ("a.npz b.pgm", "cannot be read"),
-            ("a.pgm b.pgm c.yaml", "cannot be read"),
             ("a.pgm b.png c.yaml", "cannot be read"),
             ("a.zip", "zip cannot be read"),
             ("room.yaml", "room.yaml' alone is not a map: choose the YAML and the image"),
-            ("room.pgm", "room.pgm' alone is not a map: choose the YAML and the image"),
         ],
     )
     def test_other_files_are_refused(self, names: str, message: str, tmp_path: Path) -> None:
@@ -448,10 +418,9 @@ class TestUploads:
             stored_map([(name, b"") for name in names.split()], tmp_path)
         assert not [*tmp_path.iterdir()]
 
-    @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-    def test_damaged_zip(self, method: int, tmp_path: Path) -> None:
+    def test_damaged_zip(self, tmp_path: Path) -> None:
         packed = io.BytesIO()
-        with zipfile.ZipFile(packed, "w", method) as archive:
+        with zipfile.ZipFile(packed, "w", zipfile.ZIP_LZMA) as archive:
             for name, content in uploaded(tmp_path):
                 archive.writestr(name, content)
         (tmp_path / "in").mkdir()
@@ -559,19 +528,6 @@ class TestDrawing:
             with pytest.raises(SettingsError, match=message):
                 session.draw(stroke)
 
-    def test_strokes_stay_while_the_robot_explores(self, window: Window) -> None:
-        session = window.session
-        session.open_example("apartment")
-        window.settle()
-        wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
-        session.set(spacing_m=1.0)
-        session.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
-        session.explore_more(20)
-        window.settle()
-        assert session.partial.wall_materials == (sp.Material.named("metal"),)
-        session.open_map(PARTIAL, "room.yaml")
-        assert session.strokes == ()
-
 
 class TestProjects:
     def saved(self, window: Window) -> bytes:
@@ -603,11 +559,8 @@ class TestProjects:
             (b'"hall"', b'"<b>"', "name = '<b>'"),
             (b"60480000000.0", b"1e99", "frequency_hz"),
             (b'"tr38901"', b'"/etc/passwd"', "pattern"),
-            (b'"material": ""', b'"material": "cheese"', "material"),
             (b'"x_m": 3.0', b'"x_m": NaN', "x_m"),
             (b'"x_m": 3.0', b'"y": 3.0', "damaged"),
-            (b'"gain_db"', b'"gain"', "damaged"),
-            (b'"title"', b'"titles"', "damaged"),
             (b'"title"', b"[" * 100_000, "damaged"),
         ):
             text = contents["project.json"]
@@ -667,30 +620,24 @@ class TestServer:
         assert {status_of(host + path) for path in ("/", "/wrong", "/wrong/ws", "/files/x/png")} == {404}
         assert status_of(f"{url}/files/guessed/png") == status_of(f"{url}/files/guessed/map", b"") == 404
 
-    @pytest.mark.parametrize("path", ["/wrong", "/files/guessed/map", "/files/KEY/wrong"])
-    @pytest.mark.parametrize("header", ["Content-Length: 190000000", "Transfer-Encoding: chunked"])
-    def test_large_bodies_are_refused_by_their_headers(self, url: str, path: str, header: str) -> None:
-        assert refusal(url, path, header) in (400, 404)
-
     @pytest.mark.parametrize(
-        ("header", "code"),
+        ("path", "header", "code"),
         [
-            ("Content-Length: 190000000", 415),
-            ("Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 202000000", 413),
-            ("Content-Type: multipart/form-data; boundary=x\r\nTransfer-Encoding: chunked", 411),
+            ("/wrong", "Content-Length: 190000000", 400),
+            ("/files/guessed/map", "Transfer-Encoding: chunked", 404),
+            ("/files/KEY/map", "Content-Length: 190000000", 415),
+            ("/files/KEY/map", "Content-Type: multipart/form-data; boundary=x\r\nContent-Length: 202000000", 413),
+            ("/files/KEY/map", "Content-Type: multipart/form-data; boundary=x\r\nTransfer-Encoding: chunked", 411),
         ],
-        ids=["type", "size", "chunked"],
+        ids=["path", "key", "type", "size", "chunked"],
     )
-    def test_uploads_are_refused_by_their_headers(self, url: str, header: str, code: int) -> None:
-        assert refusal(url, "/files/KEY/map", header) == code
+    def test_uploads_are_refused_by_their_headers(self, url: str, path: str, header: str, code: int) -> None:
+        assert refusal(url, path, header) == code
 
     def test_an_upload(self, url: str) -> None:
         key = window_key(url)
-        form = (
-            b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.npz"\r\n\r\n'
-            + bytes(10**6)
-            + b"\r\n--x--\r\n"
-        )
+        form = b'--x\r\nContent-Disposition: form-data; name="file"; filename="a.npz"\r\n\r\n'
+        form += bytes(10**6) + b"\r\n--x--\r\n"
         kind = {"Content-Type": "multipart/form-data; boundary=x"}
         for body, code in ((form, 200), (b"--x--\r\n", 404), (b"nothing", 400)):
             assert status_of(urllib.request.Request(f"{url}/files/{key}/map", body, kind)) == code
@@ -703,12 +650,8 @@ class TestServer:
             pass
 
     def test_port_that_is_taken(self, url: str) -> None:
-        port = url.split(":")[2].split("/")[0]
-        command = [sys.executable, "-m", "sionna_partial", "app", "--no-browser", "--port", port]
-        ended = subprocess.run(command, capture_output=True, text=True, timeout=120)
-        assert ended.returncode == 2
-        assert "choose another --port" in ended.stderr
-        assert "Traceback" not in ended.stderr
+        with pytest.raises(SettingsError, match=r"cannot be listened at .*: choose another --port"):
+            AppServer(port=int(url.split(":")[2].split("/")[0]))
 
 
 _MODEL = "Bokeh.documents[0].get_model_by_name"
@@ -850,35 +793,4 @@ def test_a_plan_is_dropped_measured_and_corrected(url: str, tmp_path: Path) -> N
         tab.run(f"{_MODEL}('stroke').value = '', 0")
         tab.drag(*pixel(tab, 1.0, 1.0), *pixel(tab, 3.0, 2.0))
         tab.wait(f"Math.abs({_MODEL}('points').data.x[0] - 3.0) < 0.1")
-        assert tab.faults() == []
-
-
-def level(tab: Tab, x_m: float, y_m: float) -> float:
-    """Return the mean received power at a position [dBm]."""
-    found = tab.run(
-        f"(({{data}}) => {{ const values = data.power_mean_dbm[0], [ny, nx] = values.shape"
-        f"; const at = (v, low, size, n) => Math.floor((v - low) / size * n)"
-        f"; return values[at({y_m}, data.y[0], data.dh[0], ny) * nx + at({x_m}, data.x[0], data.dw[0], nx)]"
-        f"}})({_MODEL}('values'))"
-    )
-    return float(found)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium")
-def test_one_is_placed_and_its_sector_turns(url: str, tmp_path: Path) -> None:
-    with chromium(tmp_path) as open_tab:
-        tab = open_tab(url, 1400, 950)
-        tab.wait(f"{_MODEL}('message').text.includes('Click on the map')")
-        press(tab, "Place it for me")
-        tab.wait(f"{_MODEL}('points').data.name[0] == 'tx1' && {_READY}")
-        type_into(tab, "x [m]", "1")
-        tab.wait(f"{_MODEL}('python').value.includes('(1.0,')")
-        type_into(tab, "y [m]", "1.5")
-        tab.wait(f"{_MODEL}('python').value.includes('(1.0, 1.5,')")
-        tab.run(f"{_MODEL}('pattern').value = 'tr38901', 0")
-        for azimuth_deg, stronger, weaker in ((10, (1.7, 1.6), (0.9, 2.5)), (90, (0.9, 2.5), (1.7, 1.6))):
-            tab.wait(f"{_MODEL}('python').value.includes('tr38901')")
-            type_into(tab, "Azimuth [\u00b0]", str(azimuth_deg))
-            tab.wait(f"{_MODEL}('python').value.includes('azimuth_deg={azimuth_deg}') && {_READY}")
-            assert level(tab, *stronger) > level(tab, *weaker) + 6.0
         assert tab.faults() == []

@@ -2,7 +2,7 @@
 
 import functools
 import logging
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -222,13 +222,12 @@ class TestPredictMap:
 
     def test_others_in_the_file_count_through_walls(self):
         """Those in walls or outside the map are left out."""
-        wifi = sp.LinkModel(HOUSE, trace_settings=sp.TraceSettings(5e9))
         positions = np.stack([TX, TX - [0.0, 0.8, 0.0], [0.2, 0.2, 1.5], [99.0, 0.0, 1.5]])
         table = {"tx": np.repeat(positions, 30, axis=0), "rx": np.tile(LEFT, (4, 1)), "gain_db": np.full(120, -75.0)}
         one = {name: values[:30] for name, values in table.items()}
         both = {name: values[:60] for name, values in table.items()}
         scales = [
-            wifi.coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
+            wifi().coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
             for each in (one, both, table)
         ]
         assert scales[1] == scales[2] != scales[0]
@@ -247,7 +246,6 @@ class TestPredictMap:
             ({"rx": np.tile([0.2, 0.2, 1.5], (30, 1))}, MeasurementError, "in walls or at the transmitter"),
             ({"rx": LEFT + 99.0}, PositionError, "rx of the measurements"),
             (MANY, MeasurementError, "30,000 links of this transmitter, more than 20,000"),
-            ({"std_db": -1.0}, MeasurementError, r"std_db\[\] = -1 is not allowed"),
             ({"std_db": [1.0, 2.0]}, MeasurementError, r"std_db has shape \(2,\)"),
             ({"sensitivity_db": -999}, MeasurementError, "sensitivity_db = -999 is not allowed"),
         ],
@@ -255,13 +253,6 @@ class TestPredictMap:
     def test_unusable_measurements_are_refused(self, change, error, message):
         with pytest.raises(error, match=message):
             sp.predict_map(model(), TX, measurements=self.table() | change, **OPTIONS)
-
-
-def test_measurements_can_be_selected():
-    measured = sp.Measurements(TX, LEFT, np.full(30, -80.0), 2.0, -110.0)
-    some = measured.take(np.array([3, 5]))
-    assert (len(some), some.sensitivity_db, some.std_db.tolist()) == (2, -110.0, [2.0, 2.0])
-    assert replace(measured, std_db=None).take(np.array([3])).std_db is None
 
 
 def test_through_walls_the_variance_is_of_process_offset_factor_and_fading_together():
@@ -302,32 +293,26 @@ LIMITS_DB = {"sensitivity_db": -95.0}
 
 
 @pytest.mark.parametrize(
-    ("house", "kind", "gains_db"),
-    [
-        (model, "one", (-3.0, 7.0, 20.0)),
-        (model, "unknown position", (7.0,)),
-        (wifi, "one", (-3.0, 7.0, 20.0)),
-        (wifi, "several", (7.0, 20.0)),
-    ],
+    ("house", "kind"), [(model, "one"), (model, "unknown position"), (wifi, "one"), (wifi, "several")]
 )
-def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind, gains_db):
+def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind):
     """With measurements that contain the gain, predictions rise by exactly the gain where there is a path."""
+    gain_db = 7.0
     measured = measured_links(-25.0 if kind == "several" else 0.0, **LIMITS_DB if kind == "one" else {})
     tx = SOURCES if kind == "several" else TX
     if kind == "unknown position":
         tx, measured = None, {name: values[:8] for name, values in measured.items() if name != "tx"}
     before = house().coverage(tx, spacing_m=1.6, measurements=measured)
-    for gain_db in gains_db:
-        flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
-        louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
-        after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
-        for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
-            np.testing.assert_allclose(after[name], before[name], atol=1e-6)
-        for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
-            seen = (before["valid"] == 1) & (before[name] > -145.0)
-            np.testing.assert_allclose((after[name] - before[name]).to_numpy()[seen], gain_db, atol=2e-5)
-        for name in ("measured_offset_db", "measured_shadow_scale", "measured_noise_db"):
-            assert after.attrs.get(name) == pytest.approx(before.attrs.get(name), abs=1e-6)
+    flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
+    louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
+    after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
+    for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
+        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+    for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
+        seen = (before["valid"] == 1) & (before[name] > -145.0)
+        np.testing.assert_allclose((after[name] - before[name]).to_numpy()[seen], gain_db, atol=2e-5)
+    for name in ("measured_offset_db", "measured_shadow_scale", "measured_noise_db"):
+        assert after.attrs.get(name) == pytest.approx(before.attrs.get(name), abs=1e-6)
 
 
 def test_the_antenna_of_another_transmitter_changes_nothing():

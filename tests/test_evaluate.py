@@ -9,7 +9,6 @@ from predictor_links import NLOS, OUTAGE, QUIET, quick_predictor
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation import (
-    ALWAYS_OUTAGE,
     WITH_INDOOR,
     WITHOUT_INDOOR,
     Baselines,
@@ -52,17 +51,11 @@ class TestEvaluate:
             assert [(row.ends_seen, row.model) for row in rows] == [
                 (ends, answer) for ends in ("all", "both", "one", "none") for answer in ANSWERS
             ]
-        assert [(each, found.state.links.sum()) for each, found in evaluation.calibrations.items()] == [
-            (0, 900),
-            (100, 900),
-        ]
-
-    def test_links_are_split_by_ends_seen(self, evaluation):
-        for receivers, answer in (("indoor", "majority"), ("anywhere", WITH_INDOOR)):
-            rows = evaluation.select(homes="test", receivers=receivers, stage=0, model=answer)
-            total, *parts = (row.metrics.links for row in rows)
-            assert total == sum(parts) == 3 * 300
-            assert min(parts) > 0
+        assert [found.state.links.sum() for found in evaluation.calibrations.values()] == [900, 900]
+        rows = evaluation.select(homes="test", receivers="anywhere", stage=0, model=WITH_INDOOR)
+        total, *parts = (row.metrics.links for row in rows)
+        assert total == sum(parts) == 3 * 300
+        assert min(parts) > 0
 
     def test_figures_are_those_of_the_links(self, table, evaluation):
         chosen = np.isin(table.home, ["home 0", "home 2", "home 3"]) & ~table.anywhere & (table.stage == 100)
@@ -72,20 +65,12 @@ class TestEvaluate:
         assert row.metrics.as_json() == pytest.approx(expected)
 
     def test_the_indoor_model_helps_where_receivers_may_be_outside(self, evaluation):
-        for homes in ("test", "train"):
-            for stage in (0, 100):
-                rows = evaluation.select(homes=homes, receivers="anywhere", stage=stage, ends_seen="all")
-                found = {row.model: row.metrics for row in rows}
-                with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
-                assert with_it.accuracy > without.accuracy + 0.05
-                for name in ("rmse_db", "nll_state", "calibration_error"):
-                    assert getattr(with_it, name) < getattr(without, name), name
-
-    def test_always_outage_is_right_as_often_as_there_is_one(self, table, evaluation):
-        (row,) = evaluation.select(homes="train", receivers="anywhere", stage=0, ends_seen="all", model=ALWAYS_OUTAGE)
-        truth = table.link_state[(table.home == "home 1") & table.anywhere & (table.stage == 0)]
-        assert row.metrics.accuracy == np.mean(truth == OUTAGE)
-        assert row.metrics.rmse_db > 0.0
+        rows = evaluation.select(homes="test", receivers="anywhere", stage=100, ends_seen="all")
+        found = {row.model: row.metrics for row in rows}
+        with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
+        assert with_it.accuracy > without.accuracy + 0.05
+        for name in ("rmse_db", "nll_state", "calibration_error"):
+            assert getattr(with_it, name) < getattr(without, name), name
 
     def test_a_receiver_that_is_seen_is_indoors_for_certain(self, table):
         doubtful = quick_predictor().fit_indoor(table.phi, np.zeros(len(table)))
@@ -153,26 +138,17 @@ class TestBaselines:
         assert rows[0] == rows[1] != []
 
 
-OTHERS = "give a data set of other homes, such as other seeds, or train with test_fraction above 0."
-
-
 @pytest.mark.parametrize(
     ("predictor", "links", "baselines", "message"),
     [
         ((), slice(None), 5, "baselines = 5 is not allowed: give Baselines, or None"),
-        (
-            [f"home {index}" for index in range(4)],
-            slice(None),
-            None,
-            f"predictor 'fitted' was trained on all 4 homes of the data set: {OTHERS}",
-        ),
+        ([f"home {index}" for index in range(4)], slice(None), None, "was trained on all 4 homes of the data set"),
         ((), slice(0), None, "dataset has no links"),
         (
             (),
             None,
             None,
-            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
-            "diffraction: choose another predictor",
+            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on",
         ),
     ],
 )

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from rosbag_files import Messages, write_bag
 from typer.testing import CliRunner
 
 import sionna_partial as sp
@@ -18,7 +17,7 @@ from sionna_partial import cli
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
 from sionna_partial.live.coverage import LiveGrid, LiveViews
-from sionna_partial.live.topics import Listener, Topics, replay
+from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
 TX = (1.5, 1.5, 1.5)
@@ -61,12 +60,6 @@ class TestOrder:
         heard.live.on_map(message(sec=6))
         assert heard.step() == []
 
-    def test_queue_of_one(self) -> None:
-        heard = Heard()
-        for cells in (ROOM, grown(), ROOM[::-1]):
-            heard.live.on_map(message(cells))
-        assert heard.step() == [(3, False), (3, True)]
-
     def test_newer_map_comes_before_a_fine_answer_but_not_forever(self) -> None:
         heard, rooms = Heard(), [ROOM, grown(), ROOM, grown()]
         heard.live.on_map(message(rooms[0]))
@@ -100,16 +93,6 @@ class TestMaps:
             at_transmitter = bool(np.isnan(expected))  # where the nearest receiver counts
             assert at_transmitter or heard[-1].cost[row, column] == pytest.approx(expected, abs=0.51)
         assert {0, 100} <= {*heard[-1].cost.ravel().tolist()}
-
-    def test_map_shrinks_and_moves(self, caplog: pytest.LogCaptureFixture) -> None:
-        heard = Heard()
-        heard.live.on_map(message(np.pad(np.array(ROOM), 3, constant_values=-1), at=(-3.0, -3.0)))
-        assert len(heard.step()) == 2
-        heard.live.on_map(message())
-        assert heard.step() == [(2, False), (2, True)]
-        heard.live.on_map(message(at=(50.0, 50.0)))
-        assert heard.step() == []
-        assert "map for tx not answered: tx = (1.5, 1.5, 1.5) is outside the map" in caplog.text
 
     def test_update(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard()
@@ -178,6 +161,8 @@ class TestTransmitters:
     def test_refused(self, tx: Any) -> None:
         with pytest.raises(sp.SionnaPartialError, match="tx"):
             sp.LiveCoverage(tx, print)
+        with pytest.raises(SettingsError, match=r"powers\['/rssi'\] = 'attic' is not allowed: name one of the"):
+            Listener(Heard().live, Topics(powers={"/rssi": "attic"}))
 
     def test_powers(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard(refresh_s=0.1)
@@ -324,12 +309,6 @@ class TestListener:
         assert heard.live._pose == pytest.approx((3.5, 0.0, 99.0))
         assert len(listener._frames) <= 13
 
-    @pytest.mark.parametrize(("powers", "name"), [({"/rssi": "attic"}, "attic"), ({"/rssi": None}, None)])
-    def test_powers_of_no_transmitter(self, powers: Any, name: str | None) -> None:
-        heard = Heard({"desk": TX, "door": TX})
-        with pytest.raises(SettingsError, match=rf"powers\['/rssi'\] = {name!r} is not allowed: name one of the"):
-            Listener(heard.live, Topics(powers=powers))
-
     def test_powers_and_views(self) -> None:
         heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
         listener = Listener(heard.live, Topics(powers={"/rssi": "door"}, key_values="/wifi"))
@@ -349,20 +328,6 @@ class TestListener:
         assert isinstance(heard[0], LiveViews)
         assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]
         assert [*listener.topics.messages(heard[0])] == ["/radio/next_views"]
-
-
-class TestRecordings:
-    def test_each_map_is_waited_for(self, tmp_path: Path) -> None:
-        make = Messages(2)
-        rows = [
-            ("/map", 1.0, make.grid(ROOM, (0.0, 0.0, 0.0), 1.0)),
-            ("/map", 2.0, make.grid(grown(), resolution_m=1.0)),
-        ]
-        heard = Heard((2.5, 3.5, 1.5))
-        replay(Listener(heard.live, Topics()), write_bag(tmp_path / "drive_mcap", rows))
-        assert [(each.map_number, each.is_final) for each in heard] == [(2, False), (2, True)]
-        with pytest.raises(sp.SionnaPartialError, match="name one of its topics: /map"):
-            replay(Listener(heard.live, Topics(map="/other")), tmp_path / "drive_mcap")
 
 
 def test_lines_are_not_repeated(caplog: pytest.LogCaptureFixture) -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-import logging
 import math
 
 import numpy as np
@@ -15,7 +14,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkFeatures
+from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.map_networks import (
     evaluate_context_networks,
     fit_context_networks,
@@ -36,7 +35,7 @@ DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
 
 @dataclasses.dataclass(frozen=True)
 class Links:
-    """Links that differ in nothing but the rooms that their receivers are in, and the last column of indirect gains.
+    """Links that differ in nothing but the rooms that their receivers are in.
 
     Half of the rooms of each map are seen. The transmitter, and receivers in rooms of both kinds, stand in cells that
     are not.
@@ -44,11 +43,10 @@ class Links:
 
     phi: LinkFeatures
     in_seen_room: np.ndarray
-    path_seen: np.ndarray
 
-    def truth(self, linked):
-        """Return true states and gains where some links (N,) are NLOS, and the others in outage."""
-        noise = np.random.default_rng(0).normal(GAIN_DB, STD_DB, len(linked))
+    def truth(self):
+        """Return true states and gains: NLOS in seen rooms, outage in the others."""
+        linked, noise = self.in_seen_room, np.random.default_rng(0).normal(GAIN_DB, STD_DB, len(self.in_seen_room))
         return np.where(linked, NLOS, OUTAGE).astype(np.uint8), np.where(linked, noise, -150.0)
 
 
@@ -66,71 +64,34 @@ def make_room_links(maps, links, seed):
         cells = np.column_stack(np.divmod(position, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
         rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
     count = maps * links
-    path_seen = rng.uniform(size=count) < 0.5
-    gains_db = np.full((count, len(ATTENUATION_LENGTHS_M)), -90.0)
-    gains_db[~path_seen, -1] = -150.0
     where, tx_m = (tuple(partial), np.repeat(np.arange(maps), links)), (0.01, 0.01, 1.5)
-    known = {"unobserved_m": 3.0, "distance_m": DISTANCE_M, "state": NLOS, "gain_db": -90.0, "indirect_db": gains_db}
+    known = {"unobserved_m": 3.0, "distance_m": DISTANCE_M, "state": NLOS, "gain_db": -90.0, "indirect_db": -90.0}
     phi = features(where, np.concatenate(rx_m), tx_m=tx_m, **known)
     order = rng.permutation(count)
-    return Links(phi.take(order), np.concatenate(in_seen_room)[order], path_seen[order])
+    return Links(phi.take(order), np.concatenate(in_seen_room)[order])
 
 
 TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 """Arguments of `make_room_links` for links to learn from, and for links on other maps."""
 
 
-def trained_and_scored(networks, rule):
-    """Train by a rule in few, larger steps; return accuracy, cross-entropy and mean NLOS gain [dB] on other maps."""
+def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
+    """In few, larger steps."""
     seen, others = make_room_links(*TRAINING), make_room_links(*OTHERS)
-    settings = PredictorSettings(networks, passes=100 if networks == "paths" else 14)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "LEARNING_RATE", 0.01)
-        patch.setattr(module, "WINDOWS_AT_ONCE", 8)
-        patch.setattr(module, "_WIDTHS", ((8, 16), (8, 16)))
-        found = fit_context_networks(seen.phi, *seen.truth(getattr(seen, rule)), settings)
-    state, _ = others.truth(getattr(others, rule))
-    probabilities, means_db, _ = evaluate_context_networks(found, others.phi, FREQUENCY_HZ)
-    entropy = -np.log(probabilities[state, np.arange(len(state))]).mean()
-    return (probabilities.argmax(axis=0) == state).mean(), entropy, means_db[NLOS][state == NLOS].mean()
+    for name, value in {"LEARNING_RATE": 0.01, "WINDOWS_AT_ONCE": 8, "_WIDTHS": ((8, 16), (8, 16))}.items():
+        monkeypatch.setattr(module, name, value)
+    networks = fit_context_networks(seen.phi, *seen.truth(), PredictorSettings("map", passes=14))
+    state, _ = others.truth()
+    probabilities, means_db, _ = evaluate_context_networks(networks, others.phi, FREQUENCY_HZ)
+    assert (probabilities.argmax(axis=0) == state).mean() > 0.9
+    assert -np.log(probabilities[state, np.arange(len(state))]).mean() < 0.5 * math.log(2.0)
+    assert means_db[NLOS][state == NLOS].mean() == pytest.approx(GAIN_DB, abs=4.0)
 
 
-def few_links():
-    """Return the arguments of a training that takes no time: four windows."""
-    return make_seen_links(200)
-
-
-class TestFitContextNetworks:
-    def test_paths(self):
-        accuracy, entropy, gain_db = trained_and_scored("paths", "path_seen")
-        assert accuracy == 1.0
-        assert entropy < 0.01
-        assert gain_db == pytest.approx(GAIN_DB, abs=1.0)
-        accuracy, entropy, _ = trained_and_scored("paths", "in_seen_room")
-        assert accuracy < 0.6
-        assert entropy > math.log(2.0) - 0.01
-
-    def test_map(self):
-        accuracy, entropy, gain_db = trained_and_scored("map", "in_seen_room")
-        assert accuracy > 0.9
-        assert entropy < 0.5 * math.log(2.0)
-        assert gain_db == pytest.approx(GAIN_DB, abs=4.0)
-
-    def test_progress(self, caplog):
-        calls = []
-        with caplog.at_level(logging.INFO, module.__name__):
-            settings = PredictorSettings("paths", passes=18)
-            fit_context_networks(*few_links(), settings, progress=lambda *call: calls.append(call))
-        ((done, message),) = calls
-        assert done == 0.0
-        assert message.startswith("step 0 of 5, loss ")
-        (message,) = (record.message for record in caplog.records if record.name == module.__name__)
-        assert message.startswith("5 steps on 4 windows: loss ")
-
-    def test_diverging_training(self):
-        phi, state, gain_db = few_links()
-        with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
-            fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
+def test_diverging_training():
+    phi, state, gain_db = make_seen_links(200)
+    with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
+        fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
 
 
 def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
@@ -150,15 +111,14 @@ def links():
 def examples(links):
     """Gains are the numbers of the links."""
     numbers = np.arange(len(links.phi), dtype=np.float64)
-    state = links.truth(links.in_seen_room)[0]
-    return module._Examples(links.phi, state, numbers, PredictorSettings("map"))
+    return module._Examples(links.phi, links.truth()[0], numbers, PredictorSettings("map"))
 
 
 class TestExamples:
     def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
         """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
         phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
-        inputs, state = scaled_inputs(phi, FREQUENCY_HZ), links.truth(links.in_seen_room)[0]
+        inputs, state = scaled_inputs(phi, FREQUENCY_HZ), links.truth()[0]
         turns = set()
         for batch in examples.batches(4, np.random.default_rng(4)):
             for number, drawn in enumerate(batch["gain_db"].astype(int)):
@@ -184,8 +144,3 @@ class TestExamples:
         count = len(examples)
         passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
         assert passes == [list(range(count))] * 7
-
-    def test_without_a_map_network_there_are_no_windows(self, links):
-        found = module._Examples(links.phi, *links.truth(links.path_seen), PredictorSettings("paths"))
-        (batch,) = found.batches(1, np.random.default_rng(7))
-        assert "windows" not in batch

@@ -41,22 +41,16 @@ def csv_file(folder: Path, text: str) -> Path:
     return path
 
 
-def rows(columns: dict[str, NDArray[np.float64]]) -> str:
-    return "\n".join(",".join(f"{value:.17g}" for value in row) for row in zip(*columns.values(), strict=True))
-
-
 class TestForms:
     @pytest.mark.parametrize(
         "source",
         [
             Measurements(TX, RX, GAIN_DB),
             FIELDS,
-            FLAT,
             Frame({"tx": [*map(tuple, TX)], "rx": [*RX], "gain_db": [*GAIN_DB]}),
             Frame({name: [*values] for name, values in FLAT.items()}),
             xr.Dataset({"tx": (("link", "axis"), TX), "rx": (("link", "axis"), RX), "gain_db": ("link", GAIN_DB)}),
         ],
-        ids=["measurements", "mapping", "flat mapping", "frame of triples", "flat frame", "xarray"],
     )
     def test_all_give_the_same(self, source: object) -> None:
         found = measurements_of(source)
@@ -69,14 +63,6 @@ class TestForms:
         path = csv_file(tmp_path, "\ufeffnote, gain_db, rx_y, rx_x, tx_x, tx_y\nhall, -80, 2, 1, 3, 4\n")
         found = measurements_of(path)
         assert (found.tx.tolist(), found.rx.tolist(), found.gain_db.tolist()) == ([[3, 4, 1.5]], [[1, 2, 1.5]], [-80])
-
-    @pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
-    def test_csv(self, tmp_path: Path, end: str) -> None:
-        path = tmp_path / "measured.csv"
-        path.write_bytes(f"{HEADER}\n{rows(FLAT)}\n\n".replace("\n", end).encode())
-        found = measurements_of(str(path) if end == "\n" else path)
-        for name, values in FIELDS.items():
-            np.testing.assert_array_equal(getattr(found, name), values)
 
     def test_one_transmitter_and_copies(self) -> None:
         gain_db = GAIN_DB.copy()
@@ -115,14 +101,14 @@ class TestMeasurements:
         [
             ({"gain_db": GAIN_DB[:, None]}, "gain_db has shape (3, 1): give one gain for each link, (N,)."),
             ({"gain_db": [-70.0, np.nan, np.nan]}, "gain_db[1] = nan (and 1 more) is not allowed: give finite numbers"),
-            ({"gain_db": [-70.0, -np.inf, -80.0]}, "gain_db[1] = -inf is not allowed: give finite numbers, or leave"),
             ({"gain_db": [70.0, 80.0, 90.0]}, "gain_db[0] = 70 (and 2 more) is not allowed: path gains are negative;"),
             ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
             ({"gain_db": "loud"}, "gain_db = 'loud' is not numeric: give"),
             ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
-            ({"rx": RX[:, :2]}, "rx has shape (3, 2) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
+            ({"tx": None, **FLAT, "tx_y": TX[:2, 1]}, "tx_x, tx_y and tx_z have shapes (3,), (2,), (3,): give one"),
+            ({"gain_db": None}, "gain_db is missing from measurements of type dict: give a mapping"),
+            ({"rx": None}, "rx is missing from the measurements: give a mapping"),
             ({"rx": [[1.0, 2.0, 3.0], [1.0, np.nan, 3.0], [0, 0, 1]]}, "rx[1, 1] = nan is not allowed: give finite"),
-            ({"tx": [[1.0, 2.0, 3.0], [1.0, 3.0], [0, 0, 1]]}, "is not numeric: give finite numbers"),
             ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "is not numeric: give finite numbers"),
         ],
     )
@@ -131,52 +117,22 @@ class TestMeasurements:
             measurements_of({**FIELDS, **changes})
 
 
-@pytest.mark.parametrize(
-    ("source", "message"),
-    [
-        *(
-            (
-                kind({key: [*values] for key, values in FIELDS.items() if key != name}),
-                f"{name} is missing from .*: give a",
-            )
-            for kind in (dict, Frame)
-            for name in ("rx", "gain_db")
-        ),
-        (None, "gain_db is missing from measurements of type NoneType: give a mapping"),
-        ([1.0, 2.0], "gain_db is missing from measurements of type list: give a mapping"),
-        ({**FLAT, "tx_y": TX[:2, 1]}, r"tx_x, tx_y and tx_z have shapes \(3,\), \(2,\), \(3,\): give one"),
-    ],
-)
-def test_missing_fields(source: object, message: str) -> None:
-    with pytest.raises(MeasurementError, match=message):
-        measurements_of(source)
-
-
 DOTS = "is not a number: write decimal points."
 OWN = {"rx_x": "east", "rx_y": "north", "gain_db": "level"}
 REFUSED_CSV = [
     (None, None, "measured.csv' cannot be read (No such file or directory): check the path"),
     (b"PK\x03\x04\xff\xfe", None, "measured.csv' cannot be read ("),
-    *((text, None, "with the columns tx_x, tx_y, tx_z, rx_x") for text in ("", "tx_x,tx_y\n1,2\n")),
+    ("tx_x,tx_y\n1,2\n", None, "with the columns tx_x, tx_y, tx_z, rx_x"),
     (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", None, "' has 2 columns of gain_db (gain_db, gain_db): keep one"),
     (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", None, "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be cut"),
     (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", None, ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
     ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", None, "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
     (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', None, f"line 2: tx_x = '1,5' {DOTS}"),
-    (f"{HEADER}\n{'1' * 200_000},2\n", None, ", line 2 cannot be read (field larger than field limit"),
-    *(
-        (
-            f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n{row}\n",
-            None,
-            f"line 4: gain_db = {cell} is not a number: correct the line",
-        )
-        for row, cell in (("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''"))
-    ),
+    (f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n1,2,1.5,3,4,1.5\n", None, "line 4: gain_db = '' is not a number: correct the"),
     ("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n", None, "2 columns of rx_x (rx_x, x): keep one"),
     ("x,y,rssi\n1,2,-52\n", ["rssi"], "columns = ['rssi'] is no mapping: name the headers of a file, as columns"),
     ("x,y,rssi\n", None, "has a header and no rows"),
     ("x,y,rssi,gain_db\n1,2,-52,-60\n", None, "has 2 columns of gain_db (a gain and a power)"),
-    ("east,north,level\n1,2,-52\n", None, "(its other headers are east, north, level): name the headers"),
     ("x,y,level\n1,2,-52\n", None, "as columns={'gain_db': 'HEADER'} of load_measurements or --column gain_db=H"),
     ("east,north,level\n3.0,2.0,-52\n", OWN | {"rx_z": "up"}, "has no column 'up'"),
     ("east,north,level\n3.0,2.0,-52\n", {"rssi": "level"}, "give a header for some of tx_x"),
@@ -198,11 +154,9 @@ def test_csv_that_would_be_misread(tmp_path: Path, content: str | bytes | None, 
     [
         np.ma.masked_array([-70.0, -20.0], mask=[False, True]),
         np.array([-70.0 + 1j, -60.0]),
-        np.array([-70, -60], dtype="timedelta64[s]"),
-        ["-70", "-60"],
         np.array(["-70", "-60"], dtype=object),
     ],
-    ids=["masked", "complex", "seconds", "texts", "objects"],
+    ids=["masked", "complex", "objects"],
 )
 def test_only_real_numbers_are_gains(gains_db: Any) -> None:
     with pytest.raises(MeasurementError, match=r"gain_db (has masked values|has dtype|= .* is not numeric)"):
@@ -222,9 +176,7 @@ class TestSurveys:
         ("header", "columns", "gain_db"),
         [
             ("rssi", None, -72.0),
-            ("power_dbm", None, -72.0),
             ("level", {"gain_db": "level"}, -72.0),
-            ("level", {"power_dbm": "level"}, -72.0),
             ("gain_db", None, -52.0),
             ("Gain", {"gain_db": "Gain"}, -52.0),
         ],

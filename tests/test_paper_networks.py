@@ -11,7 +11,6 @@ from predictor_links import (
     OUTAGE,
     QUICK,
     QUIET,
-    arrays,
     assert_valid,
     make_links,
     p_kept,
@@ -61,23 +60,6 @@ def test_gain_networks_are_the_papers(quick):
         assert [layer.activation.__name__ for layer in dense[:2]] == ["relu", "relu"]
     served = [(row.link_state, partial) for row in GAIN_NETWORKS for partial in row.partial_states]
     assert sorted(served) == [(state, partial) for state in (LOS, NLOS) for partial in LinkState]
-
-
-@pytest.mark.parametrize("state", LinkState)
-def test_classifiers_are_logistic(quick, state):
-    classifier = quick.model.get_layer(f"state_given_{state.name.lower()}")
-    assert list(classifier.input) == ["distance_m", "unobserved_distance_m"]
-    assert [weights.shape for weights in classifier.get_weights()] == [(2, 3), (3,)]
-    indoor = quick.model.get_layer(f"indoor_given_{state.name.lower()}")
-    assert list(indoor.input) == ["unobserved_distance_m"]
-    assert [weights.shape for weights in indoor.get_weights()] == [(1, 1), (1,)]
-
-
-def test_links_do_not_depend_on_each_other(quick):
-    phi, _, _ = make_links(300, seed=3)
-    together, alone = quick.predict(phi), quick.predict(phi.take(slice(7, 8)))
-    for name, values in arrays(alone).items():
-        np.testing.assert_allclose(values, arrays(together)[name][7:8], rtol=1e-5, err_msg=name)
 
 
 @pytest.mark.parametrize("partial_state", LinkState)

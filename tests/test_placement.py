@@ -98,12 +98,6 @@ class TestSearch:
         answer = sp.Predictor.load("paper").predict(sp.link_features(found.partial, links))
         np.testing.assert_allclose(found.values[far], link_values(answer, found.settings), atol=1e-6)
 
-    def test_progress_rises_to_one(self) -> None:
-        calls: list[float] = []
-        sp.place_transmitter(home(TWO_ROOMS), progress=lambda fraction, message: calls.append(fraction))
-        assert calls == sorted(calls)
-        assert (calls[0], calls[-1]) == (0.0, 1.0)
-
 
 class TestRepeats:
     def test_same_seed_same_bytes(self, tmp_path: Path) -> None:
@@ -120,7 +114,6 @@ class TestErrors:
         ("options", "message"),
         [
             ({"objective": "all"}, "objective = 'all' is not allowed: choose one of coverage, percentile"),
-            ({"threshold_db": -150.0}, r"threshold_db = -150\.0 is not allowed: give a number in \(-150, 0\]"),
             ({"tx_height_m": 3.0}, r"tx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
         ],
     )
@@ -128,11 +121,9 @@ class TestErrors:
         with pytest.raises(SettingsError, match=message):
             sp.place_transmitter(home(HALF_SEEN), **options)
 
-    @pytest.mark.parametrize("cells", [4, 8])
-    def test_rooms_without_space_for_a_neighbour(self, cells: int) -> None:
-        state = np.pad(np.zeros((cells, cells), np.uint8), 1, constant_values=1)
-        settings = sp.TraceSettings(max_depth=0, diffraction=False)
-        found = sp.place_transmitter(sp.PartialMap(state, 0.1), trace_settings=settings)
+    def test_room_without_space_for_a_neighbour(self) -> None:
+        state = np.pad(np.zeros((8, 8), np.uint8), 1, constant_values=1)
+        found = sp.place_transmitter(sp.PartialMap(state, 0.1), trace_settings=DIRECT)
         assert (found.score, len(found.trajectory_m)) == (1.0, 1)
 
 
@@ -171,9 +162,7 @@ def two_rooms() -> PlacementArea:
 class TestRoom:
     def test_free_and_away_from_walls(self) -> None:
         area = two_rooms()
-        positions_m = np.array(
-            [[1.0, 1.0, 1.5], [0.55, 1.0, 1.5], [0.65, 1.0, 1.5], [0.25, 1.0, 1.5], [2.75, 1.0, 1.5]]
-        )
+        positions_m = np.array([[x_m, 1.0, 1.5] for x_m in (1.0, 0.55, 0.65, 0.25, 2.75)])
         assert area.stands(positions_m).tolist() == [True, False, True, False, False]
 
     def test_unknown_cells_are_no_place_but_keep_no_distance(self) -> None:
@@ -181,7 +170,7 @@ class TestRoom:
         assert area.stands(np.array([[1.45, 0.7, 1.5], [1.55, 0.7, 1.5], [9.0, 0.7, 1.5]])).tolist() == [1, 0, 0]
 
     def test_distance_to_walls_is_kept_at_any_resolution(self) -> None:
-        for cell_m in (0.02, 0.05, 0.07, 0.3, 1.0):
+        for cell_m in (0.05, 0.07, 0.3, 1.0):
             count = round(4.0 / cell_m)
             state = np.zeros((count, count), dtype=np.uint8)
             state[:, 0] = CellState.WALL
@@ -191,15 +180,10 @@ class TestRoom:
             nearest_m = x_m[stands].min() - cell_m
             assert CLEARANCE_M - 1e-6 <= nearest_m <= CLEARANCE_M + 0.05
 
-    def test_area(self) -> None:
-        assert two_rooms().size_m2 == pytest.approx(1.8 * 1.8 + 1.3 * 1.8 + 0.7 * 0.3, abs=1e-6)
-
     def test_nowhere(self) -> None:
         message = "a transmitter can stand nowhere: the map has 0 free cells, and none of their area is 0.1 m away"
         with pytest.raises(PositionError, match=message):
             placement_area(map_of("##\n?#", 0.5), 1.5, 1.5, None)
-        with pytest.raises(PositionError, match="the map has 1 free cells, and none of their area"):
-            placement_area(map_of("###\n#.#\n###", 0.1), 1.5, 1.5, None)
 
 
 class TestPositions:
@@ -211,10 +195,6 @@ class TestPositions:
         assert len(positions_m) == pytest.approx(area.size_m2 / 0.25**2, rel=0.25)
         np.testing.assert_array_equal(area.positions(3), positions_m)
         assert not np.isin(area.positions(4)[:, 0], positions_m[:, 0]).any()
-
-    def test_no_more_than_wanted_on_a_large_map(self) -> None:
-        area = placement_area(PartialMap(np.zeros((200, 300), dtype=np.uint8), 0.2), 1.5, 1.5, None)
-        assert 400 < len(area.positions(0)) < 600
 
     def test_area_that_the_grid_misses(self) -> None:
         state = np.full((40, 40), CellState.UNKNOWN, dtype=np.uint8)
@@ -245,17 +225,6 @@ class TestReceivers:
         for area in (hardly, complete):
             assert (area.partial.state_at(area.rx_m) == CellState.FREE).all()
             assert (area.weight == 1.0).all()
-
-    def test_the_nearer_to_free_cells_the_more(self) -> None:
-        """P(indoor) is predicted for lengths that grow with the distance from the free cells."""
-        area = placement_area(map_of("....??????", 0.5, (0.0, 0.0)), 1.5, 1.5, shipped("paper"))
-        order = np.argsort(area.rx_m[:, 0])
-        assert (np.diff(area.weight[order][3:]) < 0.0).all()
-
-    def test_fewer_on_a_huge_map(self) -> None:
-        area = placement_area(PartialMap(np.zeros((100, 100), dtype=np.uint8), 1.0), 1.5, 1.5, None)
-        assert 3500 < len(area.rx_m) < 4500
-        assert area.spacing_m == pytest.approx(100 / np.sqrt(4000))
 
     def test_no_receiver(self) -> None:
         state = np.full((20, 20), CellState.UNKNOWN, dtype=np.uint8)
@@ -295,11 +264,3 @@ class TestVisibility:
         assert clear == 1.0
         assert unseen == pytest.approx(np.exp(-0.5 / 4.0))
         assert 0.0 < walled < unseen
-
-    def test_beyond_range(self) -> None:
-        area = two_rooms()
-        seen = area.visibility(np.array([[1.0, 1.0, 1.5]]), range_m=1.0)[0]
-        far = np.linalg.norm(area.rx_m - [1.0, 1.0, 1.5], axis=1) > 1.0
-        left = area.rx_m[:, 0] < 2.4
-        assert (seen[~far] == 1.0).all()
-        assert (seen[far & left] == 0.0).all()

@@ -18,7 +18,6 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
 
@@ -101,7 +100,6 @@ def test_anywhere_is_indoors_or_in_outage(quick):
     ("p_indoor", "message"),
     [
         ([0.5, 1.1], "p_indoor[1] = 1.1 is not allowed: it lies between 0 and 1."),
-        ([-0.1, 1.0], "p_indoor[0] = -0.1 is not allowed: it lies between 0 and 1."),
         ([0.5], "p_indoor has shape (1,): give one number for each of the 2 links."),
     ],
 )
@@ -146,23 +144,16 @@ def test_shipped_predictor(name):
 
 
 class TestNetworksOfMapsAndPaths:
-    def test_its_networks_answer_where_maps_are_partial(self, seeing):
-        phi = make_seen_links(100, seed=3)[0]
-        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
-        for name, values in arrays(seeing.predict(phi)).items():
-            np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
-
-    @pytest.mark.parametrize("complete", [range(4), [], [1, 3]], ids=str)
-    def test_the_trace_is_the_prediction_where_maps_are_complete(self, seeing, complete):
+    def test_the_trace_is_the_prediction_where_maps_are_complete(self, seeing):
         phi = make_seen_links(200, seed=3)[0]
-        sure = np.isin(corridor_of(phi), [*complete])
+        sure = np.isin(corridor_of(phi), [1, 3])
         mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, complete=sure))
         answer, traced, unsure = seeing.predict(mixed), LinkPrediction.of_trace(phi), seeing.predict(phi)
         assert_valid(answer)
         for name, values in arrays(answer).items():
             np.testing.assert_array_equal(values[sure], getattr(traced, name)[sure], err_msg=name)
             np.testing.assert_allclose(values[~sure], getattr(unsure, name)[~sure], rtol=1e-5, err_msg=name)
-        assert answer.gain_std_db[~sure].min(initial=1.0) > 0.1
+        assert answer.gain_std_db[~sure].min() > 0.1
 
     def test_without_a_context_the_papers_networks_answer(self, seeing):
         """They are fitted to the same links, whatever other networks there are."""
@@ -175,13 +166,6 @@ class TestNetworksOfMapsAndPaths:
             np.testing.assert_array_equal(values, getattr(paper.predict(phi), name), err_msg=name)
         assert abs(seeing.predict(phi).p_los - seeing.predict(blind).p_los).max() > 0.05
 
-    def test_links_do_not_depend_on_each_other(self, seeing):
-        phi = make_seen_links(300, seed=3)[0]
-        together = seeing.predict(phi)
-        for index in ([7], [200, 3, 41], np.arange(150)):
-            for name, values in arrays(seeing.predict(phi.take(np.array(index)))).items():
-                np.testing.assert_allclose(values, getattr(together, name)[index], rtol=1e-5, err_msg=name)
-
     def test_fit_indoor_keeps_its_networks(self, seeing):
         phi = make_seen_links(400, seed=4)[0]
         settings = dataclasses.replace(seeing.settings, minimum_links=50)
@@ -193,10 +177,6 @@ class TestNetworksOfMapsAndPaths:
         assert model.predict_indoor(phi).min() < 0.5 < 0.999 < seeing.predict_indoor(phi).min()
         assert model.fingerprint != seeing.fingerprint
 
-    def test_networks_by_settings(self, quick):
-        own = {name: set(parts(context_predictor(name).model)) - set(parts(quick.model)) for name in ("paths", "map")}
-        assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, *MAP_NETWORKS}}
-
     def test_links_that_cannot_train_it(self, seeing):
         _, state, gain_db = make_seen_links(5)
         message = (
@@ -205,8 +185,6 @@ class TestNetworksOfMapsAndPaths:
         )
         with pytest.raises(PredictorError, match=re.escape(message)):
             Predictor.fit(make_links(5)[0], state, gain_db, settings=seeing.settings)
-        with pytest.raises(PredictorError, match="features has no links: give at least one"):
-            Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
         wifi = dataclasses.replace(make_links(5)[0], frequency_hz=5e9)
         message = "features are at 5 GHz, settings at 28 GHz: give PredictorSettings(frequency_hz=5e+09)."
         with pytest.raises(PredictorError, match=re.escape(message)):
@@ -227,15 +205,13 @@ def test_bad_training_data(quick):
     phi, state, gain_db = make_links(5)
     for arguments, message in (
         ((make_links(0)[0], [], []), "features has no links: give at least one."),
-        ((phi, state[:4], gain_db), "link_state has shape (4,): give one number for each of the 5 links."),
         ((phi, state + 3, gain_db), "use LinkState: OUTAGE 0, LOS 1, NLOS 2."),
         ((phi, state, gain_db * np.nan), "gain_db[0] = nan is not allowed: give finite numbers."),
         (("phi", state, gain_db), "features is of type str: give the LinkFeatures of link_features."),
     ):
         with pytest.raises(PredictorError, match=re.escape(message)):
             Predictor.fit(*arguments)
-    for call in (quick.predict, quick.predict_indoor, lambda phi: quick.fit_indoor(phi, [])):
-        with pytest.raises(PredictorError, match="features is of type NoneType"):
-            call(None)
+    with pytest.raises(PredictorError, match="features is of type NoneType"):
+        quick.predict(None)
     with pytest.raises(PredictorError, match=re.escape("inside has shape (4,)")):
         quick.fit_indoor(phi, np.ones(4))

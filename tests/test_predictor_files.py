@@ -45,12 +45,10 @@ def saved(quick, tmp_path):
 def test_card(quick, saved):
     card = json.loads(saved.with_suffix(".json").read_text())
     assert card["format"] == FORMAT
-    assert card["features"] == list(GAIN_INPUTS) == ["distance_m", "unobserved_distance_m", "gain_db"]
+    assert card["features"] == ["distance_m", "unobserved_distance_m", "gain_db"]
     assert card["sha256"] == digest(saved.read_bytes()) == quick.fingerprint
-    assert card["homes"] == ["a", "b"]
-    assert card["settings"]["steps"] == QUICK.steps
-    assert sum(card["links"].values()) == 900
-    assert card["links"]["LOS given OUTAGE"] == 0
+    assert (card["homes"], card["settings"]["steps"]) == (["a", "b"], QUICK.steps)
+    assert (sum(card["links"].values()), card["links"]["LOS given OUTAGE"]) == (900, 0)
     phi = make_links(900)[0]
     seen = phi.distance_m[phi.link_state == OUTAGE]
     assert card["scaling"]["state_given_outage"]["distance_m"] == pytest.approx([seen.min(), seen.max()])
@@ -125,21 +123,17 @@ SPOILT = {
     r"mine\.keras' cannot be read \(No such file.*check the path": [lambda path: path.unlink()],
     r"mine\.json' cannot be read": [lambda path: path.with_suffix(".json").unlink()],
     r"mine\.keras' has SHA-256 .* the file is truncated, was changed": [
-        lambda path: path.write_bytes(path.read_bytes()[:-500]),
-        lambda path: path.write_bytes(b""),
         lambda path: path.write_bytes(path.read_bytes()[:900] + b"\x00" + path.read_bytes()[901:]),
     ],
     r"mine\.keras' is no Keras archive": [
-        lambda path, archive=archive: _forge(path, archive)
-        for archive in (b"", b"no archive at all", b"PK\x03\x04" + bytes(50))
+        lambda path: _forge(path, b"PK\x03\x04" + bytes(50)),
     ],
     r"mine\.keras' cannot be loaded by Keras": [_without_weights],
     "unpacks to more than 64,000,000 bytes": [lambda path: _forge(path, _packed({"config.json": bytes(70_000_000)}))],
     "has more than 64,000,000 bytes": [lambda path: os.truncate(path, 64_000_001)],
     r"has inputs \['distance_m'\] and outputs": [_other_model],
     r"mine\.json' is not JSON": [
-        lambda path, text=text: path.with_suffix(".json").write_bytes(text)
-        for text in (b"", b"{", b"[" * 100_000, b"\xff")
+        lambda path, text=text: path.with_suffix(".json").write_bytes(text) for text in (b"[" * 100_000, b"\xff")
     ],
 }
 """Words of the message, and what is done to the file of a predictor."""
@@ -158,10 +152,7 @@ def test_spoilt_files(saved, message, spoil):
         ('"ReLU"', '"Lambda"', "holds Lambda,"),
         ('"module": "keras.layers"', '"module": "os"', r"holds .*os\.Dense"),
         ('"module": "keras.layers"', '"module": "kerasx"', r"holds .*kerasx\.Dense"),
-        *(
-            (f'"class_name": "{name}"', '"class_name": "TFSMLayer"', "holds TFSMLayer,")
-            for name in ("Conv2D", "MaxPooling2D", "UpSampling2D", "Concatenate")
-        ),
+        ('"class_name": "Conv2D"', '"class_name": "TFSMLayer"', "holds TFSMLayer,"),
     ],
 )
 def test_foreign_code_is_refused(saved, old, new, found):
@@ -181,24 +172,19 @@ INPUTS = len(LINK_INPUTS)
 
 
 @pytest.mark.parametrize(
-    ("base", "change"),
+    ("base", "name", "shape"),
     [
-        ("map", {LINK_NETWORK: (INPUTS, LINK_OUTPUTS)}),
-        ("map", {LINK_NETWORK: None}),
-        ("map", {MAP_NETWORKS[1]: None}),
-        ("map", {"third_network": (INPUTS, LINK_OUTPUTS)}),
-        ("paper", {LINK_NETWORK: (INPUTS + 1, LINK_OUTPUTS)}),
-        ("paper", {LINK_NETWORK: (INPUTS, LINK_OUTPUTS + 1)}),
+        ("map", MAP_NETWORKS[1], None),
+        ("map", "third_network", (INPUTS, LINK_OUTPUTS)),
+        ("paper", LINK_NETWORK, (INPUTS, LINK_OUTPUTS + 1)),
     ],
-    ids=["no inputs from the map", "map alone", "reader of a map alone", "one too many", "inputs", "outputs"],
 )
-def test_foreign_networks_are_refused(saved, base, change):
+def test_foreign_networks_are_refused(saved, base, name, shape):
     networks = parts((quick_predictor() if base == "paper" else context_predictor("map")).model)
-    for name, shape in change.items():
-        if shape is None:
-            del networks[name]
-        else:
-            networks[name] = _dense(*shape, name)
+    if shape is None:
+        del networks[name]
+    else:
+        networks[name] = _dense(*shape, name)
     _forge(saved, pack(assemble(networks)))
     with pytest.raises(PredictorError, match=r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"):
         Predictor.load(saved)
@@ -208,18 +194,11 @@ def test_foreign_networks_are_refused(saved, base, change):
     ("change", "message"),
     [
         ({"format": "other"}, "format = 'other', but this version reads"),
-        ({"features": ["unobserved_distance_m", "distance_m", "gain_db"]}, "features = ['unobserved_distance_m'"),
         ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
-        ({"outputs": {}}, "outputs = {}"),
-        ({"sha256": "0" * 64}, f"but its card has '{'0' * 64}'"),
         ({"sha256": None}, "names no sha256"),
         ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
-        ({"settings": {"tricks": 1}}, "is damaged (TypeError"),
         ({"settings": None}, "is damaged (TypeError"),
-        ({"homes": 7}, "is damaged (TypeError"),
         ({"links": {"LOS given LOS": "many"}}, "is damaged (ValueError"),
-        ({"links": []}, "is damaged (AttributeError"),
-        ({"metrics": 1}, "is damaged (TypeError"),
     ],
     ids=str,
 )
@@ -230,14 +209,11 @@ def test_bad_card(saved, change, message):
         Predictor.load(saved)
 
 
-@pytest.mark.parametrize(("networks", "named"), [("paper", "map"), ("map", "paper"), ("map", "paths")])
-def test_card_that_names_other_networks(saved, networks, named):
-    predictor = quick_predictor() if networks == "paper" else context_predictor(networks)
-    predictor.save(saved)
+def test_card_that_names_other_networks(saved):
     path = saved.with_suffix(".json")
     card = json.loads(path.read_text())
-    path.write_text(json.dumps({**card, "settings": {**card["settings"], "networks": named}}))
-    message = f"settings.networks = '{named}', but the weights beside it are of '{networks}' networks: copy both"
+    path.write_text(json.dumps({**card, "settings": {**card["settings"], "networks": "map"}}))
+    message = "settings.networks = 'map', but the weights beside it are of 'paper' networks: copy both"
     with pytest.raises(PredictorError, match=re.escape(message)):
         Predictor.load(saved)
 
@@ -257,15 +233,13 @@ def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path
         predictor_files.read_files(tmp_path / "map.keras")
 
 
-@pytest.mark.parametrize("name", ["mine.h5", "paper.pkl", "default"])
-def test_other_suffix(quick, tmp_path, name):
-    with pytest.raises(PredictorError, match=f"{name}' is no predictor: give 'map' or 'paper', or the path"):
-        Predictor.load(tmp_path / name)
-    with pytest.raises(PredictorError, match=f"{name}' is no predictor: give the path of a .keras file"):
-        quick.save(tmp_path / name)
+def test_other_suffix(quick, tmp_path):
+    with pytest.raises(PredictorError, match=r"mine\.h5' is no predictor: give 'map' or 'paper', or the path"):
+        Predictor.load(tmp_path / "mine.h5")
+    with pytest.raises(PredictorError, match=r"mine\.h5' is no predictor: give the path of a \.keras file"):
+        quick.save(tmp_path / "mine.h5")
     with pytest.raises(PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', the path of"):
         Predictor.load(3)
-    assert not any(tmp_path.iterdir())
 
 
 def test_unwritable_folder_leaves_nothing(quick, tmp_path):
