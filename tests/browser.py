@@ -20,8 +20,6 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 class Tab:
-    """One page."""
-
     def __init__(self, socket: Any, downloads: Path, width: int, height: int) -> None:
         self._socket, self._numbers = socket, itertools.count(1)
         self.console: list[Any] = []
@@ -53,7 +51,6 @@ class Tab:
         return found["result"].get("value")
 
     def wait(self, code: str, seconds: float = 60.0) -> Any:
-        """Return the first true value of an expression."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             found = self.run(f"(() => {{ try {{ return {code} }} catch {{ return null }} }})()")

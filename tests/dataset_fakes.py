@@ -23,7 +23,6 @@ KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
 """Seeds of homes that end their process, never end, raise, end their process at the first try, and find a full disk."""
 
 HOME_S = 0.15
-"""Time that a fake home takes [s]."""
 
 
 def processes_make_fakes(folder: Path) -> str:
@@ -42,7 +41,6 @@ if "home_links import serve" in " ".join(sys.orig_argv):
 
 
 def install() -> None:
-    """Replace the making and the tracing of homes in this process."""
     from sionna_partial.datasets import home_links
 
     home_links.make_home = make_home  # type: ignore[assignment]
@@ -70,7 +68,6 @@ def make_home(seed: int, kind: str | None = None) -> SimpleNamespace:
 
 
 def fake_links(home: object, name: str, settings: DatasetSettings | None = None) -> LinkTable:
-    """Make up links that depend on the name and the seed."""
     settings = settings or DatasetSettings()
     seed = int.from_bytes(hashlib.sha256(f"{settings.seed} {name}".encode()).digest()[:6])
     table = make_table(1, settings.links_per_home, settings.stages, seed)

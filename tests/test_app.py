@@ -51,8 +51,6 @@ PARTIAL = sp.map_from_array(ROOM, 0.1)
 
 
 class Window:
-    """A session whose thread is the test's."""
-
     def __init__(self) -> None:
         self.came = threading.Event()
         self.waiting: list[Callable[[], None]] = []
@@ -74,12 +72,10 @@ class Window:
         return self.session.answer
 
     def put(self, *places_m: tuple[float, float]) -> str:
-        """Put new transmitters, and settle."""
         self.session.put([("", x_m, y_m) for x_m, y_m in places_m])
         return self.settle()
 
     def settle(self) -> str:
-        """Do what waits until no job is left, and return the last message."""
         end = time.monotonic() + 600.0
         while self.session.status.fraction is not None and time.monotonic() < end:
             while self.waiting:
@@ -594,7 +590,6 @@ def status_of(url: str | urllib.request.Request, data: bytes | None = None) -> i
 
 
 def window_key(url: str) -> str:
-    """Open a window, and return the key of its files."""
     with urllib.request.urlopen(url, timeout=60) as answer:
         return re.findall(r"/files/([\w-]+)", answer.read().decode())[0]
 
@@ -667,7 +662,6 @@ def pixel(tab: Tab, x_m: float, y_m: float) -> tuple[float, float]:
 
 
 def press(tab: Tab, label: str) -> None:
-    """Press a button as soon as it is there."""
     button = f"walk(document.body).find(n => n.tagName == 'BUTTON' && n.textContent.trim() == {label!r})"
     there = f"(async () => {{ {_WALK}; while (!{button}?.offsetWidth) await new Promise(done => setTimeout(done, 10))"
     tab.run(f"{there}; {button}.click() }})()")
@@ -682,7 +676,6 @@ def type_into(tab: Tab, label: str, text: str) -> None:
 
 
 def box(tab: Tab, selector: str) -> list[float]:
-    """Return left, top, right and bottom of an element in the window."""
     edges = "['left', 'top', 'right', 'bottom'].map(edge => box[edge])"
     found = tab.run(
         f"(() => {{ const box = document.querySelector({selector!r}).getBoundingClientRect(); return {edges} }})()"

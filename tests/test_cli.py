@@ -386,7 +386,6 @@ OPTIONS = [
 
 @pytest.mark.parametrize(("name", "option"), OPTIONS, ids=[f"{name} {option.name}" for name, option in OPTIONS])
 def test_options_that_are_no_lists_are_given_once(name: str, option: Any) -> None:
-    """The parser would take the last one."""
     words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
     rest = ["--no-such-option"] * option.multiple  # which ends the command
     result = run(name, option.opts[0], *words, (option.secondary_opts or option.opts)[0], *words, *rest)

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -51,7 +50,6 @@ def notes(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set built without a break."""
     folder = tmp_path_factory.mktemp("unbroken")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
@@ -75,7 +73,6 @@ def wait_until(true: Callable[[], bool], limit_s: float = 600.0) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process is there, and not just waiting to be forgotten by its parent."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
@@ -83,7 +80,6 @@ def is_running(process: int) -> bool:
 
 
 def processes(notes: Path) -> list[int]:
-    """Numbers of the processes that have made homes."""
     return [int(path.name.removeprefix("process-")) for path in notes.glob("process-*")]
 
 
@@ -157,32 +153,12 @@ class TestKilled:
         assert files(folder) == files(unbroken)
         assert not list(temporary.iterdir())
 
-    def test_ctrl_c_ends_at_once_and_leaves_no_process_or_file(
-        self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        temporary = tmp_path / "temporary"
-        temporary.mkdir()
-        monkeypatch.setenv("TMPDIR", str(temporary))
-        command = Path(sys.executable).parent / "sionna-partial"
-        with started(command, "dataset", tmp_path / "set", "--homes", 2000, "--links", 5, "--workers", 2) as run:
-            wait_until(lambda: shards(tmp_path / "set") >= 1)
-            assert list(temporary.glob("sionna_partial_*"))
-            run.send_signal(signal.SIGINT)
-            _, errors = run.communicate(timeout=600.0)
-        assert run.returncode not in (0, None)
-        assert "Traceback" not in errors
-        assert not any(map(is_running, processes(notes)))
-        assert not list(temporary.iterdir())
-        assert {each.name for each in (tmp_path / "set").iterdir()} <= {".lock", "dataset.json", "shards"}
-        assert {each.suffix for each in (tmp_path / "set" / "shards").iterdir()} == {".parquet"}
-
 
 POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
 
 
 @pytest.fixture(scope="module")
 def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
-    """A data set of homes of which some cannot be made."""
     folder = tmp_path_factory.mktemp("poisoned") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))

@@ -33,8 +33,6 @@ def message(cells: Any = ROOM, *, yaw: float = 0.0, at: tuple[float, float] = (0
 
 
 class Heard(list[Any]):
-    """A live coverage, and what it published."""
-
     def __init__(self, tx: Any = TX, **settings: Any) -> None:
         self.live = sp.LiveCoverage(tx, self.append, sp.LiveSettings(**{"spacing_m": 0.2, **settings}))
 

@@ -137,7 +137,6 @@ REFUSED_CSV = [
     ("east,north,level\n3.0,2.0,-52\n", OWN | {"rx_z": "up"}, "has no column 'up'"),
     ("east,north,level\n3.0,2.0,-52\n", {"rssi": "level"}, "give a header for some of tx_x"),
 ]
-"""Content of a file, names of its columns, and words of the message."""
 
 
 @pytest.mark.parametrize(("content", "columns", "message"), REFUSED_CSV, ids=lambda value: repr(value)[:40])

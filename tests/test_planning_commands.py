@@ -19,7 +19,6 @@ HIDDEN = sp.Material(5.0, 2.0, 0.01)
 
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A map of a room with a wall, and measurements of 24 links in it."""
     folder = tmp_path_factory.mktemp("room")
     state = np.zeros((40, 50), dtype=np.uint8)
     state[[0, -1], :] = state[:, [0, -1]] = sp.CellState.WALL

@@ -1,8 +1,10 @@
 import dataclasses
+import math
 import re
 
 import numpy as np
 import pytest
+from placement_cases import home
 from predictor_links import (
     LOS,
     OUTAGE,
@@ -17,6 +19,7 @@ from predictor_links import (
     quick_predictor,
 )
 
+import sionna_partial as sp
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
@@ -31,7 +34,6 @@ def quick():
 
 @pytest.fixture(params=["paths", "map"])
 def seeing(request):
-    """A predictor that sees where links run."""
     return context_predictor(request.param)
 
 
@@ -62,12 +64,9 @@ def test_total_expectation_and_variance():
     probabilities = np.array([[0.2], [0.5], [0.3]])
     means_db, stds_db = np.array([[-150.0], [-60.0], [-90.0]]), np.array([[0.0], [2.0], [7.0]])
     answer = LinkPrediction.of_parts(probabilities, means_db, stds_db)
-    rng = np.random.default_rng(0)
-    state = rng.choice(3, size=400_000, p=probabilities[:, 0])
-    samples_db = means_db[state, 0] + stds_db[state, 0] * rng.normal(size=len(state))
     assert answer.gain_mean_db == pytest.approx([-87.0])
-    assert answer.gain_mean_db == pytest.approx([samples_db.mean()], abs=0.3)
-    assert answer.gain_std_db == pytest.approx([samples_db.std()], abs=0.3)
+    second_moment = 0.2 * 150.0**2 + 0.5 * (60.0**2 + 2.0**2) + 0.3 * (90.0**2 + 7.0**2)
+    assert answer.gain_std_db == pytest.approx([math.sqrt(second_moment - 87.0**2)])
     assert answer.link_state.tolist() == [LOS]
 
 
@@ -215,3 +214,42 @@ def test_bad_training_data(quick):
         quick.predict(None)
     with pytest.raises(PredictorError, match=re.escape("inside has shape (4,)")):
         quick.fit_indoor(phi, np.ones(4))
+
+
+HALF_SEEN = "#####???\n#..#????\n#......?\n#..#????\n#####???"
+TX = (0.75, 1.25, 1.5)
+
+
+class Constant:
+    """A model of the user that predicts the same for all links."""
+
+    def __init__(self, **columns: float) -> None:
+        self.columns = {"p_los": 0.25, "p_nlos": 0.5, "p_outage": 0.25, "gain_mean_db": -90.0, "gain_std_db": 5.0}
+        self.columns |= columns
+
+    def predict(self, phi: sp.LinkFeatures) -> dict[str, np.ndarray]:
+        assert phi.context is not None
+        return {name: np.full(len(phi), value) for name, value in self.columns.items() if not np.isinf(value)}
+
+
+def test_a_model_of_the_user_predicts_what_is_not_certain() -> None:
+    model = sp.LinkModel(home(HALF_SEEN), Constant())
+    found = model.predict(TX, [[3.2, 0.4, 1.5]])
+    assert found.p_los.tolist() == [0.25]
+    assert found.gain_mean_db[0] == pytest.approx(0.75 * -90.0 + 0.25 * -150.0)
+    coverage = sp.predict_map(home(HALF_SEEN), TX, predictor=Constant(), spacing_m=0.5)
+    assert "Constant" in coverage.attrs["predictor"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"p_los": 0.9}, "p_los.*the three probabilities sum to 1"),
+        ({"gain_std_db": -1.0}, "std.*give 0 or more"),
+        ({"gain_mean_db": np.nan}, "gain_los_mean_db.*give finite numbers"),
+        ({"gain_mean_db": np.inf}, "returned no 'gain_los_mean_db'"),
+    ],
+)
+def test_what_is_no_distribution_is_refused(columns: dict[str, float], message: str) -> None:
+    with pytest.raises(PredictorError, match=message):
+        sp.LinkModel(home(HALF_SEEN), Constant(**columns)).predict(TX, [[3.2, 0.4, 1.5]])

@@ -82,7 +82,6 @@ def test_cards_from_before_there_were_others_are_of_the_papers(saved):
 
 
 def _repack(archive, change):
-    """Return the archive with `change` applied to its configuration."""
     packed = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(packed, "w") as target:
         for name in source.namelist():
@@ -99,7 +98,6 @@ def _forge(path, archive):
 
 
 def _packed(contents):
-    """Return an archive with these members."""
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
         for name, content in contents.items():
@@ -136,7 +134,6 @@ SPOILT = {
         lambda path, text=text: path.with_suffix(".json").write_bytes(text) for text in (b"[" * 100_000, b"\xff")
     ],
 }
-"""Words of the message, and what is done to the file of a predictor."""
 
 
 @pytest.mark.parametrize(("message", "spoil"), [(message, each) for message, all_ in SPOILT.items() for each in all_])

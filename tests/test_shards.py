@@ -86,7 +86,6 @@ class TestShard:
 
 
 def rewrite(path: Path, maps: dict[str, object] | None, distance_m: float | None = None) -> None:
-    """Write a shard again with other maps, or without, or with other distances."""
     table = pq.read_table(path)
     notes = {**table.schema.metadata}
     before = json.loads(notes.pop(b"sionna_partial.maps"))
