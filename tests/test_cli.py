@@ -150,6 +150,14 @@ ARGUMENTS = [
         {"start": Material(4.0, 0.1, 0.2), "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2))}
         | {"trace_settings": TraceSettings(60e9, 2, diffraction=False)},
     ),
+    (
+        "export-scene --strict --up y --height-band 2.5 2.9 --wall-height 2.7 --unit 0.01 --storey EG --resolution 0.1 "
+        "--obstacle-height 1.2 --wall-layer A --material-of A=brick",
+        "load_map",
+        {"strict": True, "up": "y", "height_band_m": (2.5, 2.9), "wall_height_m": 2.7, "unit_m": 0.01, "storey": "EG"}
+        | {"resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
+        | {"layer_materials": {"A": Material.named("brick")}},
+    ),
     ("dataset --map a.npz --map b", "build_dataset", {"homes": [Path("a.npz"), Path("b")]}),
 ]
 """Command and options, functions that it calls, and arguments of the last."""
@@ -157,12 +165,7 @@ ARGUMENTS = [
 
 @pytest.mark.parametrize(("words", "functions", "expected"), ARGUMENTS, ids=lambda value: str(value)[:24])
 def test_options_arrive(
-    words: str,
-    functions: str,
-    expected: dict[str, Any],
-    map_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    words: str, functions: str, expected: Any, map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "rx.csv").write_text("x,y,z\n2,1,1.5\n")
     name, *options = words.replace("MAP", str(map_path)).replace("RX", str(tmp_path / "rx.csv")).split()
@@ -208,44 +211,27 @@ AT = ("--tx", "1", "1")
 
 
 class TestPredict:
-    def test_defaults(self, tmp_path: Path) -> None:
+    def test_files_and_answer(self, tmp_path: Path) -> None:
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
-        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", tmp_path / "out")
+        out, options = tmp_path / "out", "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz"
+        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", out, *options.split())
         assert result.exit_code == 0, result.output
         names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
-        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
-        assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "coverage.pgm"}
-        assert sp.load_coverage(tmp_path / "out" / "coverage.nc").attrs["predictor"] == "map"
-
-    def test_answer(self, tmp_path: Path) -> None:
-        save_map(map_of(PICTURE), tmp_path / "map.yaml")
-        options = "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz --format png --format nc"
-        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", tmp_path / "out", *options.split())
-        assert result.exit_code == 0, result.output
-        coverage = sp.load_coverage(tmp_path / "out" / "coverage.nc")
-        assert coverage.attrs["frequency_hz"] == 5.2e9
+        *lines, answer = result.stdout.splitlines()
+        assert lines == [f"wrote {out / name}" for name in names]
+        assert {path.name for path in out.iterdir()} == {*names, "coverage.pgm"}
+        coverage = sp.load_coverage(out / "coverage.nc")
+        assert (coverage.attrs["predictor"], coverage.attrs["frequency_hz"]) == ("map", 5.2e9)
         observed, every = coverage.radio.area(-67.0, eirp_dbm=15.0).fraction.values
         text = f"{100 * observed:.0f} % of the observed floor, {100 * every:.0f} % of all, above -67 dBm"
-        picture = tmp_path / "out" / "coverage.png"
-        assert result.stdout.splitlines()[-1] == f"{text} with probability 0.9, at 15 dBm; open {picture}"
+        assert answer == f"{text} with probability 0.9, at 15 dBm; open {out / 'coverage.png'}"
 
-    def test_options_in_groups(self) -> None:
-        text = run("predict", "--help").stdout
-        titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
-        assert titles == ["Transmitter:", "Radio:", "Walls:", "Map:", "Output:", "Options:"]
-        assert text.index("Transmitter:") < text.index("--power") < text.index("Radio:") < text.index("--frequency")
-        assert "--tx X Y [Z]" in text
-
-    @pytest.mark.parametrize(
-        ("text", "frequency_hz"), [("5.2GHz", 5.2e9), ("2400 MHz", 2.4e9), ("60e9hz", 60e9), ("900000kHz", 9e8)]
-    )
-    def test_frequencies(self, text: str, frequency_hz: float) -> None:
-        assert parse_frequency(text) == pytest.approx(frequency_hz)
-
-    @pytest.mark.parametrize("text", ["GHz", "5,2GHz"])
-    def test_what_is_no_frequency(self, text: str) -> None:
-        with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
-            parse_frequency(text)
+    def test_frequencies(self) -> None:
+        for text, frequency_hz in {"5.2GHz": 5.2e9, "2400 MHz": 2.4e9, "60e9hz": 60e9, "900000kHz": 9e8}.items():
+            assert parse_frequency(text) == pytest.approx(frequency_hz)
+        for text in ("GHz", "5,2GHz"):
+            with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
+                parse_frequency(text)
 
     @pytest.mark.parametrize(
         ("words", "tx"),
@@ -256,16 +242,20 @@ class TestPredict:
             (["--tx=-1,2"], (-1.0, 2.0, 1.5)),
         ],
     )
-    @pytest.mark.parametrize("first", [True, False])
-    def test_position(
-        self, room: PartialMap, tmp_path: Path, words: list[str], tx: tuple[float, ...], first: bool
-    ) -> None:
+    def test_position(self, room: PartialMap, tmp_path: Path, words: list[str], tx: tuple[float, ...]) -> None:
         save_map(replace(room, origin_m=(50.0, 50.0)), tmp_path / "map.yaml")
-        before, after = ([], [tmp_path / "map.yaml"]) if first else ([tmp_path / "map.yaml"], [])
-        result = run("predict", *before, *words, *after, "--out", tmp_path)
-        assert result.exit_code == 2
-        assert result.stderr.startswith(f"error: tx = {tx} is outside the map")
-        assert len(result.stderr.splitlines()) == 1
+        for ordered in ([*words, tmp_path / "map.yaml"], [tmp_path / "map.yaml", *words]):
+            result = run("predict", *ordered, "--out", tmp_path)
+            assert result.exit_code == 2
+            assert result.stderr.startswith(f"error: tx = {tx} is outside the map")
+            assert len(result.stderr.splitlines()) == 1
+
+    def test_options_in_groups(self) -> None:
+        text = run("predict", "--help").stdout
+        titles = [line for line in text.splitlines() if line.endswith(":") and not line.startswith(" ")]
+        assert titles == ["Transmitter:", "Radio:", "Walls:", "Map:", "Output:", "Options:"]
+        assert text.index("Transmitter:") < text.index("--power") < text.index("Radio:") < text.index("--frequency")
+        assert "--tx X Y [Z]" in text
 
     @pytest.mark.parametrize(
         ("words", "message"),
@@ -297,9 +287,8 @@ class TestPredict:
         assert len(full.stderr.splitlines()) == len(blocked.stderr.splitlines()) == 1
         assert not out.exists()
         files_that_fit(99)
-        result = run(
-            "predict", map_path, *words, "--out", out, *(["--format", "nc", "--format", ".CSV", "--format", "nc"])
-        )
+        formats = ("--format", "nc", "--format", ".CSV", "--format", "nc")
+        result = run("predict", map_path, *words, "--out", out, *formats)
         assert result.exit_code == 0
         assert sorted(path.name for path in out.iterdir()) == ["coverage.csv", "coverage.nc"]
         assert result.stdout == f"wrote {out / 'coverage.nc'}\nwrote {out / 'coverage.csv'}\n"
@@ -321,22 +310,11 @@ class TestMap:
         result = run("export-scene", map_path, "--out", tmp_path / "scene", *["--strict"] * strict)
         assert result.exit_code == 0, result.output
         assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
-        words = ["Pass --strict to read the file to the letter."] * (not strict) + [
-            "origin yaw 0.5 rad: the map is turned"
-        ]
+        words = ["Pass --strict to read the file to the letter."] * (not strict)
+        words += ["origin yaw 0.5 rad: the map is turned"]
         for line, word in zip(result.stderr.splitlines(), words, strict=True):
             assert line.startswith("warning: ")
             assert word in line
-
-    def test_options_arrive(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        words = "--strict --up y --height-band 2.5 2.9 --wall-height 2.7 --unit 0.01 --storey EG --resolution 0.1"
-        words += " --obstacle-height 1.2 --wall-layer A --material-of A=brick"
-        command = ["export-scene", "scan.xyz", "--out", tmp_path / "scene"]
-        found = arguments_of(monkeypatch, "load_map", *command, *words.split())
-        expected = {"strict": True, "up": "y", "height_band_m": (2.5, 2.9), "wall_height_m": 2.7, "unit_m": 0.01}
-        expected |= {"storey": "EG", "resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
-        expected["layer_materials"] = {"A": Material.named("brick")}
-        assert {name: found[name] for name in expected} == expected
 
 
 class TestExplore:

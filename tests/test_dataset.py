@@ -212,23 +212,19 @@ class TestRefused:
             build_dataset(unbroken, SEEDS, SETTINGS)
         assert files(unbroken) == before
 
-    @pytest.mark.parametrize(
-        ("error", "message", "options"),
-        [
+    def test_arguments(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
+        for error, message, options in (
             (MapError, "homes is empty", {"homes": []}),
             (SettingsError, "workers = 0 is not allowed", {"workers": 0}),
             (SettingsError, "home_time_limit_s = 0.0 is not allowed", {"home_time_limit_s": 0.0}),
             (SettingsError, "workers = 2 is for this machine", {"workers": 2, "scheduler": "tcp://127.0.0.1:1"}),
             (BackendError, r"scheduler = 'nothing\.json' is not there", {"scheduler": "nothing.json"}),
             (BackendError, "scheduler = 'tcp://127.0.0.1:9' does not answer", {"scheduler": "tcp://127.0.0.1:9"}),
-        ],
-    )
-    def test_arguments(
-        self, tmp_path: Path, error: type, message: str, options: Any, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
-        with pytest.raises(error, match=message):
-            build_dataset(tmp_path / "set", **{"homes": SEEDS, "settings": SETTINGS} | options)
+        ):
+            given: dict[str, Any] = {"homes": SEEDS, "settings": SETTINGS} | options
+            with pytest.raises(error, match=message):
+                build_dataset(tmp_path / "set", **given)
 
     def test_home_from_another_file(self, tmp_path: Path) -> None:
         for folder in ("a", "b"):

@@ -69,12 +69,8 @@ class TestOrder:
                 heard.live.on_map(message(rooms[answer.map_number]))
 
         heard.live._publish = publish  # type: ignore[assignment]
-        assert [heard.step() for _ in rooms] == [
-            [(1, False)],
-            [(2, False), (2, True)],
-            [(3, False)],
-            [(4, False), (4, True)],
-        ]
+        steps = [heard.step() for _ in rooms]
+        assert steps == [[(1, False)], [(2, False), (2, True)], [(3, False)], [(4, False), (4, True)]]
 
 
 class TestMaps:
@@ -279,26 +275,24 @@ class TestListener:
         assert heard.live._pose[2] == 7.0  # type: ignore[index]
         assert "is not finite" in caplog.text
 
-    @pytest.mark.parametrize(
-        ("topic", "when"), [("/tf", 0), ("/tf_static", 0), ("/tf", 1), ("/tf", 2), ("/tf_static", 2)]
-    )
-    def test_any_number_of_other_frames(self, topic: str, when: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    def test_any_number_of_other_frames(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Others come before the frames of the robot, between them, or after them; few of them are kept."""
         monkeypatch.setattr(topics, "MOST_FRAMES", 10)
-        heard = Heard()
-        listener = Listener(heard.live, Topics(robot_frame="/base_link"))
-        listener.take("/map", message())
         others = [Fields(transforms=[self.transform("map", f"other{number}", 1.0)]) for number in range(25)]
-        messages = [
-            ("/tf_static", Fields(transforms=[self.transform("map", "odom", 2.0)])),
-            ("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.0)])),
-        ]
-        messages[when:when] = [(topic, other) for other in others]
-        for at, each in enumerate([*messages, messages[-1]]):
-            listener.take(*each, float(at))
-        listener.take("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.5)]), 99.0)
-        assert heard.live._pose == pytest.approx((3.5, 0.0, 99.0))
-        assert len(listener._frames) <= 13
+        for topic, when in (("/tf", 0), ("/tf_static", 0), ("/tf", 1), ("/tf", 2), ("/tf_static", 2)):
+            live = Heard().live
+            listener = Listener(live, Topics(robot_frame="/base_link"))
+            listener.take("/map", message())
+            messages = [
+                ("/tf_static", Fields(transforms=[self.transform("map", "odom", 2.0)])),
+                ("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.0)])),
+            ]
+            messages[when:when] = [(topic, other) for other in others]
+            for at, each in enumerate([*messages, messages[-1]]):
+                listener.take(*each, float(at))
+            listener.take("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.5)]), 99.0)
+            assert live._pose == pytest.approx((3.5, 0.0, 99.0))
+            assert len(listener._frames) <= 13
 
     def test_powers_and_views(self) -> None:
         heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
@@ -309,10 +303,8 @@ class TestListener:
         listener.take("/rssi", Fields(data=-60.0), 1.0)
         listener.take("/wifi", Fields(key="desk", value="-50.5"), 1.0)
         listener.take("/wifi", Fields(key="desk", value="loud"), 1.0)
-        assert {name: next(iter(each.values()))[2] for name, each in heard.live._powers.items()} == {
-            "desk": -50.5,
-            "door": -60.0,
-        }
+        powers = {name: next(iter(each.values()))[2] for name, each in heard.live._powers.items()}
+        assert powers == {"desk": -50.5, "door": -60.0}
         listener.take("/radio/request_views", Fields())
         heard.live.on_pose(6.5, 3.9, 1.0)  # in the wall by an error of the robot's
         heard.step()

@@ -1,6 +1,5 @@
 """The networks that read maps and paths: inputs, outputs, and that an empty map contributes nothing."""
 
-import dataclasses
 import functools
 import math
 
@@ -14,7 +13,6 @@ from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
-from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.map_networks import (
     LINK_INPUTS,
     LINK_NETWORK,
@@ -72,13 +70,11 @@ def nothing():
 
 
 class TestLinkInputs:
-    @pytest.mark.parametrize("cell", [FREE, UNKNOWN])
-    def test_which_states_the_map_leaves_possible(self, cell):
-        partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
-        phi = features(partial, (1.3, 0.2, 1.5), tx_m=(0.1, 0.2, 1.5), unobserved_m=0.5 * (cell == UNKNOWN))
-        found = inputs(phi)
-        columns = [found[f"{state.name.lower()}_possible"][0] for state in LinkState]
-        assert columns == ([1, 1, 1] if cell == UNKNOWN else [0, 1, 0])
+    def test_which_states_the_map_leaves_possible(self):
+        for cell, unobserved_m, expected in ((FREE, 0.0, [0, 1, 0]), (UNKNOWN, 0.5, [1, 1, 1])):
+            partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
+            found = inputs(features(partial, (1.3, 0.2, 1.5), tx_m=(0.1, 0.2, 1.5), unobserved_m=unobserved_m))
+            assert [found[f"{state.name.lower()}_possible"][0] for state in LinkState] == expected
 
     def test_length_in_walls(self):
         thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
@@ -245,28 +241,17 @@ class TestEvaluateContextNetworks:
 
 ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
 HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
-DISTANCE_M, GAIN_DB, STD_DB = 5.0, -90.0, 3.0
-
-
-@dataclasses.dataclass(frozen=True)
-class Links:
-    """Links that differ in nothing but the rooms that their receivers are in.
-
-    Half of the rooms of each map are seen. The transmitter, and receivers in rooms of both kinds, stand in cells that
-    are not.
-    """
-
-    phi: LinkFeatures
-    in_seen_room: np.ndarray
-
-    def truth(self):
-        linked, noise = self.in_seen_room, np.random.default_rng(0).normal(GAIN_DB, STD_DB, len(self.in_seen_room))
-        return np.where(linked, NLOS, OUTAGE).astype(np.uint8), np.where(linked, noise, -150.0)
+GAIN_DB = -90.0
 
 
 @functools.cache
 def make_room_links(maps, links, seed):
-    rng = np.random.default_rng(seed)
+    """Return features, true states and gains of links that differ only in the rooms of their receivers.
+
+    Half of the rooms of each map are seen: links there are NLOS, the others in outage. Transmitter and receivers stand
+    in cells that are not seen.
+    """
+    rng, count = np.random.default_rng(seed), maps * links
     partial, in_seen_room, rx_m = [], [], []
     for _ in range(maps):
         seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
@@ -277,24 +262,24 @@ def make_room_links(maps, links, seed):
         in_seen_room.append(seen.ravel()[position])
         cells = np.column_stack(np.divmod(position, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
         rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
-    count = maps * links
     where, tx_m = (tuple(partial), np.repeat(np.arange(maps), links)), (0.01, 0.01, 1.5)
-    known = {"unobserved_m": 3.0, "distance_m": DISTANCE_M, "state": NLOS, "gain_db": -90.0, "indirect_db": -90.0}
+    known = {"unobserved_m": 3.0, "distance_m": 5.0, "state": NLOS, "gain_db": -90.0, "indirect_db": -90.0}
     phi = features(where, np.concatenate(rx_m), tx_m=tx_m, **known)
     order = rng.permutation(count)
-    return Links(phi.take(order), np.concatenate(in_seen_room)[order])
+    linked = np.concatenate(in_seen_room)[order]
+    gain_db = np.where(linked, rng.normal(GAIN_DB, 3.0, count), -150.0)
+    return phi.take(order), np.where(linked, NLOS, OUTAGE).astype(np.uint8), gain_db
 
 
 TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 
 
 def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
-    seen, others = make_room_links(*TRAINING), make_room_links(*OTHERS)
+    others, state, _ = make_room_links(*OTHERS)
     for name, value in {"LEARNING_RATE": 0.01, "WINDOWS_AT_ONCE": 8, "_WIDTHS": ((8, 16), (8, 16))}.items():
         monkeypatch.setattr(module, name, value)
-    networks = fit_context_networks(seen.phi, *seen.truth(), PredictorSettings("map", passes=14))
-    state, _ = others.truth()
-    probabilities, means_db, _ = evaluate_context_networks(networks, others.phi, FREQUENCY_HZ)
+    networks = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=14))
+    probabilities, means_db, _ = evaluate_context_networks(networks, others, FREQUENCY_HZ)
     assert (probabilities.argmax(axis=0) == state).mean() > 0.9
     assert -np.log(probabilities[state, np.arange(len(state))]).mean() < 0.5 * math.log(2.0)
     assert means_db[NLOS][state == NLOS].mean() == pytest.approx(GAIN_DB, abs=4.0)
@@ -314,45 +299,28 @@ def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
     np.testing.assert_allclose(module._crps(errors_db, stds_db), expected, atol=2e-3)
 
 
-@pytest.fixture(scope="module")
-def links():
-    return make_room_links(*OTHERS)
-
-
-@pytest.fixture(scope="module")
-def examples(links):
-    """Gains are the numbers of the links."""
-    numbers = np.arange(len(links.phi), dtype=np.float64)
-    return module._Examples(links.phi, links.truth()[0], numbers, PredictorSettings("map"))
-
-
-class TestExamples:
-    def test_links_go_with_their_window_however_it_is_turned(self, links, examples):
-        """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
-        phi, half, cell_m = links.phi, WINDOW_CELLS / 2, 0.3
-        inputs, state = scaled_inputs(phi, FREQUENCY_HZ), links.truth()[0]
-        turns = set()
-        for batch in examples.batches(4, np.random.default_rng(4)):
-            for number, drawn in enumerate(batch["gain_db"].astype(int)):
-                (window,) = set(phi.context.window_index[drawn])
-                offsets_m, moved_m = receiver_offsets_m(phi)[drawn], batch["offsets_m"][number]
-                before, after = ((each / cell_m + half).astype(int).T[::-1] for each in (offsets_m, moved_m))
-                image = batch["windows"][number, 0]
-                np.testing.assert_array_equal(image[*after], phi.context.windows[window, 0][*before])
-                swapped = not np.allclose(abs(moved_m), abs(offsets_m), atol=1e-4)
-                turns.add((swapped, *np.sign(moved_m[0] * (offsets_m[0, ::-1] if swapped else offsets_m[0]))))
-                np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
-                np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
-                free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
-                np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
-        assert len(turns) == 8
-
-    def test_each_pass_has_every_window_once(self, links, examples):
-        drawn = [
-            links.phi.context.window_index[int(numbers[0])]
-            for batch in examples.batches(3, np.random.default_rng(6))
-            for numbers in batch["gain_db"]
-        ]
-        count = len(examples)
-        passes = [sorted(drawn[start : start + count]) for start in range(0, len(drawn) - count, count)]
-        assert passes == [list(range(count))] * 7
+def test_examples_are_passes_of_all_windows_turned_with_their_links():
+    """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
+    phi, state, _ = make_room_links(*OTHERS)
+    numbers = np.arange(len(phi), dtype=np.float64)  # as gains
+    examples = module._Examples(phi, state, numbers, PredictorSettings("map"))
+    inputs, half, cell_m = scaled_inputs(phi, FREQUENCY_HZ), WINDOW_CELLS / 2, 0.3
+    turns, windows = set(), []
+    for batch in examples.batches(4, np.random.default_rng(4)):
+        for number, drawn in enumerate(batch["gain_db"].astype(int)):
+            (window,) = set(phi.context.window_index[drawn])
+            windows.append(window)
+            offsets_m, moved_m = receiver_offsets_m(phi)[drawn], batch["offsets_m"][number]
+            before, after = ((each / cell_m + half).astype(int).T[::-1] for each in (offsets_m, moved_m))
+            image = batch["windows"][number, 0]
+            np.testing.assert_array_equal(image[*after], phi.context.windows[window, 0][*before])
+            swapped = not np.allclose(abs(moved_m), abs(offsets_m), atol=1e-4)
+            turns.add((swapped, *np.sign(moved_m[0] * (offsets_m[0, ::-1] if swapped else offsets_m[0]))))
+            np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
+            np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
+            free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
+            np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
+    assert len(turns) == 8
+    count = len(examples)
+    passes = [sorted(windows[start : start + count]) for start in range(0, len(windows) - count, count)]
+    assert passes == [list(range(count))] * len(passes) != []

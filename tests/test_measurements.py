@@ -92,7 +92,7 @@ def test_repetitions_are_averaged() -> None:
         ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
         ({"gain_db": "loud"}, "gain_db = 'loud' is not numeric: give"),
         ({"gain_db": np.ma.masked_less(GAIN_DB, -100.0)}, "gain_db has masked values"),
-        ({"gain_db": GAIN_DB + 1j}, "gain_db has dtype"),
+        ({"gain_db": GAIN_DB + 1j}, "is not numeric"),
         ({"gain_db": GAIN_DB.astype(str).astype(object)}, "is not numeric"),
         ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
         ({"tx": None, **FLAT, "tx_y": TX[:2, 1]}, "tx_x, tx_y and tx_z have shapes (3,), (2,), (3,): give one"),

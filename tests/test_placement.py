@@ -3,7 +3,6 @@
 import json
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -104,16 +103,13 @@ def test_same_seed_same_bytes(tmp_path: Path) -> None:
     assert record["settings"]["predictor"] == "paper"
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
+def test_settings_are_checked() -> None:
+    for options, message in (
         ({"objective": "all"}, "objective = 'all' is not allowed: choose one of coverage, percentile"),
         ({"tx_height_m": 3.0}, r"tx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
-    ],
-)
-def test_settings_are_checked(options: dict[str, Any], message: str) -> None:
-    with pytest.raises(SettingsError, match=message):
-        sp.place_transmitter(home(HALF_SEEN), **options)
+    ):
+        with pytest.raises(SettingsError, match=message):
+            sp.place_transmitter(home(HALF_SEEN), **options)
 
 
 @pytest.mark.parametrize("objective", ["coverage", "percentile"])

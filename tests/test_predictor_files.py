@@ -71,15 +71,6 @@ def test_a_training_by_seed_gives_the_same_bytes_whatever_was_trained_before_it(
     assert result.stdout.strip() == context_predictor("map").fingerprint
 
 
-def test_cards_from_before_there_were_others_are_of_the_papers(saved):
-    path = saved.with_suffix(".json")
-    card = json.loads(path.read_text())
-    for name in ("networks", "passes"):
-        del card["settings"][name]
-    path.write_text(json.dumps(card))
-    assert Predictor.load(saved).settings.networks == "paper"
-
-
 def _repack(archive, change):
     contents = unzipped(archive, 10**8)
     return zipped(contents | {"config.json": change(contents["config.json"].decode()).encode()})
@@ -132,60 +123,39 @@ def test_foreign_code_is_refused(saved, old, new, found):
         Predictor.load(saved)
 
 
-def _dense(inputs, outputs, name):
+def test_foreign_networks_are_refused(saved):
     keras = import_keras()
-    values = keras.Input((inputs,), name="link")
-    return keras.Model(values, keras.layers.Dense(outputs, name="outputs")(values), name=name)
+    values = keras.Input((len(LINK_INPUTS),), name="link")
+    foreign = keras.Model(values, keras.layers.Dense(LINK_OUTPUTS + 1, name="outputs")(values), name=LINK_NETWORK)
+    paper, alone = parts(quick_predictor().model), parts(context_predictor("map").model)
+    del alone[MAP_NETWORKS[1]]
+    for networks in (alone, paper | {LINK_NETWORK: foreign}, paper | {"third_network": foreign}):
+        _forge(saved, pack(assemble(networks)))
+        message = r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"
+        with pytest.raises(PredictorError, match=message):
+            Predictor.load(saved)
 
 
-INPUTS = len(LINK_INPUTS)
-
-
-@pytest.mark.parametrize(
-    ("base", "name", "shape"),
-    [
-        ("map", MAP_NETWORKS[1], None),
-        ("map", "third_network", (INPUTS, LINK_OUTPUTS)),
-        ("paper", LINK_NETWORK, (INPUTS, LINK_OUTPUTS + 1)),
-    ],
-)
-def test_foreign_networks_are_refused(saved, base, name, shape):
-    networks = parts((quick_predictor() if base == "paper" else context_predictor("map")).model)
-    if shape is None:
-        del networks[name]
-    else:
-        networks[name] = _dense(*shape, name)
-    _forge(saved, pack(assemble(networks)))
-    with pytest.raises(PredictorError, match=r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"):
-        Predictor.load(saved)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
+def test_bad_card(saved):
+    path = saved.with_suffix(".json")
+    card = json.loads(path.read_text())
+    others = "settings.networks = 'map', but the weights beside it are of 'paper' networks: copy both"
+    for change, message in (
         ({"format": "other"}, "format = 'other', but this version reads"),
         ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
         ({"sha256": None}, "names no sha256"),
         ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
         ({"settings": None}, "is damaged (TypeError"),
+        ({"settings": {**card["settings"], "networks": "map"}}, others),
         ({"links": {"LOS given LOS": "many"}}, "is damaged (ValueError"),
-    ],
-    ids=str,
-)
-def test_bad_card(saved, change, message):
-    path = saved.with_suffix(".json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        Predictor.load(saved)
-
-
-def test_card_that_names_other_networks(saved):
-    path = saved.with_suffix(".json")
-    card = json.loads(path.read_text())
-    path.write_text(json.dumps({**card, "settings": {**card["settings"], "networks": "map"}}))
-    message = "settings.networks = 'map', but the weights beside it are of 'paper' networks: copy both"
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        Predictor.load(saved)
+    ):
+        path.write_text(json.dumps({**card, **change}))
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            Predictor.load(saved)
+    for name in ("networks", "passes"):  # cards from before there were others
+        del card["settings"][name]
+    path.write_text(json.dumps(card))
+    assert Predictor.load(saved).settings.networks == "paper"
 
 
 def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path):
