@@ -129,29 +129,28 @@ class TestBuild:
         assert rebuilt == files(unbroken)
 
 
-class TestKilled:
-    def test_killed_runs_are_continued_to_the_same_bytes(
-        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        folder, temporary = tmp_path / "set", tmp_path / "temporary"
-        temporary.mkdir()
-        monkeypatch.setenv("TMPDIR", str(temporary))
-        monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-        with started(sys.executable, "-c", BUILD, folder) as run:
-            wait_until(lambda: shards(folder) >= 2)
-            run.kill()
-        wait_until(lambda: not any(map(is_running, processes(notes))))
-        assert 2 <= shards(folder) < len(SEEDS)
-        for parent in (folder, folder / "shards"):
-            (parent / ".tmp-0123456789abcdef").mkdir()
-            (parent / ".tmp-0123456789abcdef" / "half a file").touch()
-            (parent / ".new-sionna_partial_0123456789abcdef").mkdir()
-        there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
-        report = build_dataset(folder, SEEDS, SETTINGS, workers=1)
-        assert len(report.skipped) == len(there)
-        assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
-        assert files(folder) == files(unbroken)
-        assert not list(temporary.iterdir())
+def test_killed_runs_are_continued_to_the_same_bytes(
+    unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, temporary = tmp_path / "set", tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    with started(sys.executable, "-c", BUILD, folder) as run:
+        wait_until(lambda: shards(folder) >= 2)
+        run.kill()
+    wait_until(lambda: not any(map(is_running, processes(notes))))
+    assert 2 <= shards(folder) < len(SEEDS)
+    for parent in (folder, folder / "shards"):
+        (parent / ".tmp-0123456789abcdef").mkdir()
+        (parent / ".tmp-0123456789abcdef" / "half a file").touch()
+        (parent / ".new-sionna_partial_0123456789abcdef").mkdir()
+    there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
+    report = build_dataset(folder, SEEDS, SETTINGS, workers=1)
+    assert len(report.skipped) == len(there)
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
+    assert files(folder) == files(unbroken)
+    assert not list(temporary.iterdir())
 
 
 POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
@@ -272,29 +271,28 @@ def test_worker_that_cannot_make_homes(tmp_path: Path, monkeypatch: pytest.Monke
         assert re.search(message, result.error)
 
 
-class TestScheduler:
-    def test_slurm_example_whose_worker_is_killed(
-        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """Without SLURM the script starts a scheduler and a worker; another worker goes on where that one was."""
-        script, bin_folder = (
-            Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch",
-            Path(sys.executable).parent,
-        )
-        subprocess.run(["bash", "-n", script], check=True)
-        monkeypatch.setenv("PATH", f"{bin_folder}{os.pathsep}{os.environ['PATH']}")
-        monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
-        monkeypatch.delenv("SLURM_JOB_ID", raising=False)
-        options = ("--homes", 8, "--first-seed", 0, "--links", 5, "--transmitters", 1, "--stage", 0, "--stage", 50)
-        with started("bash", script, tmp_path / "set", *options) as run:
-            wait_until(lambda: shards(tmp_path / "set") >= 2)
-            (worker,) = (each for each in psutil.Process(run.pid).children() if "worker" in each.cmdline())
-            for each in [*worker.children(recursive=True), worker]:
-                each.kill()
-            (file,) = tmp_path.glob("scheduler.*.json")
-            lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--local-directory", notes)
-            with started(bin_folder / "dask", "worker", "--scheduler-file", file, *lone):
-                _, errors = run.communicate(timeout=600.0)
-        assert run.returncode == 0, errors
-        assert files(tmp_path / "set") == files(unbroken)
-        assert [path.name for path in tmp_path.iterdir()] == ["set"]
+def test_slurm_example_whose_worker_is_killed(
+    unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without SLURM the script starts a scheduler and a worker; another worker goes on where that one was."""
+    script, bin_folder = (
+        Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch",
+        Path(sys.executable).parent,
+    )
+    subprocess.run(["bash", "-n", script], check=True)
+    monkeypatch.setenv("PATH", f"{bin_folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    options = ("--homes", 8, "--first-seed", 0, "--links", 5, "--transmitters", 1, "--stage", 0, "--stage", 50)
+    with started("bash", script, tmp_path / "set", *options) as run:
+        wait_until(lambda: shards(tmp_path / "set") >= 2)
+        (worker,) = (each for each in psutil.Process(run.pid).children() if "worker" in each.cmdline())
+        for each in [*worker.children(recursive=True), worker]:
+            each.kill()
+        (file,) = tmp_path.glob("scheduler.*.json")
+        lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--local-directory", notes)
+        with started(bin_folder / "dask", "worker", "--scheduler-file", file, *lone):
+            _, errors = run.communicate(timeout=600.0)
+    assert run.returncode == 0, errors
+    assert files(tmp_path / "set") == files(unbroken)
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]

@@ -44,8 +44,7 @@ class TestDataset:
 
     def test_failed_homes_are_named(self, tmp_path: Path) -> None:
         save_map(PartialMap([[CellState.FREE, CellState.UNKNOWN]], 1.0), tmp_path / "one.npz")
-        result = run("dataset", tmp_path / "out", "--map", tmp_path / "one.npz")
-        assert result.exit_code == 1
+        result = run("dataset", tmp_path / "out", "--map", tmp_path / "one.npz", exit_code=1)
         line = rf"homes in {re.escape(str(tmp_path / 'out'))}: 0 built in [\d.]+ min, 0 already there\n"
         assert re.fullmatch(line, result.stdout)
         assert "one failed: home 'one' is not complete, a free cell touches an unknown one" in result.stderr
@@ -53,31 +52,28 @@ class TestDataset:
         assert "the same command tries them again" in result.stderr
 
 
-class TestTrain:
-    @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
-    def test_what_it_writes_and_says(self, tmp_path: Path) -> None:
-        table, out = make_table(homes=3, links=20), tmp_path / "run"
-        dataset = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
-        words = "--test-fraction 0.5 --networks paper --passes 2 --seed 3"
-        result = run("train", dataset, "--out", out, *words.split())
-        assert result.exit_code == 0, result.output
-        names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
-        assert sorted(path.name for path in out.iterdir()) == names
-        *lines, hint = result.stdout.splitlines()
-        assert lines[-6:] == [f"wrote {out / name}" for name in names]
-        assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
-        settings = PredictorSettings("paper", 60e9, diffraction=False, passes=2, seed=3)
-        assert Predictor.load(out / "predictor.keras").settings == settings
-        split = json.loads((out / "split.json").read_text())
-        assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
-        assert "### Test homes (2), receivers indoors" in result.stdout
+@pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
+def test_what_it_writes_and_says(tmp_path: Path) -> None:
+    table, out = make_table(homes=3, links=20), tmp_path / "run"
+    dataset = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
+    words = "--test-fraction 0.5 --networks paper --passes 2 --seed 3"
+    result = run("train", dataset, "--out", out, *words.split())
+    names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
+    assert sorted(path.name for path in out.iterdir()) == names
+    *lines, hint = result.stdout.splitlines()
+    assert lines[-6:] == [f"wrote {out / name}" for name in names]
+    assert hint.endswith(f"sionna-partial evaluate {dataset} --predictor {out / 'predictor.keras'} --out REPORT")
+    settings = PredictorSettings("paper", 60e9, diffraction=False, passes=2, seed=3)
+    assert Predictor.load(out / "predictor.keras").settings == settings
+    split = json.loads((out / "split.json").read_text())
+    assert (split["test_fraction"], len(split["train"]), len(split["test"])) == (0.5, 1, 2)
+    assert "### Test homes (2), receivers indoors" in result.stdout
 
 
 class TestEvaluate:
     def test_what_it_writes_and_says(self, dataset: Path, predictor: Path, tmp_path: Path) -> None:
         out = tmp_path / "report"
         result = run("evaluate", dataset, "--out", out, "--predictor", predictor)
-        assert result.exit_code == 0, result.output
         names = ["report.md", "report.json", "stages.png", "calibration.png"]
         assert result.stdout.splitlines()[-4:] == [f"wrote {out / name}" for name in names]
         assert "| with indoor model    |" in result.stdout
@@ -87,7 +83,7 @@ class TestEvaluate:
     def test_trained_on_all_homes(self, dataset: Path, tmp_path: Path) -> None:
         trained = run("train", dataset, "--out", tmp_path / "run", "--test-fraction", 0, "--networks", "paper")
         assert "all homes were trained on: nothing was measured" in trained.stdout
-        result = run("evaluate", dataset, "--predictor", tmp_path / "run/predictor.keras", "--out", tmp_path / "report")
-        assert result.exit_code == 2
+        words = ("--predictor", tmp_path / "run/predictor.keras", "--out", tmp_path / "report")
+        result = run("evaluate", dataset, *words, exit_code=2)
         assert "was trained on all 3 homes of the data set: give a data set of other homes" in result.stderr
         assert not (tmp_path / "report").exists()

@@ -102,15 +102,14 @@ class TestLinkInputs:
                 np.testing.assert_allclose(column, expected[name], atol=1e-6, err_msg=name)
 
 
-class TestContextNetworks:
-    def test_single_precision_whatever_the_policy(self):
-        keras = import_keras()
-        keras.config.set_dtype_policy("float64")
-        try:
-            found = context_networks(0)
-        finally:
-            keras.config.set_dtype_policy("float32")
-        assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
+def test_single_precision_whatever_the_policy():
+    keras = import_keras()
+    keras.config.set_dtype_policy("float64")
+    try:
+        found = context_networks(0)
+    finally:
+        keras.config.set_dtype_policy("float32")
+    assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
 
 
 class TestReadMapsAndLinks:

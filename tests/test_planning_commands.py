@@ -45,7 +45,6 @@ def test_calibrate(measured: Path, tmp_path: Path) -> None:
         *(measured / "room.yaml", "--measurements", measured / "measured.csv", "--out", out),
         *("--material", "2.94,0.1226,0.01", "--max-depth", 2),
     )
-    assert result.exit_code == 0, result.output
     assert sorted(file.name for file in out.iterdir()) == ["calibrated.npz", "calibration.json", "calibration.png"]
     numbers = json.loads((out / "calibration.json").read_text())
     calibrated = sp.load_map(out)
@@ -70,8 +69,8 @@ def test_calibrate(measured: Path, tmp_path: Path) -> None:
 def test_unusable_measurements_are_one_line(measured: Path, tmp_path: Path) -> None:
     rows = ["1,1,1.5,3,3,1.5,-70", "1,1,1.5,3,2,1.5,-70"]
     (tmp_path / "bad.csv").write_text("\n".join([HEADER, *rows, ""]))
-    result = run("calibrate", measured / "room.yaml", "--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
-    assert result.exit_code == 2
+    words = ("--measurements", tmp_path / "bad.csv", "--out", tmp_path / "out")
+    result = run("calibrate", measured / "room.yaml", *words, exit_code=2)
     assert "has 2 usable links of 2, fewer than 10" in result.output
     assert not (tmp_path / "out").exists()
 
@@ -85,7 +84,6 @@ def map_path(tmp_path: Path) -> Path:
 def test_place(map_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "place"
     result = run("place", map_path, "--out", out)
-    assert result.exit_code == 0, result.output
     record = json.loads((out / "placement.json").read_text())
     x, y, z = record["position_m"]
     assert result.stdout.splitlines() == [
