@@ -357,17 +357,6 @@ class TestFiles:
         assert "measured_links" not in window.answer.coverage.attrs
         assert (len(session.measured_points()[0]), session.warnings) == (0, [])
 
-    def test_python_computes_the_same(self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.chdir(tmp_path)
-        sp.save_map(PARTIAL, "room.yaml")
-        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        window.session.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        window.session.set(frequency_hz=5.2e9, through_walls=False, material="brick")
-        window.settle()
-        names: dict[str, Any] = {}
-        exec(window.session.python(), names)
-        assert names["coverage"].identical(window.answer.coverage)
-
 
 def uploaded(tmp_path: Path) -> list[tuple[str, bytes]]:
     sp.save_map(PARTIAL, tmp_path / "room.yaml")
@@ -476,7 +465,10 @@ class TestDrawing:
         self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         session = window.session
-        session.put([("", 1.0, 1.0)])
+        session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        session.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+        session.set(frequency_hz=5.2e9, through_walls=False, material="brick")
+        assert "partial = sp.load_map('room.yaml')" in session.python()
         session.draw(Stroke("brush", ((2.05, 0.5),), 0.4, "metal"))
         session.draw(Stroke("area", ((1.9, 0.0), (1.9, 1.0), (2.2, 1.0), (2.2, 0.0)), material="brick"))
         session.draw(Stroke("wall", ((2.05, 1.9), (2.05, 3.0)), 9.0))
@@ -505,47 +497,37 @@ class TestDrawing:
                 session.draw(stroke)
 
 
-class TestProjects:
-    def saved(self, window: Window) -> bytes:
-        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        window.session.change("tx2", new_name="hall", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        window.session.use_preset("60 GHz (WiGig)")
-        window.session.measured = sp.Measurements((1.0, 1.0, 1.5), [(1.5, 2.5, 1.5)], [-60.0], sensitivity_db=-120.0)
-        return window.session.file("project")
-
-    def test_saved_and_opened(self, window: Window) -> None:
-        before, content = window.session, self.saved(window)
-        other = Window()
-        other.session.upload_map([("mine.zip", content)])
-        assert other.settle() == "Ready."
-        after = other.session
-        assert (after.partial, after.title) == (before.partial, before.title)
-        assert (after.transmitters, after.settings) == (before.transmitters, before.settings)
-        assert after.measured is not None
-        assert (after.measured.rx.tolist(), after.measured.sensitivity_db) == ([[1.5, 2.5, 1.5]], -120.0)
-        assert after.file("project") == content
-        other.session.close()
-
-    def test_what_is_refused_changes_nothing(self, window: Window) -> None:
-        contents = unzipped(self.saved(window), 10**7)
-        window.settle()
-        before = window.session.transmitters
-        for old, new, message in (
-            (b'"version": 1', b'"version": 2', "version = 2"),
-            (b'"hall"', b'"<b>"', "name = '<b>'"),
-            (b"60480000000.0", b"1e99", "frequency_hz"),
-            (b'"tr38901"', b'"/etc/passwd"', "pattern"),
-            (b'"x_m": 3.0', b'"x_m": NaN', "x_m"),
-            (b'"x_m": 3.0', b'"y": 3.0', "damaged"),
-            (b'"title"', b"[" * 100_000, "damaged"),
-        ):
-            text = contents["project.json"]
-            assert old in text
-            changed = contents | {"project.json": text.replace(old, new, 1)}
-            window.session.upload_map([("mine.zip", zipped(changed))])
-            assert message in window.settle()
-            assert window.session.status.is_error
-            assert window.session.transmitters is before
+def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> None:
+    before, other = window.session, Window()
+    before.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    before.change("tx2", new_name="hall", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+    before.use_preset("60 GHz (WiGig)")
+    before.measured = sp.Measurements((1.0, 1.0, 1.5), [(1.5, 2.5, 1.5)], [-60.0], sensitivity_db=-120.0)
+    content, after = before.file("project"), other.session
+    after.upload_map([("mine.zip", content)])
+    assert other.settle() == "Ready."
+    assert (after.partial, after.title) == (before.partial, before.title)
+    assert (after.transmitters, after.settings) == (before.transmitters, before.settings)
+    assert after.measured is not None
+    assert (after.measured.rx.tolist(), after.measured.sensitivity_db) == ([[1.5, 2.5, 1.5]], -120.0)
+    assert after.file("project") == content
+    contents, transmitters = unzipped(content, 10**7), after.transmitters
+    for old, new, message in (
+        (b'"version": 1', b'"version": 2', "version = 2"),
+        (b'"hall"', b'"<b>"', "name = '<b>'"),
+        (b"60480000000.0", b"1e99", "frequency_hz"),
+        (b'"tr38901"', b'"/etc/passwd"', "pattern"),
+        (b'"x_m": 3.0', b'"x_m": NaN', "x_m"),
+        (b'"x_m": 3.0', b'"y": 3.0', "damaged"),
+        (b'"title"', b"[" * 100_000, "damaged"),
+    ):
+        text = contents["project.json"]
+        assert old in text
+        after.upload_map([("mine.zip", zipped(contents | {"project.json": text.replace(old, new, 1)}))])
+        assert message in other.settle()
+        assert after.status.is_error
+        assert after.transmitters is transmitters
+    after.close()
 
 
 @pytest.fixture(scope="module")

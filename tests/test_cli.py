@@ -339,23 +339,15 @@ def test_works_without_data_llvm_and_tensorflow(tmp_path: Path) -> None:
         assert f"{missing}: install sionna-partial again." in result.stdout
 
 
-def test_version_of_the_package_as_a_command() -> None:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-m", "sionna_partial", "--version"]
-    assert subprocess.check_output(command, env=environment, text=True, timeout=600) == f"{__version__}\n"
+def test_version_of_the_package() -> None:
+    assert run("--version").stdout == f"{__version__}\n"
 
 
-OPTIONS = [
-    (name, option)
-    for name, command in typer.main.get_command(cli.app).commands.items()  # type: ignore[attr-defined]
-    for option in command.params
-    if option.opts[0].startswith("--")
-]
-
-
-@pytest.mark.parametrize(("name", "option"), OPTIONS, ids=[f"{name} {option.name}" for name, option in OPTIONS])
-def test_options_that_are_no_lists_are_given_once(name: str, option: Any) -> None:
-    words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
-    rest = ["--no-such-option"] * option.multiple  # which ends the command
-    result = run(name, option.opts[0], *words, (option.secondary_opts or option.opts)[0], *words, *rest, exit_code=2)
-    assert (f"{option.opts[0]} is given 2 times: give it once." in result.stderr) != option.multiple
+def test_options_that_are_no_lists_are_given_once() -> None:
+    for name, command in typer.main.get_command(cli.app).commands.items():  # type: ignore[attr-defined]
+        for option in (each for each in command.params if each.opts[0].startswith("--")):
+            words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
+            rest = ["--no-such-option"] * option.multiple  # which ends the command
+            again = (option.secondary_opts or option.opts)[0]
+            result = run(name, option.opts[0], *words, again, *words, *rest, exit_code=2)
+            assert (f"{option.opts[0]} is given 2 times: give it once." in result.stderr) != option.multiple

@@ -144,11 +144,6 @@ def two_rooms() -> PlacementArea:
 
 
 class TestRoom:
-    def test_free_and_away_from_walls(self) -> None:
-        area = two_rooms()
-        positions_m = np.array([[x_m, 1.0, 1.5] for x_m in (1.0, 0.55, 0.65, 0.25, 2.75)])
-        assert area.stands(positions_m).tolist() == [True, False, True, False, False]
-
     def test_unknown_cells_are_no_place_but_keep_no_distance(self) -> None:
         area = placement_area(map_of("...??\n...??\n...??", 0.5, (0.0, 0.0)), 1.5, 1.5, None)
         assert area.stands(np.array([[1.45, 0.7, 1.5], [1.55, 0.7, 1.5], [9.0, 0.7, 1.5]])).tolist() == [1, 0, 0]
