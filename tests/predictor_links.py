@@ -157,12 +157,6 @@ def quick_predictor():
     return Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
 
 
-@functools.cache
-def trained_predictor():
-    settings = PredictorSettings(steps=400, batch_size=512, learning_rate=0.02)
-    return Predictor.fit(*make_links(12_000), settings=settings)
-
-
 @contextmanager
 def shallow_map_networks() -> Iterator[None]:
     """Let map networks have few layers, and see few windows at once: TensorFlow traces each layer of a training."""

@@ -188,20 +188,13 @@ class TestTransmitters:
         for name in ("", "a b", "../x", "tx1", "<b>"):
             with pytest.raises(SettingsError, match="name = "):
                 window.session.change("door", new_name=name)
+        with pytest.raises(PositionError, match="not between floor and ceiling"):
+            window.session.change("door", z_m=9.0)
         window.settle()
-
-    def test_power_threshold_and_layers(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        window.session.change("tx2", eirp_dbm=40.0)
-        window.settle()
-        answer = window.answer
-        best = answer.layers_of("", -60.0)
-        one, two = (answer.layers_of(name, -60.0) for name in ("tx1", "tx2"))
-        powers = [each["power_mean_dbm"].to_numpy() for each in (one, two)]
-        np.testing.assert_array_equal(best["power_mean_dbm"], np.where(powers[1] > powers[0], powers[1], powers[0]))
-        above = answer.coverage.isel(tx=1).radio.probability_above(-100.0)
-        np.testing.assert_allclose(two["p_above"], above, atol=1e-6)
-        assert np.isfinite(best["sinr_mean_db"].to_numpy()[best["valid"].to_numpy()]).all()
+        assert window.session.transmitters["door"].z_m == 2.0
+        window.session.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
+        assert window.put((1.0, 1.0)) == "Ready."
+        assert window.session.transmitters["tx1"].z_m == window.session.settings.rx_height_m == 0.6
 
     def test_one_in_a_wall_or_outside_moves_to_the_nearest_free_cell(self, window: Window) -> None:
         session = window.session
@@ -217,75 +210,69 @@ class TestTransmitters:
         assert (session.warnings, session.chosen) == ([], "tx1")
         window.settle()
 
-    def test_a_height_above_the_ceiling_changes_nothing(self, window: Window) -> None:
-        window.put((1.0, 1.0))
-        with pytest.raises(PositionError, match="not between floor and ceiling"):
-            window.session.change("tx1", z_m=9.0)
-        assert window.session.transmitters == {"tx1": Transmitter(1.0, 1.0)}
-        assert window.answer.is_final
-        window.session.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
-        assert window.put((1.0, 1.0)) == "Ready."
-        assert window.session.transmitters["tx1"].z_m == window.session.settings.rx_height_m == 0.6
+
+def test_it_fills_the_fields_of_all_transmitters_present_and_new(window: Window) -> None:
+    session = window.session
+    session.put([("", 1.0, 1.0)])
+    assert session.preset == ""
+    session.use_preset("Wi-Fi 5 GHz")
+    session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+    assert window.settle() == "Ready."
+    assert [each.eirp_dbm for each in session.transmitters.values()] == [23.0, 23.0]
+    assert (session.settings.frequency_hz, session.settings.threshold_dbm) == (5.21e9, -67.0)
+    assert session.preset == "Wi-Fi 5 GHz"
+    assert [*window.answer.thresholds("tx1", -67.0).values()] == [-67.0, -90.0, 21.0]
+    session.change("tx2", eirp_dbm=10.0)
+    assert session.preset == ""
 
 
-class TestPresets:
-    def test_it_fills_the_fields_of_all_transmitters_present_and_new(self, window: Window) -> None:
-        session = window.session
-        session.put([("", 1.0, 1.0)])
-        assert session.preset == ""
-        session.use_preset("Wi-Fi 5 GHz")
-        session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
-        assert window.settle() == "Ready."
-        assert [each.eirp_dbm for each in session.transmitters.values()] == [23.0, 23.0]
-        assert (session.settings.frequency_hz, session.settings.threshold_dbm) == (5.21e9, -67.0)
-        assert session.preset == "Wi-Fi 5 GHz"
-        assert [*window.answer.thresholds("tx1", -67.0).values()] == [-67.0, -90.0, 21.0]
-        session.change("tx2", eirp_dbm=10.0)
-        assert session.preset == ""
+def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
+    window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    window.session.change("tx2", new_name="hall", eirp_dbm=40.0)
+    window.settle()
+    answer = window.answer
+    best = answer.layers_of("", -60.0)
+    one, two = (answer.layers_of(name, -60.0) for name in ("tx1", "hall"))
+    powers = [each["power_mean_dbm"].to_numpy() for each in (one, two)]
+    np.testing.assert_array_equal(best["power_mean_dbm"], np.where(powers[1] > powers[0], powers[1], powers[0]))
+    above = answer.coverage.isel(tx=1).radio.probability_above(-100.0)
+    np.testing.assert_allclose(two["p_above"], above, atol=1e-6)
+    assert np.isfinite(best["sinr_mean_db"].to_numpy()[best["valid"].to_numpy()]).all()
+    picture = Picture()
+    picture.show_answer(answer, "", -67.0, truth=False)
+    power, server = (picture.parts[name][1] for name in ("power_mean_dbm", "best_server"))
+    assert power.ticker.ticks == [-97.0, -87.0, -77.0, -67.0, -57.0, -47.0, -37.0, -27.0]
+    assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
+    assert server.major_label_overrides == {0: "tx1", 1: "hall"}
+    assert (len(server.color_mapper.palette), server.color_mapper.high) == (2, 1.5)
+    drawn = {name: column[0] for name, column in picture.values.data.items()}
+    levels = drawn["power_mean_dbm"]
+    row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
+    x_m = drawn["x"] + (column + 0.5) / levels.shape[1] * drawn["dw"]
+    y_m = drawn["y"] + (row + 0.5) / levels.shape[0] * drawn["dh"]
+    assert math.dist((x_m, y_m), (3.0, 1.0)) < 0.5
 
-    def test_scales_follow_the_threshold_and_servers_have_names(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        window.session.change("tx2", new_name="hall")
-        window.settle()
-        picture = Picture()
-        picture.show_answer(window.session.answer, "", -67.0, truth=False)
-        power, server = (picture.parts[name][1] for name in ("power_mean_dbm", "best_server"))
-        assert power.ticker.ticks == [-97.0, -87.0, -77.0, -67.0, -57.0, -47.0, -37.0, -27.0]
-        assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
-        assert server.major_label_overrides == {0: "tx1", 1: "hall"}
-        assert (len(server.color_mapper.palette), server.color_mapper.high) == (2, 1.5)
-        drawn = {name: column[0] for name, column in picture.values.data.items()}
-        levels = drawn["power_mean_dbm"]
-        row, column = np.unravel_index(np.nanargmax(levels), levels.shape)
-        x_m = drawn["x"] + (column + 0.5) / levels.shape[1] * drawn["dw"]
-        y_m = drawn["y"] + (row + 0.5) / levels.shape[0] * drawn["dh"]
-        assert min(math.dist((x_m, y_m), tx_m) for tx_m in ((1.0, 1.0), (3.0, 1.0))) < 0.5
 
-    def test_the_page_shows_the_material_that_was_found(self, window: Window) -> None:
-        window.put((1.0, 1.0))
-        answer = window.answer
-        page = Page(Document(), "/files/key")
-        page.session.open_map(PARTIAL, "room.yaml")
-        page.session.set(material="brick", threshold_dbm=-67.0)
-        page.session.answer = replace(answer, coverage=answer.coverage.assign_attrs(wall_material="brick .69"))
-        page.session.status = Status("Ready.")
-        page.show()
-        assert "Ready. Probability of wall materials: brick .69." in page.message.text
-        assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
-        assert page.links.text.count("<a ") == len(FILES)
-        page.session.close()
-
-    def test_the_fields_of_the_page_change_the_chosen_transmitter(self) -> None:
-        page = Page(Document(), "/files/key")
-        page.session.open_map(PARTIAL, "room.yaml")
-        page.session.put([("", 1.0, 1.0)])
-        page.show()
-        page.fields["x_m"].value_throttled = 3.0
-        page.pattern.value = "tr38901"
-        page.aims["azimuth_deg"].value_throttled = 90.0
-        changed = Transmitter(3.0, 1.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        assert page.session.transmitters == {"tx1": changed}
-        page.session.close()
+def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
+    window.put((1.0, 1.0))
+    page = Page(Document(), "/files/key")
+    session = page.session
+    session.open_map(PARTIAL, "room.yaml")
+    session.set(material="brick", threshold_dbm=-67.0)
+    session.answer = replace(window.answer, coverage=window.answer.coverage.assign_attrs(wall_material="brick .69"))
+    session.status = Status("Ready.")
+    page.show()
+    assert "Ready. Probability of wall materials: brick .69." in page.message.text
+    assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
+    assert page.links.text.count("<a ") == len(FILES)
+    session.put([("", 1.0, 1.0)])
+    page.show()
+    page.fields["x_m"].value_throttled = 3.0
+    page.pattern.value = "tr38901"
+    page.aims["azimuth_deg"].value_throttled = 90.0
+    changed = Transmitter(3.0, 1.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+    assert session.transmitters == {"tx1": changed}
+    session.close()
 
 
 def test_prediction_meets_the_truth(window: Window) -> None:

@@ -27,7 +27,6 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import (
     DatasetSettings,
     Material,
-    PredictorSettings,
     SceneSettings,
     SensorSettings,
     TraceSettings,
@@ -186,7 +185,6 @@ def test_options_arrive(
         ("next MAP --out OUT", "next_views", {}),
         ("export-scene MAP --out OUT", "export_scene", {}),
         ("dataset OUT", "build_dataset", {"homes": [*range(20_000, 20_100)]}),
-        ("train LINKS --out OUT", "train", {"dataset": [Path("LINKS")], "settings": PredictorSettings("map")}),
         ("evaluate LINKS --out OUT", "evaluate", {"dataset": [Path("LINKS")], "predictor": "map"}),
     ],
 )

@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
-from commands import run
+from commands import arguments_of, run
 from link_tables import fitted_baselines, make_dataset, make_table
 from predictor_links import QUIET, quick_predictor
 
@@ -52,8 +52,13 @@ class TestDataset:
         assert "the same command tries them again" in result.stderr
 
 
+def test_defaults_of_train(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    found = arguments_of(monkeypatch, "train", "train", dataset, "--out", tmp_path / "run")
+    assert (found["test_fraction"], found["settings"]) == (0.3, PredictorSettings("map"))
+
+
 @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
-def test_what_it_writes_and_says(tmp_path: Path) -> None:
+def test_what_train_writes_and_says(tmp_path: Path) -> None:
     table, out = make_table(homes=3, links=20), tmp_path / "run"
     dataset = make_dataset(tmp_path / "links", table, frequency_hz=60e9, diffraction=False)
     words = "--test-fraction 0.5 --networks paper --passes 2 --seed 3"
