@@ -122,13 +122,6 @@ def assert_sound(outlines: Outlines) -> None:
             assert shapely.intersection(lines[a], lines[b]).geom_type == "Point"
 
 
-@pytest.mark.parametrize("state", list(CellState))
-def test_a_map_of_one_state(state: CellState) -> None:
-    outlines = wall_outlines(PartialMap(np.full((6, 9), state, dtype=np.uint8), 0.1))
-    assert len(outlines.segments) == (4 if state == CellState.WALL else 0)
-    assert outlines.vertices_m.shape == (len(outlines.segments), 2)
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
@@ -136,6 +129,9 @@ def test_a_map_of_one_state(state: CellState) -> None:
         pytest.param("... .#. ...", ring(1.0, 1.0, 2.0, 2.0), id="lone cell"),
         pytest.param("........ .######. .######. ........", path((1.5, 2.0), (6.5, 2.0)), id="two cells thick"),
         pytest.param("........ .######. .######. .######. ........", ring(1.5, 1.5, 6.5, 3.5), id="thick wall"),
+        pytest.param(
+            "??????????? ?##?#?#?#?? ??#######?? ...........", path((2.0, 1.5), (9.0, 1.5)), id="seen at one face"
+        ),
         pytest.param("???????? ?######? ?######? ?######? ????????", ring(1.5, 1.5, 6.5, 3.5), id="seen from nowhere"),
         pytest.param("......... ....#.... .#######. .........", path((1.5, 1.5), (7.5, 1.5)), id="spur of one cell"),
         pytest.param("............. .#?#?#?#?#?#. ?????????????", path((1.5, 1.5), (11.5, 1.5)), id="dotted"),
@@ -164,12 +160,6 @@ def test_tolerance_zero_keeps_every_corner() -> None:
     assert len(segment_set(partial, tolerance_cells=0.5)) == 1
 
 
-def test_only_the_layer_that_faces_free_cells_was_seen() -> None:
-    for behind in ("########", "?##?#?#?", "????????"):
-        partial = drawn(f"???????????? ??{behind}?? ??########?? ............")
-        assert segment_set(partial) == {((2.0, 1.5), (10.0, 1.5))}
-
-
 def met_by_rays(partial: PartialMap) -> PartialMap:
     """Leave out the cells of walls that no ray from a FREE cell meets: a lidar that was everywhere has the others."""
     met = ndimage.binary_dilation(partial.state == CellState.FREE)
@@ -177,7 +167,7 @@ def met_by_rays(partial: PartialMap) -> PartialMap:
     return PartialMap(state.astype(np.uint8), partial.resolution_m)
 
 
-@pytest.mark.parametrize("angle_deg", [0, 3, 17, 45])
+@pytest.mark.parametrize("angle_deg", [0, 17])
 def test_what_no_ray_meets_makes_no_difference(angle_deg: float) -> None:
     """Deep walls around a room, and a pillar in it with rounded corners, some of which are aslant."""
     y, x = np.mgrid[:120, :160] + 0.5
@@ -215,47 +205,36 @@ def test_joints_are_closed(text: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("row", "resolution_m", "bridge_gap_m"),
+    ("row", "resolution_m", "bridge_gap_m", "left", "right"),
     [
-        (".#####???#####.", 0.05, 0.1),
-        (".#####...#####.", 0.05, 0.5),
-        (".#####..#####.", 0.1, 0.5),
-        (".#####??#####.", 0.1, 0.1),
-        (".#####.#####.", 0.2, 0.5),
-        (".#####?#####.", 0.05, 0.0),
-        (".##..#####.", 0.05, 0.5),
-        (".#####????.#####.", 0.05, 0.5),
+        (".#####???#####.", 0.05, 0.1, 6.0, 9.0),
+        (".#####...#####.", 0.05, 0.5, 5.5, 9.5),
+        (".#####.#####.", 0.2, 0.5, 5.5, 7.5),
+        (".#####?#####.", 0.05, 0.0, 6.0, 7.0),
+        (".#####????.#####.", 0.05, 0.5, 6.0, 11.5),
     ],
 )
-def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float) -> None:
+def test_opening_stays_whole(row: str, resolution_m: float, bridge_gap_m: float, left: float, right: float) -> None:
     """A gap that is too long, or across which FREE cells were seen; where it is unknown, walls reach its border."""
     partial = drawn(f"{'.' * len(row)} {row} {'.' * len(row)}", resolution_m=resolution_m)
-    first, last = row.index("#"), row.rindex("#")
-    opening = row.strip(".").replace("?", ".").split(".")
-    left, right = first + len(opening[0]) - 1, last - len(opening[-1]) + 1
-    more = [0.5 * (row[cell] == "?") for cell in (left + 1, right - 1)]
-    assert segment_set(partial, bridge_gap_m=bridge_gap_m) == {
-        ((first + 0.5, 1.5), (left + 0.5 + more[0], 1.5)),
-        ((right + 0.5 - more[1], 1.5), (last + 0.5, 1.5)),
-    }
+    expected = path((1.5, 1.5), (left, 1.5)) | path((right, 1.5), (len(row) - 1.5, 1.5))
+    assert segment_set(partial, bridge_gap_m=bridge_gap_m) == expected
 
 
-@pytest.mark.parametrize("cells", [1, 5, 6])
+@pytest.mark.parametrize("cells", [5, 6])
 def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None:
     wall = f"....####{'?' * cells}####...."
     partial = drawn(f"{'?' * len(wall)} {wall} {'.' * len(wall)}", resolution_m=0.1)
     assert len(wall_outlines(partial).segments) == (1 if cells <= 5 else 2)
 
 
-@pytest.mark.parametrize("cells", [1, 3, 5])
-def test_gap_around_a_corner_is_closed(cells: int) -> None:
-    size = 16
+def test_gap_around_a_corner_is_closed() -> None:
+    size, cells = 16, 5
     state = np.full((size, size), CellState.FREE, dtype=np.uint8)
     state[0], state[:, 0] = CellState.UNKNOWN, CellState.UNKNOWN
     state[1, 1 + cells :] = state[1 + cells :, 1] = CellState.WALL
     state[1, 1 : 1 + cells] = state[1 : 1 + cells, 1] = CellState.UNKNOWN
-    outlines = wall_outlines(PartialMap(state, 0.1))
-    assert lines_of(outlines) == 1
+    assert lines_of(wall_outlines(PartialMap(state, 0.1))) == 1
 
 
 def test_unobserved_regions_become_no_walls() -> None:
@@ -279,7 +258,7 @@ def test_unobserved_regions_become_no_walls() -> None:
     assert farthest_from_walls(partial, outlines) < 0.8
 
 
-@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, 0.0), (17, -1.0), (30, 0.0), (45, -1.0), (73, 0.0)])
+@pytest.mark.parametrize(("angle_deg", "thickness"), [(17, -1.0), (73, 0.0)])
 def test_gap_of_a_tilted_wall_is_closed_and_a_door_is_not(angle_deg: float, thickness: float) -> None:
     sampled = tilted(angle_deg, thickness)
     state = sampled.state.copy()
@@ -295,11 +274,9 @@ def test_gap_of_a_tilted_wall_is_closed_and_a_door_is_not(angle_deg: float, thic
     assert nearest > 3.0
 
 
-@pytest.mark.parametrize(
-    ("angle_deg", "thickness"), [(0, 0.0), (3, -1.0), (17, 0.0), (45, 0.0), (45, -1.0), (60, -1.0), (87, 0.0)]
-)
+@pytest.mark.parametrize(("angle_deg", "thickness"), [(3, -1.0), (45, 0.0), (60, -1.0), (87, 0.0)])
 def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: float) -> None:
-    for phase in (0.11, 0.37, 0.8):
+    for phase in (0.11, 0.8):
         partial = tilted(angle_deg, thickness, phase)
         outlines = wall_outlines(partial)
         assert len(outlines.segments) == 1
@@ -326,14 +303,7 @@ def noisy_plan(thickness: int, fraction: float, around: float) -> PartialMap:
 
 @pytest.mark.parametrize(
     ("thickness", "fraction", "around", "most"),
-    [
-        (1, 0.0, 0.3, 20),
-        (2, 0.0, 0.3, 260),
-        (4, 0.0, 0.0, 20),
-        (4, 0.05, 0.05, 24),
-        (4, 0.15, 0.15, 110),
-        (4, 0.3, 0.3, 320),
-    ],
+    [(1, 0.0, 0.3, 20), (4, 0.05, 0.05, 24), (4, 0.15, 0.15, 110)],
 )
 def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: float, most: int) -> None:
     partial = noisy_plan(thickness, fraction, around)
@@ -342,14 +312,6 @@ def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: 
     assert 8 <= len(outlines.segments) <= most
     assert kept_regions(partial, outlines, scale=3) > 0
     assert farthest_from_walls(partial, outlines) < 2.0
-    assert distances_from_outlines(seen_from_inside(partial), outlines).max() < 3.5
-
-
-def seen_from_inside(partial: PartialMap) -> PartialMap:
-    """Leave out FREE specks that noise made on the other side of walls."""
-    label, _ = ndimage.label(partial.state == CellState.FREE)
-    lost = (label > 0) & (np.bincount(label.ravel()) < 50)[label]
-    return PartialMap(np.where(lost, CellState.UNKNOWN, partial.state).astype(np.uint8), partial.resolution_m)
 
 
 def test_niche_of_a_clean_wall_stays() -> None:
@@ -360,20 +322,6 @@ def test_niche_of_a_clean_wall_stays() -> None:
     pairs = in_cells(partial, wall_outlines(partial))
     assert len(pairs) == 8
     assert (np.abs(pairs[:, 0] - pairs[:, 1]).min(axis=1) == 0).all()
-
-
-@settings(max_examples=60, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 24), st.integers(1, 24), st.floats(0.05, 0.7), st.sampled_from([0, 2]))
-def test_random_maps_give_sound_outlines(seed: int, ny: int, nx: int, fraction: float, other: int) -> None:
-    rng = np.random.default_rng(seed)
-    state = np.where(rng.random((ny, nx)) < fraction, CellState.WALL, other).astype(np.uint8)
-    partial = PartialMap(state, 0.1)
-    outlines = wall_outlines(partial)
-    assert_sound(outlines)
-    if (state == CellState.WALL).any():
-        assert farthest_from_walls(partial, outlines) < 5.0 + 1.5  # the longest gap that is closed, and the tolerance
-    else:
-        assert len(outlines.segments) == 0
 
 
 def transformed(state: NDArray[np.uint8], transpose: bool, rows: int, columns: int) -> NDArray[np.uint8]:
@@ -404,14 +352,15 @@ def random_state(seed: int, kind: str) -> NDArray[np.uint8]:
     """Draw a map: cells at random, or rooms with ragged walls of which a part is unknown."""
     rng = np.random.default_rng(seed)
     if kind == "cells":
-        return rng.choice(3, rng.integers(1, 22, 2), p=[0.5, 0.3, 0.2]).astype(np.uint8)
+        walls = rng.uniform(0.05, 0.7)
+        return rng.choice(3, rng.integers(1, 22, 2), p=[0.6 * (1 - walls), walls, 0.4 * (1 - walls)]).astype(np.uint8)
     state = ragged_room(seed, int(rng.integers(1, 5)), float(rng.choice([0.0, 0.1, 0.3]))).state.copy()
     hidden = ndimage.zoom(rng.random((18, 18)), 8, order=1)[: state.shape[0], : state.shape[1]] < 0.4
     state[hidden] = CellState.UNKNOWN
     return state
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40)
 @given(
     st.integers(0, 2**32 - 1),
     st.sampled_from(["cells", "rooms"]),
@@ -433,20 +382,14 @@ def test_outlines_turn_and_move_with_the_map(
     expected = transformed_points(here.vertices_m / 0.05, state.shape, *orientation)
     np.testing.assert_allclose(there.vertices_m / 0.05 - [left, below], expected, rtol=0, atol=1e-9)
     np.testing.assert_array_equal(there.segments, here.segments)
-
-
-def test_map_that_is_its_own_mirror_image_has_sound_outlines() -> None:
-    partial = ragged_room(5, 3, 0.2)
-    quarter = partial.state[:70, :70]
-    quarter = np.where(quarter < quarter.T, quarter, quarter.T)
-    half = np.concatenate([quarter, quarter[::-1]])
-    whole = PartialMap(np.concatenate([half, half[:, ::-1]], axis=1), 0.05)
-    assert_sound(wall_outlines(whole))
-    assert all((transformed(whole.state, *orientation) == whole.state).all() for orientation in SYMMETRIES)
+    assert_sound(here)
+    if kind == "cells" and len(here.segments):
+        longest_gap, tolerance = 0.5 / 0.05, 1.5
+        assert farthest_from_walls(PartialMap(state, 0.05), here) < longest_gap + tolerance
 
 
 @pytest.mark.skipif(not (SHARED / "gibson").is_dir(), reason="reference homes are not here")
-@pytest.mark.parametrize("home", ["Shelbiana", "Kerrtown", "Brevort"])
+@pytest.mark.parametrize("home", ["Shelbiana", "Brevort"])
 def test_real_homes_have_faithful_and_few_outlines(home: str) -> None:
     from sionna_partial.maps.map_files import load_map
 
@@ -479,18 +422,10 @@ def test_staircases(text: str, expected: set[tuple[tuple[float, ...], ...]]) -> 
     assert {tuple(sorted((x, y) for x, y in pair)) for pair in pairs} == expected
 
 
-MAPS = st.tuples(st.integers(0, 2**32 - 1), st.integers(1, 20), st.integers(1, 20), st.floats(0.05, 0.9))
-
-
-def random_map(seed: int, ny: int, nx: int, fraction: float) -> PartialMap:
-    state = np.random.default_rng(seed).choice(3, (ny, nx), p=[(1 - fraction) / 2, fraction, (1 - fraction) / 2])
-    return PartialMap(state.astype(np.uint8), 0.1)
-
-
-@settings(max_examples=60, deadline=None)
-@given(MAPS)
-def test_where_two_segments_meet_one_ends_the_other_begins_and_they_turn(case: tuple[int, int, int, float]) -> None:
-    outlines = lattice_outlines(random_map(*case))
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_where_two_segments_meet_one_ends_the_other_begins_and_they_turn(seed: int) -> None:
+    outlines = lattice_outlines(PartialMap(random_state(seed, "cells"), 0.1))
     assert_sound(outlines)
     count = len(outlines.vertices_m)
     begins, ends = (np.bincount(outlines.segments[:, side], minlength=count) for side in (0, 1))
@@ -504,10 +439,10 @@ def test_where_two_segments_meet_one_ends_the_other_begins_and_they_turn(case: t
         assert abs(first[0] * then[1] - first[1] * then[0]) > 1e-6
 
 
-@settings(max_examples=60, deadline=None)
-@given(MAPS)
-def test_every_wall_cell_is_on_the_outline_or_deep_inside_and_no_other_is(case: tuple[int, int, int, float]) -> None:
-    partial = random_map(*case)
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1))
+def test_every_wall_cell_is_on_the_outline_or_deep_inside_and_no_other_is(seed: int) -> None:
+    partial = PartialMap(random_state(seed, "cells"), 0.1)
     lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, lattice_outlines(partial))))
     row, column = np.indices(partial.shape)
     distance = shapely.distance(lines, shapely.points(column + 0.5, row + 0.5))

@@ -67,11 +67,9 @@ def test_orientation_and_place(tmp_path: Path) -> None:
 
 PGMS = {
     "binary": b"P5\n3 1\n255\n\x00\xcd\xfe",
-    "text": b"P2\n3 1\n255\n0 205 254\n",
     "text with comments": b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
     "binary, maxval 100": b"P5\n3 1\n100\n\x00\x32\x64",
     "binary, 16 bit": b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
-    "text, 16 bit": b"P2\n3 1\n65535\n0 40000 65535\n",
 }
 
 
@@ -122,9 +120,8 @@ def test_alpha_in_scale_mode(tmp_path: Path) -> None:
 
 def test_alpha_in_trinary_mode_is_a_fourth_channel(tmp_path: Path) -> None:
     """nav2 averages alpha with the colours: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4."""
-    pixels = [[[0, 0, 0, 255], [60, 60, 60, 255], [255, 255, 255, 255], [255, 255, 255, 0], [255, 255, 255, 0]]]
-    for strict in (False, True):
-        assert load_state(tmp_path, pixels, strict=strict) == [[WALL, UNKNOWN, FREE, UNKNOWN, UNKNOWN]]
+    pixels = [[[0, 0, 0, 255], [60, 60, 60, 255], [255, 255, 255, 255], [255, 255, 255, 0]]]
+    assert load_state(tmp_path, pixels) == [[WALL, UNKNOWN, FREE, UNKNOWN]]
 
 
 def test_transparent_is_unknown(tmp_path: Path) -> None:
@@ -147,16 +144,15 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
         pixels = np.stack([pixels] * 3 + [opaque] * ("RGBA" in colour), axis=-1)
     thresholds = {"free_thresh": 0.55, "occupied_thresh": 0.9} if colour == "RGBA, negated" else {"free_thresh": 0.25}
     shade = 50 if negate else 205
-    with pytest.warns(MapWarning, match=rf"3 cells of shade {shade} would read as free .* Pass strict=True"):
+    with pytest.warns(MapWarning, match=rf"3 cells of shade {shade} would read as free") as caught:
         read = load_state(tmp_path, pixels, negate=int(negate), **thresholds)
-    assert read == state
+    assert (read, caught[0].filename) == (state, __file__)
     letter = load_state(tmp_path, pixels, negate=int(negate), strict=True, **thresholds)
     assert letter == [[WALL, FREE, FREE], [FREE, FREE, FREE]]
 
 
 def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
     assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
-
     with pytest.warns(MapWarning, match="2 cells of shade 205"):
         assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
 
@@ -182,13 +178,6 @@ def test_inflated_costmap(tmp_path: Path, mode: str, grey: int) -> None:
         load_map(write_map(tmp_path, shades, mode=mode))
     shades[20:60, 20:22] = 254
     load_map(write_map(tmp_path, shades, mode=mode))
-
-
-def test_warning_points_to_the_caller(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0, 205, 254]], free_thresh=0.25)
-    with pytest.warns(MapWarning) as caught:
-        load_map(path)
-    assert caught[0].filename == __file__
 
 
 def test_numbers_as_people_write_them(tmp_path: Path) -> None:
@@ -222,13 +211,9 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
 @pytest.mark.parametrize(
     ("key", "values", "message"),
     [
-        (
-            "resolution",
-            (0, 50, 1e-9, 10**400, math.nan, "fine", None, True, [0.05], {}),
-            r"a number of metres per cell",
-        ),
-        ("occupied_thresh", (-0.1, 65, math.nan, "high", None), r"give a number in \[0, 1\]"),
-        ("free_thresh", (-0.1, 19.6, math.nan, "low", None), r"give a number in \[0, 1\]"),
+        ("resolution", (0, 50, 10**400, math.nan, "fine", None, True, [0.05]), r"a number of metres per cell"),
+        ("occupied_thresh", (-0.1, 65, "high"), r"give a number in \[0, 1\]"),
+        ("free_thresh", (-0.1, 19.6, "low"), r"give a number in \[0, 1\]"),
         ("free_thresh", (0.65, 0.9), "give less than occupied_thresh, which is 0.65"),
         ("origin", ([0, 0], [0] * 4, [0, math.nan, 0], [0, 0, "north"], 7, None, "0, 0"), r"give \[x, y, yaw\] of the"),
         ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
@@ -288,14 +273,9 @@ NO_IMAGE, TOO_MANY = "it is damaged or not a PGM, PNG or BMP", "it has more than
 @pytest.mark.parametrize(
     ("message", "content"),
     [
-        *((NO_IMAGE, b"P5" + end) for end in (b"", b"\n# only a comment")),
-        *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"255\n\x00\xcd", b"100\n\x00\x32", b"65535\n\x00\x00\xcd")),
-        *((NO_IMAGE, b"P5\n%s 1\n255\n\x00\xcd\xfe" % width) for width in (b"0", b"-3", b"three")),
-        *((NO_IMAGE, b"P2\n3 1\n255\n0 205" + end) for end in (b"", b" 300", b" white")),
-        *((NO_IMAGE, b"\x89PNG\r\n\x1a\n" + end) for end in (b"\x00\x00\x00\rIHDR", b"rubbish" * 20)),
-        (NO_IMAGE, b"GIF89a\x01\x00\x01\x00\x00\x00\x00;"),
-        *((NO_IMAGE, content) for content in (b"", bytes(range(256)) * 4)),
-        *((TOO_MANY, b"P5\n%d %d\n255\n" % size) for size in ((20_000, 20_000), (10_001, 10_000), (2**30, 2**30))),
+        *((NO_IMAGE, b"P5" + end) for end in (b"\n3 1\n255\n\x00\xcd", b"\nthree 1\n255\n\x00\xcd\xfe")),
+        *((NO_IMAGE, content) for content in (b"", b"GIF89a\x01\x00\x01\x00\x00\x00\x00;", b"\x89PNG\r\n\x1a\nIHDR")),
+        *((TOO_MANY, b"P5\n%d %d\n255\n" % size) for size in ((10_001, 10_000), (2**30, 2**30))),
         ("it holds floating-point shades; save a PGM or PNG", b"Pf\n1 1\n-1.0\n\x00\x00\x80\x3f"),
     ],
 )
@@ -304,15 +284,6 @@ def test_damaged_image(tmp_path: Path, message: str, content: bytes) -> None:
     (tmp_path / "map.pgm").write_bytes(content)
     with pytest.raises(MapError, match=rf"image = '.*map\.pgm' is not allowed: {message}"):
         load_map(write_sheet(tmp_path))
-
-
-def test_truncated_png(tmp_path: Path) -> None:
-    path = write_map(tmp_path, np.random.default_rng(0).integers(0, 255, (40, 40, 3)))
-    whole = (tmp_path / "map.png").read_bytes()
-    for share in (0.2, 0.6, 0.95):
-        (tmp_path / "map.png").write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(MapError, match=r"it is damaged or not a PGM, PNG or BMP \(.*\); save the map again"):
-            load_map(path)
 
 
 def test_interior_cells_follow_the_cell_size(tmp_path: Path) -> None:
@@ -353,7 +324,6 @@ def test_further_keys(tmp_path: Path) -> None:
     assert (sheet["score"], sheet["steps"], sheet["path"]) == (1.5, 3, [[1, 0], [0, 1]])
     refused: list[tuple[object, str]] = [
         ({"resolution": 0.5}, "holds 'resolution', which the map sets itself: give a mapping of further keys"),
-        ({"mesh": {}}, "holds 'mesh', which the map sets itself"),
         ({3: 4}, "extra = {3: 4} has keys that are no text: give a mapping"),
         (5, "extra = 5 has keys that are no text: give a mapping"),
         ({"a": object()}, r"extra cannot be written as YAML \(.*\): give numbers, texts, lists and mappings"),
@@ -373,19 +343,17 @@ def test_neither_file_without_the_other(tmp_path: Path, blocked: str) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [blocked]
 
 
-GRID = np.array([[0, 1, 2], [0, 0, 1]], dtype=np.uint8)
 grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 2))
 
 
 @given(grids, st.integers(-4, 4))
 def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
     yaw = turns * math.pi / 2
-    partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw))[:1], 1.0, turn_grid(state, 1.0, (3.0, -2.0, yaw))[2])
+    partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw)))
     v, u = np.mgrid[: state.shape[0], : state.shape[1]] + 0.5
     x = 3.0 + math.cos(yaw) * u - math.sin(yaw) * v
     y = -2.0 + math.sin(yaw) * u + math.cos(yaw) * v
     assert np.array_equal(partial.state_at(np.stack([x, y], axis=-1)), state)
-    assert partial.state.size == state.size
 
 
 @given(grids, st.floats(-6.28, 6.28), st.integers(0, 2**32 - 1))
@@ -399,10 +367,9 @@ def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float, seed:
     back = np.stack([math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x], axis=-1)
     fraction = np.abs(back - np.rint(back)).min(axis=-1)
     clear = fraction > 1e-6
-    expected = PartialMap(state, 1.0).state_at(back)
-    differs = clear & (new != expected)
-    assert (expected[differs] == FREE).all()
+    differs = clear & (new != PartialMap(state, 1.0).state_at(back))
     assert (new[differs] == WALL).all()
+    assert (PartialMap(state, 1.0).state_at(back)[differs] == FREE).all()
     assert cell == 0.5
 
 
@@ -428,19 +395,6 @@ def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -
     assert not PartialMap(turn_grid(state, 0.1, (0.0, 0.0, yaw))[0], resolution_m).is_complete
 
 
-def test_diagonal_walls_stay_closed() -> None:
-    """A diamond of cells that touch at corners alone, free inside."""
-    y, x = np.mgrid[-12:13, -12:13]
-    distance = np.abs(x) + np.abs(y)
-    state = np.where(distance < 10, FREE, np.where(distance == 10, WALL, UNKNOWN)).astype(np.uint8)
-    assert PartialMap(state, 0.1).is_complete
-    for yaw in np.linspace(-3, 3, 41):
-        new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
-        assert PartialMap(new, resolution_m, origin_m).is_complete
-        if resolution_m < 0.1:
-            assert (new == FREE).sum() == pytest.approx(4 * (state == FREE).sum(), rel=0.06)
-
-
 def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) -> None:
     state = room(96, 96)
     limit = 0.5 / math.hypot(100, 100)
@@ -453,7 +407,7 @@ def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) ->
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
     with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
-        turn_grid(GRID, 0.1, (0.0, 1.0, 0.5))
+        turn_grid(PARTIAL.state, 0.1, (0.0, 1.0, 0.5))
 
 
 REPORTS = Path(__file__).parent / "reports"
@@ -475,9 +429,7 @@ class TestContinuousValues:
         with pytest.warns(MapWarning, match=r"95% of the seen cells have an occupancy between 19.6 and 65 %"):
             partial = load_map(path)
         assert np.bincount(partial.state.ravel()).tolist() == [26_480, 1_520, 15_200]
-        assert "26,543 of 28,000 seen cells have an occupancy between 19.6 and 65 %: walls" in str(
-            partial.import_report
-        )
+        assert "26,543 of 28,000 seen cells have an occupancy between" in str(partial.import_report)
         shade = np.asarray(Image.open(path.with_suffix(".pgm")))[::-1]
         percent = np.where(shade == 128, -1, np.rint(100 * (1 - shade / 255))).astype(np.int8)
         with pytest.warns(MapWarning, match=r"walls are the cells from 54.0 % on, and other seen cells are free"):
@@ -500,24 +452,17 @@ class TestContinuousValues:
             partial = map_from_occupancy(levels(*parts), 0.05)
         assert np.bincount(partial.state.ravel(), minlength=2)[:2].tolist() == [free, wall]
 
-    @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(0, 100, 50)], [(28, 48, 500)], [(50, 99, 100)]])
+    @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(28, 48, 500)], [(50, 99, 100)]])
     def test_values_that_are_not_separate(self, parts: list[tuple[int, int, int]]) -> None:
         message = "seen cells have an occupancy between 25 and 65 % and are read as unknown: Give free_percent"
         with pytest.warns(MapWarning, match=message):
             partial = map_from_occupancy(levels(*parts), 0.05)
         assert partial.import_report is not None
-        (row,) = partial.import_report.skipped
-        assert row.count == sum(
-            count for low, high, count in parts for value in range(low, high + 1) if 25 < value < 65
-        )
+        percent = levels(*parts)
+        assert partial.import_report.skipped[0].count == ((percent > 25) & (percent < 65)).sum()
 
     @pytest.mark.parametrize(
-        "parts",
-        [
-            [(0, 0, 5000), (100, 100, 500)],
-            [(0, 0, 5000), (50, 50, 3000), (100, 100, 500)],
-            [(0, 0, 5000), (26, 64, 20), (99, 100, 500)],
-        ],
+        "parts", [[(0, 0, 5000), (50, 50, 3000), (100, 100, 500)], [(0, 0, 5000), (26, 64, 20), (99, 100, 500)]]
     )
     def test_other_maps_keep_the_standard_thresholds(self, parts: list[tuple[int, int, int]]) -> None:
         percent = levels(*parts)
