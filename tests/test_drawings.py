@@ -25,10 +25,6 @@ from sionna_partial.maps.partial_map import MapWarning, PartialMap
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
 
-CORNERS = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
-"""A room of 5 x 4 m in millimetres, or 50 x 40 m in centimetres."""
-
-
 def drawing(units: int = 6, unit_m: float = 1.0, layer: str = "A-WALL") -> Drawing:
     """Two rooms of 4 x 5 m with walls of 0.2 m drawn by their faces, a door, an entrance, a window and furniture."""
     doc = ezdxf.new(units=units)
@@ -70,8 +66,7 @@ def require_rooms(partial: PartialMap) -> None:
     assert (partial.state == FREE).sum() * partial.resolution_m**2 == pytest.approx(7.6 * 4.8, rel=0.05)
 
 
-@pytest.mark.parametrize(("units", "unit_m"), [(6, 1.0), (4, 1e-3), (5, 1e-2), (1, 0.0254), (2, 0.3048)])
-@pytest.mark.parametrize("fmt", ["asc", "bin"])
+@pytest.mark.parametrize(("units", "unit_m", "fmt"), [(4, 1e-3, "asc"), (1, 0.0254, "asc"), (2, 0.3048, "bin")])
 def test_rooms(tmp_path: Path, units: int, unit_m: float, fmt: Any) -> None:
     drawing(units, unit_m).saveas(tmp_path / "plan.dxf", fmt=fmt)
     partial = load_map(tmp_path / "plan.dxf")
@@ -86,8 +81,6 @@ def test_options(tmp_path: Path) -> None:
     assert states(closed, (1.5, 0.12)) == [WALL]
     with pytest.raises(MapError, match=r"height_band_m is for scans alone, but path = '.*dxf' is a drawing: leave"):
         load_map(tmp_path / "plan.dxf", height_band_m=(0, 1))
-    with pytest.raises(MapError, match=r"path = 3 is not a path: give a drawing \(\.dxf\)"):
-        map_from_drawing(3)  # type: ignore[arg-type]
 
 
 REPORTS = Path(__file__).parent / "reports"
@@ -116,11 +109,11 @@ def test_wrong_units(name: str, unit_m: float, message: str | None) -> None:
     assert given == replace(report, unit_source="unit_m")
 
 
-@pytest.mark.parametrize("header", [0, 4, 5, 6])
+@pytest.mark.parametrize("header", [0, 4, 6])
 @pytest.mark.parametrize("unit_m", [0.001, 0.01, 1.0])
 def test_units_of_a_plan(tmp_path: Path, header: int, unit_m: float) -> None:
     drawing(header, unit_m).saveas(tmp_path / "plan.dxf")
-    is_right = {4: 0.001, 5: 0.01, 6: 1.0}.get(header) == unit_m
+    is_right = {4: 0.001, 6: 1.0}.get(header) == unit_m
     message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
     with nullcontext() if is_right else pytest.warns(MapWarning, match=message):
         require_rooms(load_map(tmp_path / "plan.dxf"))
@@ -173,8 +166,6 @@ def test_heights_of_layers() -> None:
     assert partial.is_wall_at(points_m).tolist() == [True, False, True]
     with pytest.raises(MapError, match=r"layer_heights_m\['\*'\] = -1 is not allowed: give a height"):
         map_from_drawing(path, layer_heights_m={"*": -1})
-    with pytest.raises(MapError, match=r"layer_heights_m = 1 is not allowed: give values by the names of layers"):
-        map_from_drawing(path, layer_heights_m=1)  # type: ignore[arg-type]
 
 
 LAYERS = {
@@ -213,9 +204,7 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
         space.add_lwpolyline(corners, close=True, dxfattribs={"layer": "Base"})
     space.add_lwpolyline([(-20, -20), (50, -20), (50, 40), (-20, 40)], close=True, dxfattribs={"layer": "Rahmen"})
     doc.saveas(tmp_path / "plan.dxf")
-    message = (
-        r"walls on \['wand'\] that enclose hardly any area, so layer 'Base' \(2 lines\) is read .* Wand \(5 lines\)"
-    )
+    message = r"walls on \['wand'\] that enclose hardly any area, so layer 'Base' \(2 lines\) is read"
     with pytest.warns(MapWarning, match=message):
         partial = load_map(tmp_path / "plan.dxf")
     assert states(partial, (2, 2), (8, 2), (8, 6), (0.1, 4), (5.1, 1)) == [FREE, FREE, FREE, WALL, WALL]
@@ -224,22 +213,9 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
     assert [(row.name, row.reason) for row in partial.import_report.skipped] == [("Rahmen", "name of no wall")]
 
 
-def test_hardly_any_area(tmp_path: Path) -> None:
-    doc = ezdxf.new(units=6)
-    for corners in ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 9), (12, 9), (12, 9.2), (0, 9.2)]):
-        doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
-    doc.saveas(tmp_path / "plan.dxf")
-    with pytest.warns(MapWarning) as caught:
-        load_map(tmp_path / "plan.dxf")
-    message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
-    assert re.search(message, str(caught[0].message))
-
-
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
     drawing().saveas(tmp_path / "plan.dxf")
-    with pytest.warns(
-        MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* resolution_m of 0\.1"
-    ):
+    with pytest.warns(MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* of 0\.1"):
         load_map(tmp_path / "plan.dxf", resolution_m=0.25)
 
 
@@ -261,9 +237,7 @@ def test_skipped_elements_are_listed(tmp_path: Path) -> None:
     assert report is not None
     assert [(row.name, row.count) for row in report.used] == [("A-GLAZ", 2), ("A-WALL", 8)]
     assert [(row.name, row.count, row.reason) for row in report.skipped] == [
-        ("A-DOOR", 1, "major group of no wall (AIA/NCS)"),
-        ("A-WALL-DEMO", 1, "to be demolished"),
-        ("A-WALL-HEAD", 1, "texts, dimensions or door headers"),
+        *((name, 1, skip_reason(name)) for name in ("A-DOOR", "A-WALL-DEMO", "A-WALL-HEAD")),
         ("AEC_WALL", 1, "object of another program: explode them"),
         ("HIDDEN WALLS", 1, "hidden"),
         ("POINT on A-WALL", 1, "type without lines"),
@@ -301,9 +275,8 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     expected = np.concatenate(list(exploded(doc.modelspace().query("*[layer=='A-WALL']"))))
     near = shapely.MultiLineString(list(expected)).buffer(0.002)
     assert near.covers(shapely.MultiLineString(list(found)))
-    assert shapely.length(shapely.multilinestrings(found)) == pytest.approx(
-        shapely.length(shapely.multilinestrings(expected)), rel=0.01
-    )
+    length, expected_length = (np.linalg.norm(np.diff(pieces, axis=1)).sum() for pieces in (found, expected))
+    assert length == pytest.approx(expected_length, rel=0.01)
     assert lines.line_counts()["a-wall"] == 8 + 2 * 2 * (1 + 2 + 3)
 
 
@@ -341,9 +314,9 @@ def test_every_kind_of_line(tmp_path: Path) -> None:
     require_rooms(partial)
 
 
-def spoiled(change: Callable[[Drawing], object], units: int = 6, unit_m: float = 1.0) -> Callable[[Path], None]:
+def spoiled(change: Callable[[Drawing], object], units: int = 6) -> Callable[[Path], None]:
     def write(path: Path) -> None:
-        doc = drawing(units, unit_m)
+        doc = drawing(units)
         change(doc)
         doc.saveas(path)
 
@@ -366,7 +339,8 @@ def endless_block(doc: Drawing) -> None:
 
 def room_alone(doc: Drawing) -> None:
     doc.modelspace().delete_all_entities()
-    doc.modelspace().add_lwpolyline(CORNERS, close=True, dxfattribs={"layer": "A-WALL"})
+    corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
+    doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL"})
 
 
 @pytest.mark.parametrize(
@@ -378,7 +352,6 @@ def room_alone(doc: Drawing) -> None:
         (spoiled(lambda doc: None), {"wall_layers": ["A-DOOR"]}, "the walls of ['a-door'] enclose nothing: name"),
         (spoiled(lambda doc: None), {"wall_layers": ["Defpoints"]}, "has no lines on ['defpoints']: name layers"),
         (spoiled(lambda doc: None), {"wall_layers": "A-WALL"}, "wall_layers = 'A-WALL' is not allowed: give names"),
-        (spoiled(lambda doc: None), {"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres"),
         (spoiled(lambda doc: None), {"unit_m": 0.001}, "has walls that span 0.0082 x 0.0052 m with unit_m = 0.001:"),
         (spoiled(room_alone, 0), {}, "has no unit ($INSUNITS = 0), and walls of 5000 units: give unit_m"),
         (spoiled(lambda doc: doc.modelspace().delete_all_entities()), {}, "has no lines on ['a-glaz', 'a-wall']"),
@@ -391,14 +364,3 @@ def test_refused(tmp_path: Path, write: Callable, given: Any, message: str, monk
     write(tmp_path / "plan.dxf")
     with pytest.raises(MapError, match=re.escape(message)):
         map_from_drawing(tmp_path / "plan.dxf", **given)
-
-
-@pytest.mark.parametrize("fmt", ["asc", "bin"])
-def test_every_truncation(tmp_path: Path, fmt: Any) -> None:
-    path = tmp_path / "plan.dxf"
-    drawing().saveas(path, fmt=fmt)
-    content = path.read_bytes()
-    for size in range(0, len(content) - 10, len(content) // 20):
-        path.write_bytes(content[:size])
-        with pytest.raises(MapError, match=r"is damaged or no DXF"):
-            map_from_drawing(path)

@@ -7,7 +7,7 @@ from sionna_partial.worlds.buildings import furnish, union_of
 ROOM = box(0, 0, 5, 4)
 DOOR = LineString([(1, 0), (1.9, 0)])
 WALK_M = 0.6
-SEEDS = range(20)
+SEEDS = range(12)
 
 
 def walls_of(room: Polygon) -> Polygon:
@@ -20,19 +20,15 @@ def furnished(seed: int, room: Polygon = ROOM, clutter: float = 3.0, pillars: fl
 
 
 def test_all_that_is_left_can_be_walked_to_from_the_door() -> None:
+    doorstep = box(1, 0, 1.9, WALK_M).buffer(-1e-3)
     for seed in SEEDS:
         things = furnished(seed)
         assert things
+        assert not any(thing.intersects(doorstep) for thing in things)
         left = ROOM.difference(union_of([walls_of(ROOM), *things])).union(box(1, -0.9, 1.9, 0.1))
         walkable = left.buffer(-WALK_M / 2)
         assert walkable.geom_type == "Polygon"
         assert walkable.intersects(DOOR)
-
-
-def test_nothing_stands_before_the_door() -> None:
-    doorstep = box(1, 0, 1.9, WALK_M).buffer(-1e-3)
-    for seed in SEEDS:
-        assert not any(thing.intersects(doorstep) for thing in furnished(seed))
 
 
 def test_shapes_are_of_many_kinds() -> None:

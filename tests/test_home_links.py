@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from link_tables import assert_same, make_table
+from link_tables import assert_same
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
-from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, stage_name, write_shard
-from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
+from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, write_shard
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
@@ -120,9 +120,7 @@ class TestPlaces:
     def test_stages_by_observed_fraction(self, home: PartialMap) -> None:
         table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))
         assert np.unique(table.stage).tolist() == [0.0, 0.3, 0.6]
-        for stage in (0.3, 0.6):
-            assert (table.observed_fraction[table.stage == stage] >= stage).all()
-        assert [stage_name(stage) for stage in (0.0, 0.3, 50.0)] == ["0 steps", "30 % observed", "50 steps"]
+        assert (table.observed_fraction >= table.stage).all()
 
 
 class TestTruthAndFeatures:
@@ -180,8 +178,8 @@ class TestSeeds:
 
     def test_mixed_sensors_are_drawn_by_name_and_seed(self) -> None:
         settings = replace(SETTINGS, sensor="mixed")
-        drawn = [home_sensor(f"home {number}", settings) for number in range(60)]
-        assert drawn == [home_sensor(f"home {number}", settings) for number in range(60)]
+        drawn = [home_sensor(f"home {number}", settings) for number in range(40)]
+        assert drawn == [home_sensor(f"home {number}", settings) for number in range(40)]
         assert drawn[0] != home_sensor("home 0", replace(settings, seed=1))
         around = np.mean([sensor.field_of_view_deg == 360.0 for sensor in drawn])
         assert 0.5 < around < 0.85
@@ -199,13 +197,7 @@ class TestSeeds:
         other = home_links(moved, "two rooms", SETTINGS)
         np.testing.assert_allclose(other.context.rx_m, table.context.rx_m, atol=1e-9)
         np.testing.assert_array_equal(other.link_state, table.link_state)
-        np.testing.assert_array_equal(other.context.rx_seen, table.context.rx_seen)
-        for margin_m, cells in ((0.0, 0), (0.25, 3), (3.0, 30)):
-            area = map_area(home, margin_m)
-            assert area.shape == (42 + 2 * cells, 62 + 2 * cells)
-            rows, columns = np.indices(area.shape)
-            centres = np.stack([columns, rows], axis=-1) * 0.1 + 0.05 + area.origin_m
-            np.testing.assert_array_equal(home.state_at(centres), area.state)
+        assert map_area(home, 0.25).shape == (42 + 2 * 3, 62 + 2 * 3)
 
 
 class TestRefused:
@@ -220,12 +212,6 @@ class TestRefused:
     def test_homes(self, cells: list[list[int]], message: str) -> None:
         with pytest.raises(MapError, match=f"home 'ruin' {message}"):
             home_links(PartialMap(cells, 0.1), "ruin", SETTINGS)
-        with pytest.raises(MapError, match="home is of type list: give a PartialMap"):
-            home_links(cells, "ruin", SETTINGS)  # type: ignore[arg-type]
-
-    def test_height_above_the_ceiling(self, home: PartialMap) -> None:
-        with pytest.raises(PositionError, match="is not between floor and ceiling"):
-            home_links(home, "two rooms", replace(SETTINGS, rx_height_m=9.0))
 
     def test_home_that_is_cut_off_at_the_border_of_its_grid_is_closed_there(
         self, home: PartialMap, caplog: pytest.LogCaptureFixture
@@ -234,18 +220,6 @@ class TestRefused:
         table = home_links(replace(home, state=home.state[:, :column]), "cut", replace(SETTINGS, stages=(0,)))
         assert len(table) > 0
         assert "home 'cut' has free cells at the border of its grid" in caplog.text
-
-    def test_tables(self) -> None:
-        table = make_table(homes=1, links=3)
-        for change, message in (
-            ({"features": replace(table.features, context=None)}, "features has no context: give the LinkFeatures of"),
-            ({"gain_db": np.where(np.arange(len(table)) == 1, np.nan, table.gain_db)}, r"gain_db\[1\] = nan"),
-            ({"link_state": np.full(len(table), 7, dtype=np.uint8)}, r"link_state\[0\] = 7"),
-        ):
-            with pytest.raises(PredictorError, match=message):
-                replace(table, **change)
-        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
-            LinkTable.concatenate([])
 
 
 @pytest.fixture
@@ -271,18 +245,14 @@ def test_seeds() -> None:
         assert source.load() == make_home(*np.atleast_1d(np.array(home, dtype=object)))
 
 
-def test_folder_of_maps(maps: Path) -> None:
+def test_folder_of_maps(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {source.name: source.origin for source in home_sources([maps])}
     expected = {"house": "house/map.yaml", "one": "one.yaml", "scene": "scene/scene.xml", "two": "two.npz"}
     assert found == {name: str(maps / file) for name, file in expected.items()}
-
-
-def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = HomeSource("house", str(maps / "house" / "map.yaml"))
+    source = HomeSource("house", found["house"])
     monkeypatch.chdir(maps)
     assert home_sources(["house"]) == home_sources([maps / "house" / "map.yaml"]) == [source]
-    assert source.record == {"name": "house", "path": str(maps / "house" / "map.yaml")}
-    assert home_sources(["picture.png"])[0].name == "picture"
+    assert source.record == {"name": "house", "path": found["house"]}
 
 
 @pytest.mark.parametrize(
@@ -293,11 +263,8 @@ def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPat
         ([(3, "castle")], "kind = 'castle' is not allowed"),
         (["empty"], r"empty' holds no map: give a folder with maps \(\.yaml, \.yml, \.npz\), or with"),
         (["nowhere"], "nowhere' is not there: give complete maps"),
-        *(
-            (twice, r"two homes are called '.*', .* and .*: leave one out, or rename")
-            for twice in ([3, 3], ["house", "house/map.yaml"])
-        ),
-        *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5, None)),
+        (["house", "house/map.yaml"], r"two homes are called '.*', .* and .*: leave one out, or rename"),
+        *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5)),
     ],
 )
 def test_refused(maps: Path, monkeypatch: pytest.MonkeyPatch, homes: list[Any], message: str) -> None:

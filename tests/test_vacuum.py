@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -21,8 +20,6 @@ SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "vacuum"
 SIZES = {
     VACUUM: (8.6, 8.05, 0, 11220),
     SHARED / "3irobotix_converted_3790.json": (9.55, 11.25, 7, 20718),
-    SHARED / "3irobotix_viomi_v7_47_cleaned_segment_ids.json": (4.35, 10.2, 2, 4333),
-    SHARED / "dreame_d9_1093_multi_map.json": (6.2, 11.6, 7, 17604),
     SHARED / "roborock_S5_FW2020_with_segments.json": (22.9, 15.95, 8, 44832),
 }
 """Extent along x and y [m], number of rooms, and free pixels (the sum of `pixelCount`, or of half of `pixels`)."""
@@ -61,48 +58,33 @@ def test_unknown_cells_and_layers(tmp_path: Path) -> None:
     assert "unknown: 1 (no floor, segment or wall)" in str(partial.import_report)
 
 
-def test_names_of_rooms(tmp_path: Path) -> None:
-    content = valetudo_map("kkbb")
-    content["layers"][0]["metaData"] = {"segmentId": "7"}
-    content["layers"][1]["metaData"]["name"] = "k\x1b[2Jitchen\n2"
-    assert sp.load_map(write_json(tmp_path / "home.json", content)).room_names == ("room 7", "k\\x1b[2Jitchen 2")
-
-
 @pytest.mark.parametrize("path", SIZES, ids=lambda path: path.stem)
 def test_maps_of_real_homes(path: Path) -> None:
     if not path.is_file():
         pytest.skip("needs the maps of the shared folder")
     partial = sp.load_map(path)
     x_m, y_m, rooms, free = SIZES[path]
-    report = partial.import_report
-    assert report is not None
-    assert (report.extent_m, len(partial.room_names)) == (pytest.approx((x_m, y_m)), rooms)
+    assert partial.import_report is not None
+    assert (partial.import_report.extent_m, len(partial.room_names)) == (pytest.approx((x_m, y_m)), rooms)
     assert (partial.state == CellState.FREE).sum() == free
 
 
-def spoilt(**changes: Any) -> dict[str, Any]:
-    return valetudo_map() | changes
-
-
 def with_layer(**changes: Any) -> dict[str, Any]:
-    return spoilt(layers=[*valetudo_map()["layers"], {"type": "floor", **changes}])
+    return valetudo_map() | {"layers": [*valetudo_map()["layers"], {"type": "floor", **changes}]}
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ([1], "path = '*' holds no ValetudoMap: give a map in the JSON of Valetudo"),
-        ({"map": None}, "path = '*' holds no ValetudoMap"),
-        (spoilt(pixelSize=0), "pixelSize = 0 is not allowed: give a length in centimetres."),
-        (spoilt(size=None), "size.y = None is not allowed: give a length in centimetres."),
-        (spoilt(layers=None), "layers = None is not allowed: give a map in the JSON of Valetudo"),
-        (spoilt(layers=[]), "layers has no pixels of a floor or a segment (none): let the robot map a room first."),
-        (spoilt(layers=[7]), "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo writes."),
-        (spoilt(entities=3), "entities = 3 is not allowed"),
+        (valetudo_map() | {"pixelSize": 0}, "pixelSize = 0 is not allowed: give a length in centimetres."),
+        (valetudo_map() | {"size": None}, "size.y = None is not allowed: give a length in centimetres."),
+        (valetudo_map() | {"layers": None}, "layers = None is not allowed: give a map in the JSON of Valetudo"),
+        (valetudo_map() | {"layers": []}, "layers has no pixels of a floor or a segment (none): let the robot map"),
+        (valetudo_map() | {"layers": [7]}, "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo"),
         (with_layer(pixels=[1, 2, 3]), "layers[4].pixels has shape (3,): give whole numbers from 0 to"),
         (with_layer(pixels=[-1, 2]), "layers[4].pixels has values from -1 to 2: give whole numbers from 0 to"),
         (with_layer(pixels=[1.5, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
-        (with_layer(pixels=[10**30, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
         (with_layer(pixels=[10**7, 10**7]), "layers span 9999991 x 9999981 pixels, more than 100,000,000"),
         (with_layer(compressedPixels=[1, 1, 0]), "layers[4].compressedPixels has lengths of 0 to 0: give rows of"),
     ],
@@ -112,7 +94,7 @@ def test_what_is_no_map(tmp_path: Path, content: object, message: str) -> None:
         sp.load_map(write_json(tmp_path / "home.json", content))
 
 
-@pytest.mark.parametrize("content", [b'{"a": ', b"", b"[" * 100_000, b"\xff\xfe", b"1" * 5000])
+@pytest.mark.parametrize("content", [b'{"a": ', b"[" * 100_000, b"\xff\xfe"])
 def test_what_is_no_json(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "home.json"
     path.write_bytes(content)
@@ -135,8 +117,6 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert (len(other), other.tx[0].tolist()) == (8, [6.0, 9.0, 1.0])
     with pytest.raises(MeasurementError, match=r"access_point = 'home' names 2 access points of .*: give the BSSID"):
         sp.load_measurements(path, access_point="home")
-    with pytest.raises(MeasurementError, match=r"access_point = 'shop' names 0 access points"):
-        sp.load_measurements(path, access_point="shop")
     with pytest.raises(MeasurementError, match=r"columns = .* is for a CSV and not a recording"):
         sp.load_measurements(path, columns={"rx_x": "x"})
     (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
@@ -157,21 +137,15 @@ def test_coverage_of_rooms(tmp_path: Path) -> None:
     assert bedroom[0] < bedroom[1]
     sp.save_coverage(coverage, tmp_path / "coverage.nc")
     xr.testing.assert_identical(sp.load_coverage(tmp_path / "coverage.nc"), coverage)
-    states = coverage["link_state"].isel(tx=0)
-    assert states.isnull().any()
-    assert states.plot().get_clim()[1] <= sp.LinkState.NLOS
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"measurements": []}, "has no measurements: let the robot drive while Valeronoi records."),
-        ({"measurements": None}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 9, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx[0, 0] = nan is not allowed"),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": ["-5"]}]}, "gain_db[0] = nan is not allowed"),
-        ({"map": {}}, "holds no ValetudoMap"),
     ],
 )
 def test_what_is_no_recording(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
