@@ -109,7 +109,6 @@ def test_where_the_robot_stands_is_free_whatever_was_seen():
 
 
 def fused(fusion, hits, passes):
-    """State of a cell in which so many rays of each picture ended, and that so many crossed."""
     all_hits, all_passes = np.zeros((2, 1, 1), dtype=np.int32)
     seen = np.full((1, 1), CellState.UNKNOWN, dtype=np.uint8)
     for hit, passed in zip(hits, passes, strict=True):
@@ -167,7 +166,6 @@ def test_grazed_walls_and_lost_rays_return_nothing():
 
 
 def test_errors_of_the_heading_turn_the_map():
-    """A wall across the view, 20 cells ahead, is mapped some cells beside its row."""
     truth = surrounded(np.zeros((60, 60), dtype=np.uint8))
     truth[29:32, 45] = WALL
     eye = camera(truth, SensorSettings(heading_noise_deg=20.0, field_of_view_deg=60.0, fusion="gmapping"), seed=2)

@@ -212,8 +212,6 @@ class TestTrajectory:
 
 
 class TestSensor:
-    """What is mapped with errors; the home is an apartment, seen for 60 steps."""
-
     def test_what_is_known_stays_known(self, home):
         first, later = explore_trajectory(home, (30, 60), 3, sensor=NOISY).states
         assert not ((first != CellState.UNKNOWN) & (later == CellState.UNKNOWN)).any()

@@ -51,7 +51,6 @@ def test_geotiff_has_the_values_of_the_dataset_and_their_units_and_settings(cove
 
 
 def table_values(coverage, name):
-    """Values of a variable in a table; link states are missing where no receiver stands."""
     values = coverage[name].to_numpy().astype(np.float64)
     return np.where(coverage["valid"], values, np.nan) if name.endswith("link_state") else values
 

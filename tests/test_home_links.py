@@ -46,7 +46,6 @@ def table(home: PartialMap) -> LinkTable:
 
 class TestPlaces:
     def test_counts(self, home: PartialMap, table: LinkTable) -> None:
-        """Every stage has the same links and truth; receivers outside are in outage."""
         assert len(table) == 2 * 31 * 3
         assert set(table.home) == {"two rooms"}
         assert table.take(slice(3)).complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
@@ -163,7 +162,6 @@ class TestSeeds:
         assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
 
     def test_sensor_is_that_of_the_settings(self, home: PartialMap, table: LinkTable) -> None:
-        """Positions are not where errors put walls."""
         far = replace(SETTINGS, sensor=SensorSettings(field_of_view_deg=360.0, range_m=20.0))
         seen = home_links(home, "two rooms", far).observed_fraction
         assert (seen >= table.observed_fraction).all()
@@ -224,7 +222,6 @@ class TestRefused:
 
 @pytest.fixture
 def maps(tmp_path: Path) -> Path:
-    """Two maps in a folder, a map in a folder of its own, an exported scene, and other files."""
     (tmp_path / "house").mkdir()
     (tmp_path / "scene").mkdir()
     (tmp_path / "empty").mkdir()

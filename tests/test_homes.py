@@ -23,7 +23,6 @@ SCENES = Path(__file__).resolve().parents[1] / "scenes"
 
 @cache
 def made(seed: int, kind: str | None = "apartment") -> PartialMap:
-    """Return a home in cells of 0.1 m: most tests look at the same few homes."""
     return make_home(seed, kind, resolution_m=0.1)
 
 
@@ -46,7 +45,6 @@ def test_every_home_is_complete_and_tight(seed, kind):
 
 
 def parts_of(home: PartialMap) -> list[np.ndarray]:
-    """Connected parts of the free cells, the largest first: a robot starts there."""
     labels, count = ndimage.label(home.state == CellState.FREE)
     return sorted((labels == number for number in range(1, count + 1)), key=np.sum, reverse=True)
 
@@ -115,7 +113,6 @@ def test_large_kinds_are_as_large_as_buildings_and_no_larger(kind):
 
 
 def test_floors_have_corridors_and_rooms_and_halls_have_few():
-    """A body wider than any door finds many rooms on a floor; a hall is one, or a few."""
     rooms = {kind: np.median([rooms_of(made(seed, kind), 1.0) for seed in range(4)]) for kind in LARGE}
     assert rooms["floor"] > 15
     assert rooms["floor"] > 3 * max(rooms["hall"], rooms["warehouse"])
@@ -124,7 +121,6 @@ def test_floors_have_corridors_and_rooms_and_halls_have_few():
 
 
 def test_doors_of_some_floors_are_closed_and_those_of_none_without_locked_rooms():
-    """Of twelve floors some are one connected part, and some are many parts, each enclosed by walls."""
     floors = [made(seed, "floor") for seed in range(12)]
     parts = [ndimage.label(floor.state == CellState.FREE)[1] for floor in floors]
     assert sum(count < 6 for count in parts) >= 3

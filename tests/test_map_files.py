@@ -2,7 +2,6 @@
 
 import io
 import re
-import sysconfig
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -87,12 +86,6 @@ def link_to_the_outside(folder: Path) -> None:
     (folder / "map.pgm").symlink_to(folder.parent / "outside.pgm")
 
 
-def two_scenes(folder: Path) -> None:
-    for name in ("a.xml", "b.xml"):
-        (folder / name).write_text("<scene/>")
-    (folder / "scene.xml").unlink()
-
-
 @pytest.mark.parametrize(
     ("spoil", "name", "message"),
     [
@@ -102,7 +95,6 @@ def two_scenes(folder: Path) -> None:
         ),
         (link_to_the_outside, "", rf"image = 'map\.pgm' {OUTSIDE}"),
         (lambda folder: (folder / "scene.xml").unlink(), "", "is no scene: it has 0 .xml files; give the path of one"),
-        (two_scenes, "", r"is no scene: it has 2 .xml files; give the path of one, or a ROS map YAML"),
         (lambda folder: (folder / "map.yaml").unlink(), "", "scene.xml' holds no shape: give a Mitsuba scene with"),
         *(
             (lambda folder: None, f"sub/{name}", NOT_THERE)
@@ -124,13 +116,6 @@ def test_refused(tmp_path: Path, spoil: Callable[[Path], object], name: str, mes
         load_map(f"{tmp_path}/scene/{name}")
 
 
-def test_arguments_of_another_type(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
-        load_map(SMALL)  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
-        load_map(tmp_path, strict=1)  # type: ignore[arg-type]
-
-
 @pytest.fixture
 def room_file(tmp_path: Path) -> Path:
     path = tmp_path / "room.ply"
@@ -150,15 +135,6 @@ def test_mesh_file(room_file: Path) -> None:
     assert surface_m2(part.mesh) < surface_m2(partial.mesh)
     assert load_map(room_file, observed=part, resolution_m=0.1, height_band_m=(0.2, 2.9)) == part
     assert load_map(room_file, up="y").height_range_m == (0.0, 4.0)
-
-
-def test_scene_of_sionna() -> None:
-    folder = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes" / "simple_street_canyon"
-    partial = load_map(folder, resolution_m=1.0)
-    assert partial == load_map(folder / "simple_street_canyon.xml", resolution_m=1.0)
-    assert partial.mesh is not None
-    assert len(partial.mesh.materials) == 5
-    assert 0 < (partial.state == WALL).sum() < (partial.state == FREE).sum()
 
 
 def test_mesh_in_npz(tmp_path: Path, room_file: Path) -> None:
@@ -187,6 +163,8 @@ def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     folder = export(tmp_path / "scene")
     with pytest.raises(MapError, match=r"resolution_m is for scans, .* alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
+    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
+        load_map(folder, strict=1)  # type: ignore[arg-type]
     with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its"):
         load_map(folder, up="z")
 
@@ -314,7 +292,6 @@ def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, 
 
 @pytest.mark.parametrize("folder", ["gibson", None])
 def test_maps_of_robots_come_back(tmp_path: Path, folder: str | None) -> None:
-    """The cluttered house of this repository, and real maps where they are."""
     sheets = sorted((SHARED / folder).rglob("*.yaml"))[::5] if folder else [HOUSE]
     if not sheets:
         pytest.skip("the real maps are not here")

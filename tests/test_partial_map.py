@@ -54,7 +54,6 @@ def test_every_cell_centre_has_its_index_and_state(state: np.ndarray, resolution
 
 @given(st.integers(-50, 50), st.sampled_from([0.05, 0.1, 0.03, 1 / 3]), st.sampled_from([0.0, -24.0, 7.7]))
 def test_cell_edges_belong_to_the_cell_that_they_begin(cell: int, resolution_m: float, origin: float) -> None:
-    """Rounding of multiples of the resolution does not move an edge to the cell before."""
     partial = PartialMap(np.zeros((2, 2)).astype(int), resolution_m, (origin, origin))
     edge = origin + cell * resolution_m
     assert [int(index) for index in partial.cell_index(np.array([edge, edge]))] == [cell, cell]

@@ -47,7 +47,6 @@ def test_walls_by_threshold(tmp_path: Path, name: str, shades: tuple[int, int]) 
 
 
 def test_other_pictures(tmp_path: Path) -> None:
-    """Transparency is white, shades may have 16 bits, and walls may be drawn by their faces."""
     clear = np.zeros((*plan().shape, 4), np.uint8)
     clear[..., 3] = np.where(plan() < 100, 255, 0)
     expected = sp.load_map(write(tmp_path / "plan.png", plan()), resolution_m=PIXEL_M)

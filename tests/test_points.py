@@ -22,7 +22,6 @@ INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)
 
 
 def shell(low: tuple[float, float, float], high: tuple[float, float, float], rng: np.random.Generator) -> NDArray:
-    """Points on the six faces of a box, about 1,000 per square metre."""
     low_m, size = np.array(low), np.subtract(high, low)
     faces = []
     for axis in range(3):
@@ -48,7 +47,6 @@ ROOM = room()
 
 
 def write(path: Path, points: NDArray) -> Path:
-    """Write a cloud with the library of its format."""
     kind = path.suffix
     if kind in (".las", ".laz"):
         header = laspy.LasHeader(point_format=3, version="1.2")
@@ -142,7 +140,6 @@ def test_two_storeys() -> None:
 
 
 def test_walls_alone() -> None:
-    """Without floor and ceiling, only what sensors see across is free."""
     walls = ROOM[(ROOM[:, 2] > 0.3) & (ROOM[:, 2] < 2.3)]
     walls = walls[(np.abs(walls[:, :2] - (1.4, 1.3)) > 0.6).any(axis=1)]
     assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
