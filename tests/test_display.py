@@ -128,10 +128,6 @@ def test_a_bar_in_a_terminal(progress: bool | None) -> None:
         report(0.5, "half [of it]")
     assert "100%|" in terminal.getvalue()
     assert "half [of it]" in terminal.getvalue()
-
-
-@pytest.mark.usefixtures("at_once")
-def test_things_are_counted() -> None:
     with redirect_stderr(Terminal()) as terminal, counting(None, "homes") as count:
         count(2, 4, "starting")
         count(4, 4, "the end")

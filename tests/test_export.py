@@ -15,8 +15,6 @@ from sionna_partial.coverage.network import network_map
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.plots.coverage_plot import plot_coverage
-from sionna_partial.plots.style import figure_png
 
 SUFFIXES = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
@@ -65,13 +63,6 @@ def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
         np.testing.assert_allclose(table[name], table_values(coverage, name).ravel(), rtol=1e-6, err_msg=name)
     save_coverage(coverage.assign_coords(x=coverage["x"] + 500_000.0), tmp_path / "coverage.csv")
     assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
-
-
-def test_png_is_the_picture(several, tmp_path):
-    save_coverage(several, tmp_path / "coverage.png")
-    with Image.open(tmp_path / "coverage.png") as image:
-        assert image.width >= 1200
-    assert (tmp_path / "coverage.png").read_bytes() == figure_png(plot_coverage(several))
 
 
 def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):

@@ -70,10 +70,8 @@ class TestFiles:
         partial = low().with_wall_material("brick", low().state == CellState.WALL)
         (sp.export_scene if name == "scene" else sp.save_map)(partial, tmp_path / name)
         assert sp.load_map(tmp_path / name) == partial
-
-    def test_an_argument_of_load_map(self, tmp_path: Path) -> None:
-        sp.save_map(hall(), tmp_path / "map.yaml")
-        assert sp.load_map(tmp_path / "map.yaml", obstacle_height_m=0.75) == hall().with_obstacle_height(0.75)
+        sp.save_map(hall(), tmp_path / "hall.yaml")
+        assert sp.load_map(tmp_path / "hall.yaml", obstacle_height_m=0.75) == hall().with_obstacle_height(0.75)
 
     @pytest.mark.parametrize(
         ("value", "message"),

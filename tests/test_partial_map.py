@@ -37,7 +37,7 @@ def test_equality() -> None:
     changes = {"state": np.full((3, 4), 1), "resolution_m": 0.25, "origin_m": (10.0, -4.5), "wall_height_m": 2.4}
     for name, value in {**changes, "interior_cells": 2, "material": Material(), "mesh": mesh}.items():
         assert replace(PLAN, **{name: value}) != PLAN  # type: ignore[arg-type]
-    assert replace(PLAN) == PLAN != "a text"
+    assert replace(PLAN) == PLAN
     assert replace(PLAN, mesh=replace(mesh)) == replace(PLAN, mesh=mesh) != replace(PLAN, mesh=other)
 
 
@@ -70,9 +70,7 @@ def test_outside_is_unknown() -> None:
     [
         ([[1, 1], [1, 1]], WALL),
         ([[1, 1], [1, 2]], UNKNOWN),
-        ([[1, 2], [1, 1]], UNKNOWN),
         ([[1, 2], [0, 1]], FREE),
-        ([[0, 2], [1, 1]], FREE),
         ([[2, 1], [1, 0]], FREE),
     ],
 )
@@ -117,14 +115,6 @@ def test_wrong_map(arguments: dict[str, object], message: str) -> None:
         PartialMap(**{"state": [[0]], "resolution_m": 0.1, **arguments})  # type: ignore[arg-type]
 
 
-def test_positions_may_be_free_or_unknown() -> None:
-    points = [[10.75, -3.25, 1.5], [11.75, -3.25, 0.01], [11.25, -3.25, 2.49]]
-    found = PLAN.require_positions("rx", points)
-    assert found.tolist() == points
-    assert PLAN.require_positions("tx", (10.75, -3.25, 1)).tolist() == [10.75, -3.25, 1.0]
-    assert PLAN.require_positions("rx", np.zeros((0, 3)), least=0).shape == (0, 3)
-
-
 @pytest.mark.parametrize(
     ("points", "message"),
     [
@@ -166,7 +156,6 @@ def test_turned_arrays(turn: Callable[[np.ndarray], np.ndarray], hint: str) -> N
     state = np.full((4, 9), WALL)
     state[1, 1:8] = state[2, 1] = FREE
     rx = [(x + 0.5, y, 1.5) for x, y in ((1, 1.5), (4, 1.5), (7, 1.5), (1, 2.5))]
-    assert len(PartialMap(state, 1.0).require_positions("rx", rx)) == 4
     with pytest.raises(PositionError, match=re.escape(f"All 4 are free {hint}")):
         PartialMap(turn(state), 1.0).require_positions("rx", rx)
 

@@ -133,15 +133,13 @@ def table(outcomes: Sequence[Outcome]) -> str:
     counts = {family: Counter[str]() for family in FAMILIES}
     for outcome in outcomes:
         counts[outcome.case.family][outcome.ending] += 1
+    counts["all"] = sum(counts.values(), Counter[str]())
     rows = [
-        f"| {family} | {sum(counts[family].values())} | "
-        + " | ".join(str(counts[family][end]) for end in ENDINGS)
-        + " |"
-        for family in FAMILIES
+        " | ".join(map(str, [family, found.total(), *(found[end] for end in ENDINGS)]))
+        for family, found in counts.items()
     ]
-    total = sum(counts.values(), Counter[str]())
-    rows.append(f"| all | {sum(total.values())} | " + " | ".join(str(total[end]) for end in ENDINGS) + " |")
-    return "\n".join([f"| inputs | cases | {' | '.join(ENDINGS)} |", "|---" * (len(ENDINGS) + 2) + "|", *rows])
+    heads = " | ".join(["inputs", "cases", *ENDINGS])
+    return "\n".join([f"| {heads} |", "|---" * (len(ENDINGS) + 2) + "|", *(f"| {row} |" for row in rows)])
 
 
 def main() -> None:

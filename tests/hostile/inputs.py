@@ -294,15 +294,10 @@ def _drawing(folder: Path) -> Path:
 
 def _bag(name: str, folder: Path) -> Path:
     sys.path.insert(0, str(Path(HERE).parent))
-    from rosbag_files import START_S, messages_of, write_bag
+    from rosbag_files import write_drive
 
     name = {".bag": "drive.bag", ".mcap": "drive_mcap", ".db3": "drive_sqlite3"}[Path(name).suffix]
-    make = messages_of(name)
-    rows: list[tuple[str, float, Any]] = [("/map", 0.0, make.grid([[0, 100, -1]] * 4))]
-    for time_s in (0.0, 1.0, 2.0):
-        rows.append(("/pose", time_s, make.pose_stamped(START_S + time_s, time_s, 1.0, 0.0)))
-        rows.append(("/rssi", time_s, make.power(-60.0)))
-    bag = write_bag(folder / name, rows)
+    bag = write_drive(folder / name)
     return bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
 
 

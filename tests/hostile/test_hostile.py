@@ -7,7 +7,8 @@ from attack import attack
 from cases import cases_of
 from inputs import valid
 
-import sionna_partial as sp
+from sionna_partial.errors import MapError
+from sionna_partial.maps.map_files import load_map
 
 EVERY = {"settings": 80, "files": 62}
 """One case out of so many is run here."""
@@ -35,5 +36,5 @@ def test_cut_files_are_refused(kind: str, tmp_path: Path) -> None:
     content = path.read_bytes()
     for size in range(0, len(content) - 100, len(content) // 12):
         path.write_bytes(content[:size])
-        with pytest.raises(sp.MapError, match=r"is damaged or no|has 0 Occ|has no map|holds no finite point"):
-            sp.load_map(path)
+        with pytest.raises(MapError, match=r"is damaged or no|has 0 Occ|has no map|holds no finite point"):
+            load_map(path)
