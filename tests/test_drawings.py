@@ -13,7 +13,6 @@ import pytest
 import shapely
 from ezdxf.document import Drawing
 
-import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps import drawing_lines
@@ -66,10 +65,19 @@ def require_rooms(partial: PartialMap) -> None:
     assert (partial.state == FREE).sum() * partial.resolution_m**2 == pytest.approx(7.6 * 4.8, rel=0.05)
 
 
-@pytest.mark.parametrize(("units", "unit_m", "fmt"), [(1, 0.0254, "asc"), (2, 0.3048, "bin")])
-def test_rooms(tmp_path: Path, units: int, unit_m: float, fmt: Any) -> None:
-    drawing(units, unit_m).saveas(tmp_path / "plan.dxf", fmt=fmt)
-    partial = load_map(tmp_path / "plan.dxf")
+@pytest.mark.parametrize(
+    ("header", "unit_m", "fmt"),
+    [
+        *((0, 0.001, "asc"), (0, 0.01, "asc"), (4, 0.001, "asc"), (4, 1.0, "bin"), (6, 0.01, "asc")),
+        *((1, 0.0254, "asc"), (2, 0.3048, "bin")),
+    ],
+)
+def test_rooms_in_any_unit(tmp_path: Path, header: int, unit_m: float, fmt: Any) -> None:
+    drawing(header, unit_m).saveas(tmp_path / "plan.dxf", fmt=fmt)
+    is_right = {1: 0.0254, 2: 0.3048, 4: 0.001}.get(header) == unit_m
+    message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
+    with nullcontext() if is_right else pytest.warns(MapWarning, match=message):
+        partial = load_map(tmp_path / "plan.dxf")
     require_rooms(partial)
     assert (partial.resolution_m, partial.wall_height_m) == (0.05, 3.0)
 
@@ -109,58 +117,30 @@ def test_wrong_units(name: str, unit_m: float, message: str | None) -> None:
     assert given == replace(report, unit_source="unit_m")
 
 
-@pytest.mark.parametrize("header", [0, 4, 6])
-@pytest.mark.parametrize("unit_m", [0.001, 0.01, 1.0])
-def test_units_of_a_plan(tmp_path: Path, header: int, unit_m: float) -> None:
-    drawing(header, unit_m).saveas(tmp_path / "plan.dxf")
-    is_right = {4: 0.001, 6: 1.0}.get(header) == unit_m
-    message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
-    with nullcontext() if is_right else pytest.warns(MapWarning, match=message):
-        require_rooms(load_map(tmp_path / "plan.dxf"))
-
-
-@pytest.mark.parametrize(("unit_m", "used_m"), [(0.01, 0.001), (1.0, 1.0)])
-def test_a_doubtful_unit_is_named(tmp_path: Path, unit_m: float, used_m: float) -> None:
-    doc = ezdxf.new(units=4 if used_m < 1 else 6)
-    scale = 1 / unit_m
-    for x in range(0, 40, 4):
-        for y, end in ((0, 2.4), (3.3, 8), (8.9, 16)):
-            doc.modelspace().add_line((x * scale, y * scale), (x * scale, end * scale), dxfattribs={"layer": "WALL"})
-    square = np.array([(0, 0), (36, 0), (36, 16), (0, 16)]) * scale
-    doc.modelspace().add_lwpolyline(square.tolist(), close=True, dxfattribs={"layer": "WALL"})
-    doc.saveas(tmp_path / "plan.dxf")
-    with pytest.warns(MapWarning, match="centimetres") if unit_m < 1 else nullcontext():
-        report = load_map(tmp_path / "plan.dxf").import_report
-    assert report is not None
-    assert report.extent_m == pytest.approx((36, 16), abs=0.06)
-
-
 @pytest.mark.parametrize(
-    ("name", "state", "message"),
+    ("name", "is_used", "message"),
     [
-        ("A-WALL-FULL-N", sp.LinkState.OUTAGE, None),
-        ("A-WALL-FULL-D", sp.LinkState.LOS, None),
-        ("A-WALL-DEMO", sp.LinkState.LOS, None),
-        ("E-LITE-WALL", sp.LinkState.LOS, None),
-        ("A-WALL-PRHT", sp.LinkState.OUTAGE, "has walls of partial height on .* give layer_heights_m to map_from_draw"),
+        ("A-WALL-FULL-N", True, None),
+        ("A-WALL-FULL-D", False, None),
+        ("A-WALL-DEMO", False, None),
+        ("E-LITE-WALL", False, None),
+        ("A-WALL-PRHT", True, "has walls of partial height on .* give layer_heights_m to map_from_draw"),
     ],
 )
-def test_layers_by_the_standard(name: str, state: sp.LinkState, message: str | None) -> None:
-    path = REPORTS / "dxf_layers" / f"{name}.dxf"
+def test_layers_by_the_standard(name: str, is_used: bool, message: str | None) -> None:
     with pytest.warns(MapWarning, match=message) if message else nullcontext():
-        partial = load_map(path)
+        partial = load_map(REPORTS / "dxf_layers" / f"{name}.dxf")
     assert partial.import_report is not None
     used = {row.name for row in partial.import_report.used}
-    assert (name in used) == (state == sp.LinkState.OUTAGE)
+    assert (name in used) == is_used
     assert used | {row.name for row in partial.import_report.skipped} == {"A-WALL-FULL-E", name}
-    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [state]
+    assert states(partial, (6.02, 4)) == [WALL if is_used else FREE]
 
 
 def test_heights_of_layers() -> None:
     path = REPORTS / "dxf_layers" / "A-WALL-PRHT.dxf"
     partial = map_from_drawing(path, layer_heights_m={"*-prht": 1.1})
     assert partial.obstacle_heights_m == (1.1,)
-    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [sp.LinkState.LOS]
     points_m = np.array([[6.02, 4, 1.0], [6.02, 4, 1.2], [0.02, 4, 1.2]])
     assert partial.is_wall_at(points_m).tolist() == [True, False, True]
     with pytest.raises(MapError, match=r"layer_heights_m\['\*'\] = -1 is not allowed: give a height"):

@@ -282,6 +282,7 @@ def test_full_temporary_folder_is_named() -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file of Python itself
 def test_file_size_limit_leaves_whole_files(tmp_path: Path) -> None:
     """HDF5 must not see a failed write: it crashes then."""
     partial = sp.PartialMap(np.pad(np.zeros((20, 20), np.uint8), 1, constant_values=1), 0.1)

@@ -49,20 +49,19 @@ def tilted(angle_deg: float, thickness: float, phase: float = 0.0, gap: tuple[fl
     return PartialMap(np.where(wall, CellState.WALL, CellState.FREE).astype(np.uint8), 0.05)
 
 
-def ragged_room(seed: int, thickness: int, fraction: float) -> PartialMap:
-    """Two rooms joined by a door of 20 cells, with ragged walls, a few specks, and unknown around."""
+def noisy_plan(thickness: int, fraction: float, around: float, scale: int = 1, seed: int = 0) -> PartialMap:
+    """A hall with three stubs; `fraction` of its face cells are lost, `around` of the cells beside are walls."""
     rng = np.random.default_rng(seed)
-    wall = np.zeros((140, 140), dtype=bool)
-    wall[20:120, 20:120] = True
-    inside = np.zeros_like(wall)
-    inside[20 + thickness : 120 - thickness, 20 + thickness : 120 - thickness] = True
-    wall &= ~inside
-    wall[20:120, 70 : 70 + thickness] = True
-    wall[60:80, 70 : 70 + thickness] = False
-    bumps = ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < fraction)
-    specks = inside & (rng.random(wall.shape) < 0.001)
-    state = np.where(inside, CellState.FREE, CellState.UNKNOWN)
-    return PartialMap(np.where(wall | bumps | specks, CellState.WALL, state).astype(np.uint8), 0.05)
+    ny, nx, y0, y1, x0, x1 = np.array([360, 560, 180, 240, 100, 280]) // scale
+    wall = np.zeros((ny, nx), dtype=bool)
+    wall[:, :thickness] = wall[:, -thickness:] = wall[:thickness] = wall[-thickness:] = True
+    wall[:y0, x1 : x1 + thickness] = wall[y1:, x1 : x1 + thickness] = wall[y0 : y0 + thickness, :x0] = True
+    wall = np.pad(wall, 20)
+    lost = wall & ~ndimage.binary_erosion(wall) & (rng.random(wall.shape) < fraction)
+    more = ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < around)
+    state = np.pad(np.full((ny, nx), CellState.FREE), 20, constant_values=CellState.UNKNOWN)
+    state[wall] = CellState.FREE
+    return PartialMap(np.where((wall & ~lost) | more, CellState.WALL, state).astype(np.uint8), 0.05)
 
 
 def farthest_from_walls(partial: PartialMap, outlines: Outlines) -> float:
@@ -265,20 +264,6 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
         assert distances_from_outlines(partial, outlines).max() < 0.8
 
 
-def noisy_plan(thickness: int, fraction: float, around: float) -> PartialMap:
-    """A hall with three stubs; `fraction` of its face cells are lost, `around` of the cells beside are walls."""
-    rng = np.random.default_rng(0)
-    wall = np.zeros((360, 560), dtype=bool)
-    wall[:, :thickness] = wall[:, -thickness:] = wall[:thickness] = wall[-thickness:] = True
-    wall[:180, 280 : 280 + thickness] = wall[240:, 280 : 280 + thickness] = wall[180 : 180 + thickness, :100] = True
-    wall = np.pad(wall, 20)
-    lost = wall & ~ndimage.binary_erosion(wall) & (rng.random(wall.shape) < fraction)
-    more = ndimage.binary_dilation(wall) & ~wall & (rng.random(wall.shape) < around)
-    state = np.pad(np.full((360, 560), CellState.FREE), 20, constant_values=CellState.UNKNOWN)
-    state[wall] = CellState.FREE
-    return PartialMap(np.where((wall & ~lost) | more, CellState.WALL, state).astype(np.uint8), 0.05)
-
-
 @pytest.mark.parametrize(
     ("thickness", "fraction", "around", "most"),
     [(1, 0.0, 0.3, 20), (4, 0.05, 0.05, 24), (4, 0.15, 0.15, 110)],
@@ -329,8 +314,9 @@ def random_state(seed: int, kind: str) -> NDArray[np.uint8]:
     if kind == "cells":
         walls = rng.uniform(0.05, 0.7)
         return rng.choice(3, rng.integers(1, 22, 2), p=[0.6 * (1 - walls), walls, 0.4 * (1 - walls)]).astype(np.uint8)
-    state = ragged_room(seed, int(rng.integers(1, 5)), float(rng.choice([0.0, 0.1, 0.3]))).state.copy()
-    hidden = ndimage.zoom(rng.random((18, 18)), 8, order=1)[: state.shape[0], : state.shape[1]] < 0.4
+    lost, more = rng.choice([0.0, 0.1, 0.3], 2)
+    state = noisy_plan(int(rng.integers(1, 5)), lost, more, 4, seed).state.copy()
+    hidden = ndimage.zoom(rng.random((23, 23)), 8, order=1)[: state.shape[0], : state.shape[1]] < 0.4
     state[hidden] = CellState.UNKNOWN
     return state
 
