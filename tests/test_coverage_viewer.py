@@ -1,7 +1,5 @@
 """The HTML page of a coverage map: what is in it, and what a browser without network makes of it."""
 
-import base64
-import gzip
 import html
 import re
 from collections.abc import Callable, Iterator
@@ -33,8 +31,6 @@ FOUND = f"""(() => {{
         best: Array.from(values.data.best_server?.[0] ?? []), title: plot.title.text,
         shown: images.map(each => [each.glyph.image.field, Array.from(each.view.indices ?? [])])}}
 }})()"""
-
-ROUNDING = 1 / 2048
 
 
 @pytest.fixture(scope="module")
@@ -101,24 +97,6 @@ def test_nothing_is_loaded_from_elsewhere(coverage, tmp_path):
     text = (tmp_path / "coverage.html").read_text(encoding="utf-8")
     assert "default-src 'none'" in text
     assert not re.search(r"<(script|link|img|iframe)[^>]*\b(src|href)=", re.sub(r"(?s)<script>.*?</script>", "", text))
-
-
-def test_the_outside_of_a_complete_map_has_no_values(coverage, tmp_path):
-    pages = []
-    for complete in (0, 1):
-        coverage.attrs["map_complete"] = complete
-        save_coverage(coverage, tmp_path / "coverage.html")
-        pages.append(values_of(tmp_path / "coverage.html", coverage))
-    expected = np.where(coverage["observed"], coverage["p_los"], np.nan)
-    np.testing.assert_allclose(pages[0], coverage["p_los"], atol=ROUNDING)
-    np.testing.assert_allclose(pages[1], expected, atol=ROUNDING)
-
-
-def values_of(page: Path, coverage: xr.Dataset) -> np.ndarray:
-    text = page.read_text(encoding="utf-8")
-    (data,) = re.findall(r'\["p_los", \[\{"type": "ndarray", "array": \{"type": "bytes", "data": "([^"]+)"', text)
-    values = np.frombuffer(gzip.decompress(base64.b64decode(data)), dtype=np.float32)
-    return values.reshape(coverage["p_los"].shape)
 
 
 def test_names_are_text(coverage, several, tmp_path):

@@ -194,12 +194,6 @@ class TestTrajectory:
         assert (exploration.maps[-1].state_at(exploration.poses[:, :2]) == CellState.FREE).all()
         assert np.array_equal(exploration.poses, exploration.believed_poses)
 
-    def test_poses_are_in_the_world(self):
-        home = plan(CLOSET)
-        moved = PartialMap(home.state, home.resolution_m, (100.0, -50.0))
-        here, there = (explore_trajectory(each, (20,), 1).poses for each in (home, moved))
-        assert there == pytest.approx(np.add(here, [100.0, -50.0, 0.0]))
-
     def test_some_of_the_moments(self, home, exploration):
         some = exploration.at([30])
         assert (some.steps, some.maps) == ((30,), exploration.maps[1:2])

@@ -36,9 +36,7 @@ def test_rooms_of_a_large_plan() -> None:
     """Plans of many cells are coarsened; corners of rooms and columns are no rooms."""
     free = np.repeat(np.repeat(flat().state == CellState.FREE, 10, axis=0), 10, axis=1)
     free[200:210, 200:210] = False
-    rooms = rooms_of(free, 0.005)
-    assert rooms.number == 3
-    np.testing.assert_allclose(rooms.openings_m, [0.9, 1.2], atol=0.06)
+    assert rooms_of(free, 0.005).number == 3
     assert rooms_of(np.zeros((3, 3), dtype=bool), 0.05).number == 0
 
 

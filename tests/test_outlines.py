@@ -216,20 +216,8 @@ def test_gap_that_no_ray_passed_is_closed_up_to_half_a_metre(cells: int) -> None
 
 
 def test_unobserved_regions_become_no_walls() -> None:
-    partial = drawn(
-        """
-        ##################################
-        ................................??
-        ................................??
-        ........???????.................??
-        .....#????????????..............??
-        ........???????.................??
-        ................................??
-        ................................??
-        ##################################
-        """,
-        resolution_m=0.1,
-    )
+    rows = ["#" * 34, "." * 32 + "??", "." * 8 + "?" * 7 + "." * 17 + "??", "." * 5 + "#" + "?" * 12 + "." * 14 + "??"]
+    partial = drawn("\n".join(rows[index] for index in (0, 1, 1, 2, 3, 2, 1, 1, 0)), resolution_m=0.1)
     outlines = wall_outlines(partial)
     assert len(outlines.segments) == 6
     assert farthest_from_walls(partial, outlines) < 0.8
