@@ -16,6 +16,22 @@ settings.load_profile("repeatable")
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell has started the tests in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
+SLOWEST_FIRST = tuple(
+    f"test_{name}"
+    for name in (
+        *("readme", "app", "llvm", "differentiable", "dataset", "against_stock", "homes", "path_set", "docstrings"),
+        *("predictor_files", "train", "evaluate", "unseen_walls", "calibration", "localisation", "assimilation"),
+        *("antennas", "channels", "export", "link_model", "hostile", "paper_networks", "map_training", "notebook"),
+        *("crossings", "coverage_plot", "cli", "shipped_predictor", "learning_commands", "coverage", "trace", "demo"),
+    )
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slowest files: the last file of a process would leave the other process idle."""
+    order = {name: place for place, name in enumerate(SLOWEST_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
+
 
 @pytest.fixture
 def command_line(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
