@@ -63,8 +63,8 @@ IMPORTS = {
     "mitsuba": "import drjit, mitsuba; mitsuba.set_variant('llvm_ad_mono_polarized')",
     "tensorflow": "import tensorflow",
 }
-ORDERS = ("tensorflow ours sionna mitsuba", "ours mitsuba tensorflow sionna", "mitsuba sionna ours tensorflow")
-"""Ours before Dr.Jit, where TensorFlow may be anywhere, and after it. Dr.Jit between TensorFlow and ours is below."""
+ORDERS = ("tensorflow ours sionna mitsuba", "mitsuba sionna ours tensorflow")
+"""Ours before Dr.Jit, and after it. Dr.Jit between TensorFlow and ours is below."""
 
 STOCK_AND_OURS = """
 import tempfile

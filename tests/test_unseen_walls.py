@@ -102,7 +102,8 @@ def test_damaged_weights(monkeypatch, tmp_path):
         UnseenWalls.shipped.__wrapped__(UnseenWalls)
 
 
-def test_training_repeats_itself(unseen_home, tmp_path):
+def test_training_repeats_itself(unseen_home, tmp_path, monkeypatch):
+    monkeypatch.setattr("sionna_partial.training.walls.IMAGES", 2)
     first, second = (fit_unseen_walls(unseen_home, steps=2) for _ in range(2))
     first.save(tmp_path / "first.npz")
     start = UnseenWalls.untrained().cells.get_weights()[0]
