@@ -51,7 +51,7 @@ site: $(READY)
 	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
 
 pages: $(READY)
-	@$(ONE_THREAD) $(BIN)/python -m pytest -q -m pages tests/test_readme.py
+	@$(ONE_THREAD) $(BIN)/python -m pytest -q -m ci tests/test_readme.py
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
 	@mkdir -p build
@@ -99,7 +99,7 @@ wheel: $(READY) ## Build the source archive, and the wheel from it (dist/)
 	@$(BIN)/python -m build --no-isolation
 
 wheel-check: $(READY) ## Install source archive and wheel in a new environment, and run the demo there
-	@$(BIN)/python -m pytest -m slow tests/test_wheel.py
+	@$(BIN)/python -m pytest -m 'slow or ci' tests/test_wheel.py
 
 clean: ## Remove what was made, the environment too
 	@rm -rf .venv build dist demo-output .pytest_cache .hypothesis .mypy_cache .ruff_cache
