@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import shapely
 from ezdxf.document import Drawing
+from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -49,10 +50,6 @@ def drawing(units: int = 6, unit_m: float = 1.0, layer: str = "A-WALL") -> Drawi
     space.add_circle((2 * scale, 3 * scale), 0.6 * scale, dxfattribs={"layer": "A-FURN"})
     space.add_text("PLAN", height=scale, dxfattribs={"layer": layer})
     return doc
-
-
-def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
-    return partial.state_at(np.array(points)).tolist()
 
 
 def require_rooms(partial: PartialMap) -> None:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
+from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -67,10 +68,6 @@ def write(path: Path, points: NDArray) -> Path:
             stream.write(head)
             np.savetxt(stream, columns, fmt="%.4f", delimiter=" " if kind == ".pts" else ",")
     return path
-
-
-def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
-    return partial.state_at(np.array(points)).tolist()
 
 
 def require_room(partial: PartialMap) -> None:
