@@ -101,7 +101,7 @@ BLACK, WHITE, CLEAR = [0, 0, 0, 255], [255] * 4, [255, 255, 255, 0]
         *(([0, 19, 20, 21, 64, 65, 100, 101], {"mode": "raw", "negate": k}, [0, 0, 0, 2, 2, 1, 1, 2]) for k in (0, 1)),
         # Alpha is a fourth channel in trinary mode: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4.
         ([BLACK, [60, 60, 60, 255], WHITE, CLEAR], {}, [WALL, UNKNOWN, FREE, UNKNOWN]),
-        ([BLACK, WHITE, [0, 0, 0, 254], CLEAR], {"mode": "Scale"}, [WALL, FREE, UNKNOWN, UNKNOWN]),
+        ([[60, 60, 60, 255], WHITE, [0, 0, 0, 254], CLEAR], {"mode": "Scale"}, [WALL, FREE, UNKNOWN, UNKNOWN]),
         ([0, 128, 205, 254], {"free_thresh": 0.25}, [WALL, UNKNOWN, FREE, FREE]),  # more would be unknown otherwise
     ],
 )
