@@ -189,6 +189,17 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
     assert [(row.name, row.reason) for row in partial.import_report.skipped] == [("Rahmen", "name of no wall")]
 
 
+def test_hardly_any_area(tmp_path: Path) -> None:
+    doc = ezdxf.new(units=6)
+    for corners in ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 9), (12, 9), (12, 9.2), (0, 9.2)]):
+        doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    with pytest.warns(MapWarning) as caught:
+        load_map(tmp_path / "plan.dxf")
+    message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
+    assert re.search(message, str(caught[0].message))
+
+
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
     drawing().saveas(tmp_path / "plan.dxf")
     with pytest.warns(MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* of 0\.1"):

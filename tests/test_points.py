@@ -197,6 +197,13 @@ def test_other_files(tmp_path: Path) -> None:
         map_from_points(tmp_path / "room.las")
 
 
+def test_compressed_pcd_holds_what_an_uncompressed_one_does(tmp_path: Path) -> None:
+    floor = np.random.default_rng(0).uniform((0.02, 0.02, 0.0), (4.0, 3.0, 0.01), (2000, 3))
+    points = np.concatenate([floor, floor * (1.0, 0.0, 0.0) + (0.0, 2.98, 1.0) + floor[::-1] * (0.0, 0.0, 100.0)])
+    compressed, plain = (load_map(write(tmp_path / name, points)) for name in ("room.pcd", "room_binary.pcd"))
+    assert compressed == plain
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [

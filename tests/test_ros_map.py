@@ -17,6 +17,7 @@ from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
+from sionna_partial.maps import ros_map
 from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -359,6 +360,12 @@ def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) ->
     assert not caplog.text
     assert turn_grid(state, 0.1, (0.0, 0.0, 1.01 * limit))[1] == 0.05
     assert "rad: the map is turned onto cells of 0.05 m" in caplog.text
+
+
+def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
+    with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
+        turn_grid(PARTIAL.state, 0.1, (0.0, 1.0, 0.5))
 
 
 REPORTS = Path(__file__).parent / "reports"
