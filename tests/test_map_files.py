@@ -135,13 +135,17 @@ def test_mesh_file(room_file: Path) -> None:
     assert load_map(room_file, up="y").height_range_m == (0.0, 4.0)
 
 
-def test_mesh_in_npz(tmp_path: Path, room_file: Path) -> None:
+def test_mesh_in_npz(tmp_path: Path, room_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for partial in (load_map(room_file), load_map(room_file, observed=OBSERVED[:3], wall_height_m=8.0)):
         save_map(partial, tmp_path / "home.npz")
         assert load_map(tmp_path / "home.npz") == partial
     assert load_map(tmp_path / "home.npz", wall_height_m=4.0).height_range_m == (0.0, 4.0)
     with pytest.raises(OutputError, match=r"home.yaml' cannot hold the map's mesh: choose .npz, or use export_scene"):
         save_map(partial, tmp_path / "home.yaml")
+    monkeypatch.setattr(map_files, "_MESH_BYTES", 500)
+    with pytest.raises(MapError, match=r"home.npz' holds more than 5,000,000 triangles: cut or simplify the mesh"):
+        load_map(tmp_path / "home.npz")
+    monkeypatch.undo()
     with np.load(tmp_path / "home.npz") as content:
         arrays = {key: content[key] for key in content if key != "mesh_vertices_m"}
     (tmp_path / "home.npz").write_bytes(npz_bytes(**arrays))
