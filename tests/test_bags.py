@@ -220,26 +220,26 @@ def test_other_files(tmp_path: Path) -> None:
 class TestHostileStorage:
     """Storage whose reader would not end, or would read another file."""
 
-    def refused(self, path: Path, message: str) -> None:
-        with pytest.raises(MapError, match=message):
-            map_from_bag(path)
-
     def test_views(self, tmp_path: Path) -> None:
         with closing(sqlite3.connect(tmp_path / "a.db3")) as database:
-            database.executescript(
-                "CREATE TABLE topics (id INTEGER); CREATE VIEW messages AS "
-                "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x FROM n;"
-            )
-        self.refused(tmp_path / "a.db3", "it has views in place of tables")
+            database.execute("CREATE TABLE topics (id INTEGER)")
+            database.execute("CREATE VIEW messages AS SELECT id FROM topics")
+        with pytest.raises(MapError, match="it has views in place of tables"):
+            map_from_bag(tmp_path / "a.db3")
 
     def test_names_that_are_uris(self, tmp_path: Path) -> None:
         (tmp_path / "..%2Fother.db3").touch()
-        self.refused(tmp_path / "..%2Fother.db3", "characters % . # in it: rename it")
+        with pytest.raises(MapError, match=r"characters % . # in it: rename it"):
+            map_from_bag(tmp_path / "..%2Fother.db3")
 
-    def test_huge_chunks_and_arrays(self, tmp_path: Path) -> None:
-        magic, path = b"\x89MCAP0\r\n", tmp_path / "a.mcap"
-        path.write_bytes(magic + struct.pack("<BQ16xQ", 6, 24, 20 * 10**9))
-        self.refused(path, "a chunk of 20,000,000,000 bytes")
-        schema = b"uint8[4000000000] a"
-        path.write_bytes(magic + struct.pack("<BQ", 3, len(schema)) + schema)
-        self.refused(path, "arrays of 4,000,000,000 values")
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            (struct.pack("<BQ16xQ", 6, 24, 20 * 10**9), "a chunk of 20,000,000,000 bytes"),
+            (struct.pack("<BQ", 3, 19) + b"uint8[4000000000] a", "arrays of 4,000,000,000 values"),
+        ],
+    )
+    def test_huge_chunks_and_arrays(self, tmp_path: Path, content: bytes, message: str) -> None:
+        (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + content)
+        with pytest.raises(MapError, match=message):
+            map_from_bag(tmp_path / "a.mcap")
