@@ -205,7 +205,7 @@ def procedural(
         errors_db, gain_db = drawn_errors_db(rx_m, rng), simulation.links(tx_m, rx_m).gain_db
         power = gain_db + errors_db
         rows = np.column_stack([np.tile(tx_m, (len(rx_m), 1)), rx_m, power, gain_db])
-        links[f"{number}"] = rows[power > SENSITIVITY_DBM]
+        links[f"{number}"] = rows[shared | (power > SENSITIVITY_DBM)]
     return partial, {tx: rows for tx, rows in links.items() if len(rows) >= POINTS}, frequency_hz
 
 

@@ -184,7 +184,7 @@ def _log_process(
     for tx_seen in (True, False):
         correlation = positive(walks.correlation(measured.rx, kinds[0], tx_seen=tx_seen))
         at = np.flatnonzero(seen == tx_seen)
-        for some in np.split(at, range(BLOCK, len(at), BLOCK)):
+        for some in (at[first : first + BLOCK] for first in range(0, len(at), BLOCK)):
             residuals_db = above_db[some], below_db[some], std_db[some]
             for number, kind in enumerate(kinds):
                 of_material = _log_evidence(kind, correlation, received, *residuals_db, noise_db)

@@ -134,7 +134,7 @@ class Residuals(NamedTuple):
             relative = noises_db**2 * (scale_db**-2.0).sum(axis=1)[:, None] / max(len(root), 1)
             spectrum = values + relative[..., None]
             products = rows[:, :, None] * rows[:, None]
-            gram = (1.0 / spectrum) @ products.reshape(len(rows), 9, -1).swapaxes(1, 2)
+            gram = (1.0 / spectrum) @ products.reshape(len(rows), 9, len(root)).swapaxes(1, 2)
             gram = gram.reshape(*spectrum.shape[:2], 3, 3)
             offset, factor = (prior[:, at, at, None] + gram[..., at + 1, at + 1] for at in (0, 1))
             both, (first, second) = prior[:, 0, 1, None] + gram[..., 1, 2], np.moveaxis(gram[..., 1:, 0], -1, 0)
