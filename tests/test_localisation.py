@@ -86,6 +86,15 @@ class TestCoverage:
         warned = "powers were measured and no path gains" in caplog.text
         assert warned or abs(found.attrs["measured_offset_db"] - offset_db) < 10.0
 
+    def test_powers_through_walls_of_an_unknown_material(self):
+        through_walls = sp.LinkModel(HOUSE, None, sp.TraceSettings(2.4e9))
+        power_db = through_walls.predict(TX, PLACES).gain_mean_db - 30.0
+        found = sp.predict_map(through_walls, measurements=table(gain_db=power_db), **COARSE)
+        assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 2.0
+        assert float(found.p_transmitter.sum()) == pytest.approx(1.0)
+        assert found.attrs["measured_offset_db"] == pytest.approx(-30.0, abs=10.0)
+        assert "wall_material" in found.attrs
+
     def test_its_height_may_be_known(self):
         found = sp.predict_map(model(), measurements=table(tx=[np.nan, np.nan, 2.0]), **COARSE)
         assert found.attrs["transmitter_m"][2] == 2.0
