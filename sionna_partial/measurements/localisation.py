@@ -42,8 +42,8 @@ MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements; one of each group is traced."""
 
 CORRELATION_M, FARTHEST_M = 3.0, 30.0
-"""Correlation length of prediction errors along walks with opaque walls, and length of the longest walks [m]; with it
-the 90 % region holds 90 % of the transmitters of procedural homes, unreceived ones included.
+"""Correlation length of prediction errors along walks with opaque walls, with which the 90 % region holds 90 % of the
+transmitters of procedural homes, unreceived ones included; and length of the longest walks [m].
 """
 
 BLOCK = 64
@@ -206,11 +206,12 @@ def _log_evidence(
     Residuals of links that were not received are independent, given the mean of the others.
     """
     count = received.sum()
-    rows = (each[..., received].reshape(-1, count) for each in (above_db, below_db, std_db))
-    residuals = Residuals(correlation[np.ix_(received, received)], np.ones(count), *rows, kind.covariance[None])
+    above, below, std = (each[..., received].reshape(-1, count) for each in (above_db, below_db, std_db))
+    correlation, covariance = correlation[np.ix_(received, received)], kind.covariance[None]
+    residuals = Residuals(correlation, np.ones(count), above, below, std, covariance)
     log_p = OWN_WEIGHT * residuals.log_evidence(np.hypot(FADINGS_DB, noise_db)) + log_std_prior()
-    unsure = count + RESIDUAL_DB**2 / kind.covariance[0, 0]
-    offset_db = above_db[..., received].sum(axis=-1, keepdims=True) / unsure
+    prior_count = RESIDUAL_DB**2 / kind.covariance[0, 0]
+    offset_db = above_db[..., received].sum(axis=-1, keepdims=True) / (count + prior_count)
     bounds = log_ndtr((above_db - offset_db)[..., ~received] / np.hypot(std_db[..., ~received], RESIDUAL_DB))
     of_rows: Floats = logsumexp(log_p, axis=(1, 2)).reshape(above_db.shape[:2])
     return of_rows + OWN_WEIGHT * bounds.sum(axis=-1)
