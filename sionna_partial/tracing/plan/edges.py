@@ -20,7 +20,8 @@ from sionna_partial.scene.outlines import bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.beams import BeamTree, trace_beams
+from sionna_partial.tracing.plan.beams import BeamTree, Origins, needed_of, trace_beams
+from sionna_partial.tracing.plan.clipping import EXPECTED
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, unfold
 from sionna_partial.tracing.plan.room import (
     Building,
@@ -40,6 +41,7 @@ from sionna_partial.tracing.plan.room import (
 from sionna_partial.tracing.power import (
     Materials,
     at_edge,
+    at_face,
     at_flats,
     at_wall,
     gain_at_azimuth,
@@ -64,8 +66,11 @@ _NEAR_M = 1e-3
 _ASIDE_M = 1e-3
 """Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
-_NEGLIGIBLE = 3e-6
+_NEGLIGIBLE = 3e-5
 """Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
+
+_HALF_DEGREE = 0.0044
+"""Sine of half the angle between a direction and the next half degree."""
 
 _FLAT_RAD = 1e-3
 """Smallest angle between walls and a straight line at an edge [rad]."""
@@ -130,13 +135,18 @@ class _Edges(NamedTuple):
 
 
 class _EdgeTask(NamedTuple):
-    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path."""
+    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
+
+    `most` (J,) are bounds of the fields of arrivals, `faces` (J, 2) the coefficients of both faces of the edge.
+    """
 
     tree: BeamTree
     pairs: NDArray[np.int32]
     group: Indices
     edges: _Edges
     arrivals: _Arrivals
+    most: Floats
+    faces: NDArray[np.complex128]
     building: Building
     reflections: int
 
@@ -234,6 +244,10 @@ class DiffractionCandidates(_EdgeCandidates):
         receivers, walls = bin_points(room.rx_m[:, :2]), np.array([self._walls_a_side])
         tree_and_pairs = trace_beams(self._building, bin_points(edges.position_m), room.tx_m[None, :2], walls)
         arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
+        materials, heights = self._building.materials, _heights(room, self._reflections + 1)
+        most, faces = _most_of_arrivals(materials, arrivals, edges.material, heights.max())
+        negligible = _NEGLIGIBLE * found
+        needed = needed_of(negligible, room, materials.wavelength_m)
         reached = np.flatnonzero(np.diff(arrivals.start))
         groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
@@ -241,9 +255,12 @@ class DiffractionCandidates(_EdgeCandidates):
             group = groups[number]
             fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
             onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward)
-            task = _EdgeTask(tree, pairs, group, edges, arrivals, self._building, self._reflections)
-            pair, joined, bound, unlisted = _list_joined(task, _NEGLIGIBLE * found, trail_of(plan))
+            power = _diffracted_power(edges, arrivals, most, faces, group, materials.wavelength_m)
+            origins = Origins(*power, np.zeros(len(found)))
+            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward, (origins, needed))
+            task = _EdgeTask(tree, pairs, group, edges, arrivals, most, faces, self._building, self._reflections)
+            pair, joined, bound, unlisted = _list_joined(task, heights, negligible, trail_of(plan))
+            unlisted += origins.unlisted * (0.25 * materials.wavelength_m / np.pi) ** 2
             write = partial(self._written, task, pair, joined)
             return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
 
@@ -291,7 +308,7 @@ class CrossedEdgeCandidates(_EdgeCandidates):
 
 def _straight_lines(sources_m: Floats) -> BeamTree:
     none = np.full(len(sources_m), -1, np.int32)
-    return BeamTree(none, none, sources_m)
+    return BeamTree(none, none, sources_m, np.arange(len(sources_m), dtype=np.int32))
 
 
 @njit(cache=True)
@@ -408,24 +425,21 @@ def _strength(media, arrived, face, after, terms, path):
 
 
 @njit(cache=True, nogil=True)
-def _list_joined(task, negligible, trail):
+def _list_joined(task, heights, negligible, trail):
     """Join paths to edges and from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
 
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
     references at every access, on all cores.
     """
-    tree, pairs, group, edges, arrivals, building, reflections = task
+    tree, pairs, group, edges, arrivals, most, faces, building, reflections = task
     room, size, unlisted = building.room, reflections + 1, np.zeros(len(building.room.rx_m))
     out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
-    material, cosine, heights = np.empty(size, np.int64), np.empty(size), _heights(room, size)
-    scratch, media = (material, cosine, np.empty((4, 3))), _media(building)
+    material, cosine, media = np.empty(size, np.int64), np.empty(size), _media(building)
+    scratch = material, cosine, np.empty((4, 3)), np.empty(2 * size)
     pieces_m, of_piece, walls, bounce = building.plan.pieces_m, building.material, trail.walls, trail.bounce
-    most = _most_of_arrivals(building.materials.largest, arrivals, edges.material, heights.max())
     for i in range(len(pairs)):
-        root = node = pairs[i, 0]
-        while tree.parent[root] >= 0:
-            root = tree.parent[root]
-        edge, rx = group[root // 4], pairs[i, 1]
+        node, rx = pairs[i, 0], pairs[i, 1]
+        edge = group[tree.origin[node]]
         origin, target, exterior = edges.position_m[edge], room.rx_m[rx], edges.exterior_rad[edge]
         after, onward = unfold(tree, node, pieces_m, target, walls, bounce)
         x, y = (bounce[0, 0], bounce[0, 1]) if after > 0 else (target[0], target[1])
@@ -437,7 +451,8 @@ def _list_joined(task, negligible, trail):
         departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
         face, utd = (edges.material[edge, 0], edges.material[edge, 1]), _constants(edges, edge)
         pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, departure, utd, face)
-        out, rough = _list_pair(media, room, arrivals, most, pair, heights[rx], scratch, negligible[rx], out)
+        bounds = most, faces, heights[rx], negligible[rx]
+        out, rough = _list_pair(media, room, arrivals, pair, bounds, scratch, out)
         unlisted[rx] += rough
     listed, joined, bound, used = out
     return listed[:used].copy(), joined[:used].copy(), bound[:used].copy(), unlisted
@@ -454,34 +469,33 @@ def _heights(room, size):
 
 
 @njit(cache=True)
-def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):
-    """Add all paths of a pair; return the unlisted power.
-
-    Paths with a rough bound below `negligible`, which takes `most`, are not listed.
-    """
-    (_, largest, _, wavelength), (material, cosine, terms) = media, scratch
+def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
+    """Add the paths of a pair; return the unlisted power: of paths with a rough bound below `negligible`."""
+    (_, largest, flat, wavelength), (material, cosine, terms, weight) = media, scratch
+    most, at_faces, heights, negligible = bounds
     before, before_cosine, lit, lengths = arrivals.material, arrivals.cosine, arrivals.lit, arrivals.length_m
     reflections, angle, faces = arrivals.reflections, arrivals.angle, arrivals.faces
     toward, gain = arrivals.toward, arrivals.gain
     directed, onward, after = len(room.gains.table) > 1, pair.onward_m, (material, cosine, pair.after)
-    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, heights.max())
     pairs, joined, bound, used = out
     unlisted, size = 0.0, len(heights)
+    highest = _weigh_variants(largest, flat, heights, lengths[arrivals.start[pair.edge + 1] - 1] + onward, weight)
+    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, highest)
     for j in range(arrivals.start[pair.edge], arrivals.start[pair.edge + 1]):
         left, length = pair.left - reflections[j], lengths[j]
         if left < 0:
             continue
         utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), pair.departure, terms)
         spread, reach = _spread(wavelength, length, onward)
-        amplitude = most_after * most[j, 0] * most_at_edge(terms, np.sqrt(reach), most[j, 1], most[j, 2])
-        rough = (2 * left + 1) * amplitude**2 * spread / (length + onward) * gain[j]
-        if rough < negligible:
-            unlisted += rough
-            continue
+        amplitude = most_after * most[j] * most_at_edge(terms, np.sqrt(reach), at_faces[j, 0], at_faces[j, 1])
+        rough = amplitude**2 * spread / (length + onward) * gain[j]
         face = pair.material[0] if lit[j] else pair.material[1], faces[j, 0], faces[j, 1]
         for variant in range(2 * left + 2):
             height = heights[variant]
             if height < 0.0:
+                continue
+            if rough * weight[variant] < negligible:
+                unlisted += EXPECTED * rough * weight[variant]
                 continue
             total = np.sqrt((length + onward) ** 2 + height**2)
             sine = (length + onward) / total
@@ -498,6 +512,18 @@ def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, 
 
 
 @njit(cache=True)
+def _weigh_variants(largest, flat, heights, length, weight):
+    """Write the largest powers of variants relative to a path in the plan; return the largest height."""
+    highest = 0.0
+    for variant in range(len(heights)):
+        height = max(heights[variant], 0.0)
+        total = np.sqrt(length * length + height * height)
+        weight[variant] = at_flats(largest, flat, height / total, variant // 2, (1.0, 0.0, 0.0)) ** 2 * length / total
+        highest = max(highest, height)
+    return highest
+
+
+@njit(cache=True)
 def _constants(edges, edge):
     return edges.utd[edge, 0], edges.utd[edge, 1], edges.utd[edge, 2], edges.utd[edge, 3], edges.utd[edge, 4]
 
@@ -510,18 +536,41 @@ def _spread(wavelength, length, onward):
 
 
 @njit(cache=True)
-def _most_of_arrivals(largest, arrivals, material, highest):
-    most, one = np.empty((len(arrivals.lit), 3)), np.int64(1)
+def _most_of_arrivals(materials, arrivals, material, highest):
+    most, faces = np.empty(len(arrivals.lit)), np.empty((len(arrivals.lit), 2), np.complex128)
     for edge in range(len(arrivals.start) - 1):
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
-            length, own = arrivals.length_m[j], material[edge] if arrivals.lit[j] else material[edge, 1:]
-            most[j, 0] = _most_at_walls(
-                largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
+            length, own = arrivals.length_m[j], material[edge, 0] if arrivals.lit[j] else material[edge, 1]
+            most[j] = _most_at_walls(
+                materials.largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
             )
             for k in range(2):
-                face = arrivals.faces[j, k : k + 1]
-                most[j, 1 + k] = _most_at_walls(largest, own, face, one, length, highest) if face[0] >= 0.0 else 1.0
-    return most
+                faces[j, k] = at_face(materials.reflection, own, arrivals.faces[j, k], 1.0, 0.0)[0]
+    return most, faces
+
+
+@njit(cache=True, nogil=True)
+def _diffracted_power(edges, arrivals, most, faces, group, wavelength):
+    """Return bounds (G, 360) of the power from edges by azimuth, as in `Origins`, and the shortest arrivals (G,)."""
+    power, before_m, terms = np.zeros((len(group), 360)), np.full(len(group), np.inf), np.empty((4, 3))
+    for g in range(len(group)):
+        edge, exterior = group[g], edges.exterior_rad[group[g]]
+        for azimuth in range(360):
+            x, y = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+            departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
+            for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
+                angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
+                utd_terms(_constants(edges, edge), angle, departure, terms)
+                for k in range(4):  # the largest term within half a degree
+                    near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
+                    terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
+                length = arrivals.length_m[j]
+                boundary = np.sqrt(4.0 * np.pi / wavelength * length)
+                size = most[j] * most_at_edge(terms, boundary, faces[j, 0], faces[j, 1])
+                strength = wavelength / (4.0 * np.pi**2) * size**2 * arrivals.gain[j] / length
+                power[g, azimuth] = max(power[g, azimuth], strength)
+                before_m[g] = min(before_m[g], length)
+    return power, before_m
 
 
 @njit(cache=True)
