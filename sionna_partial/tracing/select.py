@@ -17,7 +17,7 @@ from sionna_partial.arrays import Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import part_of
-from sionna_partial.process import njit
+from sionna_partial.process import in_order, njit
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
@@ -112,10 +112,17 @@ class Selection:
         return LEVELS - (first - start[:-1])
 
     def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
-        for number, (name, part, level) in enumerate(self.parts, start=1):
-            rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
-            for candidates in part.blocks(rows):
-                yield Block(candidates, low + (high - low) * number / len(self.parts), f"verifying {name}")
+        def chosen() -> Iterator[tuple[int, Indices]]:
+            for number, (_, part, level) in enumerate(self.parts):
+                rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
+                yield from ((number, rows[start : start + part.at_once]) for start in range(0, len(rows), part.at_once))
+
+        def written(item: tuple[int, Indices]) -> Block:
+            number, rows = item
+            name, part, _ = self.parts[number]
+            return Block(part.write(rows), low + (high - low) * (number + 1) / len(self.parts), f"verifying {name}")
+
+        yield from in_order(written, chosen())
 
 
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:

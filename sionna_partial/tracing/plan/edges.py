@@ -137,7 +137,8 @@ class _Edges(NamedTuple):
 class _EdgeTask(NamedTuple):
     """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
 
-    `most` (J,) are bounds of the fields of arrivals, `faces` (J, 2) the coefficients of both faces of the edge.
+    `most` (J,) are bounds of the fields of arrivals, `faces` (J, 2) the coefficients of both faces of the edge, `power`
+    (J, 360) bounds of the power after the edge, as in `Origins`, `highest_m` is the largest height that a path rises.
     """
 
     tree: BeamTree
@@ -147,6 +148,8 @@ class _EdgeTask(NamedTuple):
     arrivals: _Arrivals
     most: Floats
     faces: NDArray[np.complex128]
+    power: Floats
+    highest_m: float
     building: Building
     reflections: int
 
@@ -155,7 +158,8 @@ class _Pair(NamedTuple):
     """Numbers of a pair of a beam from an edge and a receiver, of the edge, and of the receiver.
 
     `left` is the number of further reflections allowed, `after` the number of walls that reflect after the edge,
-    `onward_m` this leg's length, `departure` its direction as in `wedge_angle`; `utd` and `material` as in `_Edges`.
+    `onward_m` this leg's length, `azimuth_rad` and `angle_rad` its direction, from x and from the 0-face; `utd` and
+    `material` as in `_Edges`.
     """
 
     number: np.int32
@@ -164,7 +168,9 @@ class _Pair(NamedTuple):
     left: np.int64
     after: np.int64
     onward_m: float
-    departure: tuple[float, float, float, float]
+    azimuth_rad: float
+    angle_rad: float
+    exterior_rad: float
     utd: tuple[float, float, float, float, float]
     material: tuple[np.int64, np.int64]
 
@@ -245,20 +251,24 @@ class DiffractionCandidates(_EdgeCandidates):
         tree_and_pairs = trace_beams(self._building, bin_points(edges.position_m), room.tx_m[None, :2], walls)
         arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
         materials, heights = self._building.materials, _heights(room, self._reflections + 1)
-        most, faces = _most_of_arrivals(materials, arrivals, edges.material, heights.max())
-        negligible = _NEGLIGIBLE * found
+        reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
+        if not len(reached):
+            return
         needed = needed_of(negligible, room, materials.wavelength_m)
-        reached = np.flatnonzero(np.diff(arrivals.start))
-        groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
+        most, faces = _most_of_arrivals(materials, arrivals, edges.material, highest_m)
+        power, start = _diffracted_power(edges, arrivals, most, faces, materials.wavelength_m), arrivals.start[reached]
+        fewest = np.minimum.reduceat(arrivals.reflections, start)
+        most_onward = np.minimum(self._walls_a_side, self._reflections - fewest)
+        strongest, shortest_m = np.maximum.reduceat(power, start), np.minimum.reduceat(arrivals.length_m, start)
+        groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
         def of_group(number: int) -> Listed:
-            group = groups[number]
-            fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
-            onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-            power = _diffracted_power(edges, arrivals, most, faces, group, materials.wavelength_m)
-            origins = Origins(*power, np.zeros(len(found)))
+            some = groups[number]
+            group, onward, powers = reached[some], most_onward[some], (strongest[some], shortest_m[some])
+            origins = Origins(*powers, np.zeros(len(found)))
             tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward, (origins, needed))
-            task = _EdgeTask(tree, pairs, group, edges, arrivals, most, faces, self._building, self._reflections)
+            bounds = most, faces, power, highest_m
+            task = _EdgeTask(tree, pairs, group, edges, arrivals, *bounds, self._building, self._reflections)
             pair, joined, bound, unlisted = _list_joined(task, heights, negligible, trail_of(plan))
             unlisted += origins.unlisted * (0.25 * materials.wavelength_m / np.pi) ** 2
             write = partial(self._written, task, pair, joined)
@@ -431,7 +441,7 @@ def _list_joined(task, heights, negligible, trail):
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
     references at every access, on all cores.
     """
-    tree, pairs, group, edges, arrivals, most, faces, building, reflections = task
+    tree, pairs, group, edges, arrivals, most, faces, power, highest, building, reflections = task
     room, size, unlisted = building.room, reflections + 1, np.zeros(len(building.room.rx_m))
     out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
     material, cosine, media = np.empty(size, np.int64), np.empty(size), _media(building)
@@ -448,10 +458,10 @@ def _list_joined(task, heights, negligible, trail):
             continue
         for k in range(after):
             material[k], cosine[k] = of_piece[walls[k]], bounce[k, 3]
-        departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
+        directions = np.arctan2(y, x), _angle_rad(edges.face_rad[edge], exterior, x, y), exterior
         face, utd = (edges.material[edge, 0], edges.material[edge, 1]), _constants(edges, edge)
-        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, departure, utd, face)
-        bounds = most, faces, heights[rx], negligible[rx]
+        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, *directions, utd, face)
+        bounds = most, faces, power, heights[rx], highest, negligible[rx]
         out, rough = _list_pair(media, room, arrivals, pair, bounds, scratch, out)
         unlisted[rx] += rough
     listed, joined, bound, used = out
@@ -472,20 +482,31 @@ def _heights(room, size):
 def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
     """Add the paths of a pair; return the unlisted power: of paths with a rough bound below `negligible`."""
     (_, largest, flat, wavelength), (material, cosine, terms, weight) = media, scratch
-    most, at_faces, heights, negligible = bounds
+    most, at_faces, power, heights, highest, negligible = bounds
     before, before_cosine, lit, lengths = arrivals.material, arrivals.cosine, arrivals.lit, arrivals.length_m
     reflections, angle, faces = arrivals.reflections, arrivals.angle, arrivals.faces
     toward, gain = arrivals.toward, arrivals.gain
     directed, onward, after = len(room.gains.table) > 1, pair.onward_m, (material, cosine, pair.after)
     pairs, joined, bound, used = out
-    unlisted, size = 0.0, len(heights)
-    highest = _weigh_variants(largest, flat, heights, lengths[arrivals.start[pair.edge + 1] - 1] + onward, weight)
+    unlisted, size, first, last = 0.0, len(heights), arrivals.start[pair.edge], arrivals.start[pair.edge + 1]
     most_after = _most_at_walls(largest, material, cosine, pair.after, onward, highest)
-    for j in range(arrivals.start[pair.edge], arrivals.start[pair.edge + 1]):
+    free_space, azimuth = (
+        (wavelength / (4.0 * np.pi) * most_after) ** 2,
+        int(np.degrees(pair.azimuth_rad) + 360.5) % 360,
+    )
+    departure, is_weak = (0.0, 0.0, 0.0, 0.0), True
+    for j in range(first, last):
         left, length = pair.left - reflections[j], lengths[j]
         if left < 0:
             continue
-        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), pair.departure, terms)
+        rough = free_space * power[j, azimuth] / (onward * (length + onward))
+        if rough < negligible:
+            unlisted += EXPECTED * rough
+            continue
+        if is_weak:
+            departure, is_weak = wedge_angle(pair.angle_rad, pair.exterior_rad), False
+            _weigh_variants(largest, flat, heights, lengths[last - 1] + onward, weight)
+        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), departure, terms)
         spread, reach = _spread(wavelength, length, onward)
         amplitude = most_after * most[j] * most_at_edge(terms, np.sqrt(reach), at_faces[j, 0], at_faces[j, 1])
         rough = amplitude**2 * spread / (length + onward) * gain[j]
@@ -513,14 +534,11 @@ def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
 
 @njit(cache=True)
 def _weigh_variants(largest, flat, heights, length, weight):
-    """Write the largest powers of variants relative to a path in the plan; return the largest height."""
-    highest = 0.0
+    """Write the largest powers of variants relative to a path in the plan."""
     for variant in range(len(heights)):
         height = max(heights[variant], 0.0)
         total = np.sqrt(length * length + height * height)
         weight[variant] = at_flats(largest, flat, height / total, variant // 2, (1.0, 0.0, 0.0)) ** 2 * length / total
-        highest = max(highest, height)
-    return highest
 
 
 @njit(cache=True)
@@ -549,28 +567,26 @@ def _most_of_arrivals(materials, arrivals, material, highest):
     return most, faces
 
 
-@njit(cache=True, nogil=True)
-def _diffracted_power(edges, arrivals, most, faces, group, wavelength):
-    """Return bounds (G, 360) of the power from edges by azimuth, as in `Origins`, and the shortest arrivals (G,)."""
-    power, before_m, terms = np.zeros((len(group), 360)), np.full(len(group), np.inf), np.empty((4, 3))
-    for g in range(len(group)):
-        edge, exterior = group[g], edges.exterior_rad[group[g]]
-        for azimuth in range(360):
+@njit(cache=True)
+def _diffracted_power(edges, arrivals, most, faces, wavelength):
+    """Return bounds (J, 360) of the power of arrivals after the edge by azimuth, as in `Origins`."""
+    power, terms = np.zeros((len(most), 360)), np.empty((4, 3))
+    for edge in range(len(arrivals.start) - 1):
+        exterior, utd = edges.exterior_rad[edge], _constants(edges, edge)
+        for azimuth in range(360 if arrivals.start[edge] < arrivals.start[edge + 1] else 0):
             x, y = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
             departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
             for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
                 angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
-                utd_terms(_constants(edges, edge), angle, departure, terms)
+                utd_terms(utd, angle, departure, terms)
                 for k in range(4):  # the largest term within half a degree
                     near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
                     terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
                 length = arrivals.length_m[j]
                 boundary = np.sqrt(4.0 * np.pi / wavelength * length)
                 size = most[j] * most_at_edge(terms, boundary, faces[j, 0], faces[j, 1])
-                strength = wavelength / (4.0 * np.pi**2) * size**2 * arrivals.gain[j] / length
-                power[g, azimuth] = max(power[g, azimuth], strength)
-                before_m[g] = min(before_m[g], length)
-    return power, before_m
+                power[j, azimuth] = wavelength / (4.0 * np.pi**2) * size**2 * arrivals.gain[j] / length
+    return power
 
 
 @njit(cache=True)
