@@ -58,17 +58,16 @@ class BeamTree(NamedTuple):
     """M beams as trees: a beam is the sequence of walls from a root down to it.
 
     `parent` (M,) is -1 at the roots, `piece` (M,) the reflecting piece of a wall, `source_m` (M, 2) the image of the
-    transmitter, `origin` (M,) the number of the source.
+    transmitter. Beams 4 k to 4 k + 3 are the roots of source k, by quadrant.
     """
 
     parent: NDArray[np.int32]
     piece: NDArray[np.int32]
     source_m: Floats
-    origin: NDArray[np.int32]
 
     @classmethod
     def of(cls, beams: "Beams") -> "BeamTree":
-        return cls(beams.parent, beams.piece, beams.window[:, :2].copy(), beams.origin)
+        return cls(beams.parent, beams.piece, beams.window[:, :2].copy())
 
     def extended(self, beams: "Beams") -> "BeamTree":
         columns: Any = zip(self, BeamTree.of(beams), strict=True)
@@ -90,29 +89,13 @@ class Needed(NamedTuple):
     grid: Floats
 
 
-class Origins(NamedTuple):
-    """Power of beams from E sources, relative to (wavelength / 4 pi)^2.
-
-    At a distance s it is at most `power` (E, 360), by degrees of azimuth, or (E, 1), over s (s + `before_m` (E,)).
-    `unlisted` (N,) receives the expected power of the pairs left out, by receiver.
-    """
-
-    power: Floats
-    before_m: Floats
-    unlisted: Floats
-
-    @classmethod
-    def equal(cls, sources: int, receivers: int) -> "Origins":
-        return cls(np.ones((sources, 1)), np.zeros(sources), np.zeros(receivers))
-
-
 class Beams(NamedTuple):
     """M beams of one number of reflections.
 
-    `parent`, `piece` and `origin` (M,) are as in `BeamTree`, -1 for the roots. `window` (M, 6) are the image of the
-    transmitter and the ends of the window [m]. `left` (M, 2) bounds the power after reflections and after walls,
-    `crossed` (M,) is the smallest number of walls, `more` (M,) the largest number of further reflections, `sequence`
-    (M,) numbers the sequences of lines.
+    `parent` and `piece` (M,) are as in `BeamTree`, -1 for the roots. `window` (M, 6) are the image of the transmitter
+    and the ends of the window [m]. `left` (M, 2) bounds the power after reflections and after walls, `crossed` (M,) is
+    the smallest number of walls, `more` (M,) the largest number of further reflections, `sequence` (M,) numbers the
+    sequences of lines.
     """
 
     parent: NDArray[np.int32]
@@ -121,7 +104,6 @@ class Beams(NamedTuple):
     left: Floats
     crossed: NDArray[np.int32]
     more: NDArray[np.int32]
-    origin: NDArray[np.int32]
     sequence: NDArray[np.int64]
 
     @classmethod
@@ -133,8 +115,7 @@ class Beams(NamedTuple):
         count = len(windows_m)
         none, left = np.full(count, -1, np.int32), np.tile([power, 1.0], (count, 1))
         crossed, reflections = np.zeros(count, np.int32), np.repeat(more, 4).astype(np.int32)
-        origin = np.arange(count) // 4
-        return cls(none, none, windows_m, left, crossed, reflections, origin.astype(np.int32), origin)
+        return cls(none, none, windows_m, left, crossed, reflections, np.arange(count) // 4)
 
 
 class Task(NamedTuple):
@@ -144,7 +125,6 @@ class Task(NamedTuple):
     building: Building
     needed: Needed
     most_transmitted: float
-    origins: Origins
 
 
 class _Beam(NamedTuple):
@@ -187,22 +167,16 @@ def needed_of(power: Floats, room: Room, wavelength_m: float) -> Needed:
 
 
 def trace_beams(
-    building: Building,
-    receivers: PointBins,
-    sources_m: Floats,
-    max_depth: NDArray[np.int64],
-    powers: tuple[Origins, Needed] | None = None,
+    building: Building, receivers: PointBins, sources_m: Floats, max_depth: NDArray[np.int64]
 ) -> tuple[BeamTree, NDArray[np.int32]]:
-    """Find sequences of opaque walls from sources (E, 2) with largest depths (E,) to receivers.
+    """Find every sequence of opaque walls from sources (E, 2) with largest depths (E,) to receivers.
 
     Return beams and pairs (K, 2) of beam and receiver, ordered by sequence and then receiver; a receiver has each
-    sequence of wall lines once. With `powers`, sequences that receivers do not need are left out.
+    sequence of wall lines once.
     """
     nothing, beams = np.zeros(0), Beams.first(sources_m, max_depth, 1.0)
-    if powers is None:
-        every = Needed(np.zeros(len(receivers.order)), nothing, nothing, nothing, np.zeros((1, 1)), np.ones(4))
-        powers = Origins.equal(len(sources_m), len(receivers.order)), every
-    tree, task, pairs = BeamTree.of(beams), Task(receivers, building, powers[1], 1.0, powers[0]), []
+    needed = Needed(np.zeros(len(receivers.order)), nothing, nothing, nothing, np.zeros((1, 1)), np.zeros(4))
+    tree, task, pairs = BeamTree.of(beams), Task(receivers, building, needed, 1.0), []
     while len(beams.parent):
         beams, pair, _ = follow(tree, beams, task)
         tree = tree.extended(beams)
@@ -223,43 +197,35 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
     children, pair, through = zip((nothing, np.zeros((0, 2), np.int32), np.zeros(0)), *found, strict=True)
     columns = [np.concatenate(column) for column in zip(*children, strict=True)]
     line, lines = building.plan.line[columns[1]], int(building.plan.line.max(initial=0)) + 1
-    above = columns[0] - before
-    _, sequence = np.unique(beams.sequence[above] * lines + line, return_inverse=True)
+    _, sequence = np.unique(beams.sequence[columns[0] - before] * lines + line, return_inverse=True)
     pairs, receivers = np.concatenate(pair), max(1, len(task.receivers.order))
     _, once = np.unique(beams.sequence[pairs[:, 0] - before] * receivers + pairs[:, 1], return_index=True)
-    return Beams(*[*columns, beams.origin[above], sequence]), pairs[once], np.concatenate(through)[once]
+    return Beams(*[*columns, sequence]), pairs[once], np.concatenate(through)[once]
 
 
 @njit(cache=True, nogil=True)
 def _follow_beams(beams, before, first, stop, task):
     layers, building = _layers_of(task.building.plan), task.building
     plan, opaque, room, receivers = building.plan, building.limits.walls == 0, building.room, task.receivers
-    pieces_m, low, scratch, origins = plan.pieces_m, plan.low, layers.clipped, task.origins
+    pieces_m, low, scratch = plan.pieces_m, plan.low, layers.clipped
     parent, piece = np.empty(64, np.int32), np.empty(64, np.int32)
     window, left = np.empty((64, 6)), np.empty((64, 2))
     crossed, more = np.empty(64, np.int32), np.empty(64, np.int32)
-    span, wall = np.empty((64, 5)), np.empty((64, 2), np.int64)
+    span, wall = np.empty((64, 4)), np.empty((64, 2), np.int64)
     pair, through, used = np.empty((1024, 2), np.int32), np.empty(1024), np.int64(0)
-    x, y, before_m, power = 0.0, 0.0, 0.0, 0.0
     count = np.int64(0)
     for k in range(first, stop):
-        own, further, x, y = beams.piece[k], np.int64(beams.more[k]), beams.window[k, 0], beams.window[k, 1]
+        own, further = beams.piece[k], np.int64(beams.more[k])
         beam = _Beam(beams.window[k], beams.left[k, 0], beams.left[k, 1], np.int64(beams.crossed[k]), further)
         if not (opaque or own < 0 or _is_needed(beam, task)):
             continue
         walls = _clip_walls(plan, beam.window, own, opaque, layers)
         if opaque:
             span, wall, windows = _look(walls, plan.line, low, layers, span, wall)
-            before_m = origins.before_m[beams.origin[k]]
             for i in range(windows):
-                corner, power = corners_of(beam.window, own >= 0, span[i]), beam.reflected
-                if own < 0:
-                    sides = (corner[3, 0] - x, corner[3, 1] - y), (corner[2, 0] - x, corner[2, 1] - y)
-                    power *= gain_between(origins.power[beams.origin[k]], *sides)
-                span[i, 4] = power
                 if wall[i, 0] < 0 or not low[scratch.wall[wall[i, 0]]]:
-                    strength = x, y, power, before_m, task.needed.power, origins.unlisted
-                    pair, through, used = add_points(corner, before + k, receivers, strength, (pair, through, used))
+                    corner = corners_of(beam.window, own >= 0, span[i])
+                    pair, through, used = add_points(corner, before + k, receivers, pair, through, used)
         else:
             span, wall, windows = _lay(beam, walls, task, layers, (span, wall, np.int64(0)))
             if own >= 0:
@@ -272,15 +238,11 @@ def _follow_beams(beams, before, first, stop, task):
             ends = (part[0], part[1], part[2], part[3]) if opaque else _piece_of(layers, c, part)
             if c < 0 or not reflect(beam.window, ends, pieces_m[scratch.wall[c]], new):
                 continue
-            reflected, behind = (part[4], 1.0) if opaque else (part[2], part[3])
-            if opaque and origins.power.shape[1] > 1:
-                near = _window_distance(new)
-                reflected *= _reflected_power(beam.window, part, scratch.wall[c], before_m, building)
-                if further == 1 and not _reaches(new, near, reflected, before_m, task.needed):
-                    continue
+            reflected, behind = (1.0, 1.0) if opaque else (part[2], part[3])
             if own < 0 and not opaque:
+                x, y = beam.window[0], beam.window[1]
                 sides = (new[4] - x, new[5] - y), (new[2] - x, new[3] - y)
-                reflected *= gain_between(room.gains.by_azimuth, *sides) / room.gains.largest
+                reflected *= gain_between(room.gains, *sides) / room.gains.largest
             if not (opaque or _is_needed(_Beam(new, reflected, behind, wall[i, 1], further - 1), task)):
                 continue
             parent[count], piece[count], crossed[count] = before + k, scratch.wall[c], wall[i, 1]
@@ -288,23 +250,6 @@ def _follow_beams(beams, before, first, stop, task):
             count += 1
     children = parent[:count], piece[:count], window[:count], left[:count], crossed[:count], more[:count]
     return children, pair[:used], through[:used]
-
-
-@njit(cache=True)
-def _reflected_power(beam, part, piece, before_m, building):
-    """Return the largest fraction of power that a piece reflects within one window."""
-    wall, cosine = building.plan.pieces_m[piece], 1.0
-    wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
-    size = np.hypot(wx, wy)
-    for k in range(2):
-        t, w = part[2 * k], max(part[2 * k + 1], 1e-9)
-        x = (1.0 - t) * (beam[2] - beam[0]) + t * (beam[4] - beam[0])
-        y = (1.0 - t) * (beam[3] - beam[1]) + t * (beam[5] - beam[1])
-        along = np.hypot(x, y)
-        length = before_m + along / w
-        flat = length / np.hypot(length, 2.0 * building.room.height_m)
-        cosine = min(cosine, abs(wx * y - wy * x) / (size * along) * flat)
-    return building.materials.most_reflected[building.material[piece], int(cosine * COSINES)]
 
 
 @njit(cache=True)
@@ -534,7 +479,7 @@ def _is_needed(beam, task):
         return False
     if beam.more > 0 and matters(total * discount_after(limits, order + 1), near, task.needed):
         return True
-    return _reaches(beam.window, near, total * discount_after(limits, order), 0.0, task.needed)
+    return _reaches(beam.window, near, total * discount_after(limits, order), task.needed)
 
 
 @njit(cache=True)
@@ -548,7 +493,7 @@ def _window_distance(beam):
 
 
 @njit(cache=True)
-def _reaches(beam, near, left, before_m, needed):
+def _reaches(beam, near, left, needed):
     """Return whether a beam would matter to any receiver behind its window without walls."""
     x0, y0, edge, (rows, columns) = needed.grid[0], needed.grid[1], needed.grid[2], needed.cells.shape
     corner = cone_of(beam, True, needed.grid, rows)
@@ -562,7 +507,7 @@ def _reaches(beam, near, left, before_m, needed):
         for column in range(first, last + 1):
             x, y = x0 + (column + 0.5) * edge - beam[0], y0 + (row + 0.5) * edge - beam[1]
             length = max(near, np.hypot(x, y) - 0.7072 * edge)
-            if left >= needed.cells[row, column] * length * (length + before_m):
+            if left >= needed.cells[row, column] * length * length:
                 return True
     return False
 

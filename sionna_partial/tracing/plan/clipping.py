@@ -18,9 +18,6 @@ _STRIP_CELLS = 6.0
 _FAR_M = 1e6
 """Length at which beams that hit nothing are cut off [m], fixed: no receiver depends on others."""
 
-EXPECTED = 0.5
-"""Expected power of unlisted paths, relative to their rough bounds."""
-
 THINNEST = 1e-12
 """Smallest part of a beam's width between two edges."""
 
@@ -274,13 +271,8 @@ def _inward_edges(corner):
 
 
 @njit(cache=True)
-def add_points(corner, number, receivers, strength, pairs):
-    """Pair a beam with the receivers in a quadrilateral that need it; add the expected power of others to `unlisted`.
-
-    `strength` is its image, power and length before it, as in `Origins`, the power that receivers need, and `unlisted`.
-    """
-    points, (normal, offset), (pair, through, used) = receivers.points_m, _inward_edges(corner), pairs
-    x, y, power, before, needed, unlisted = strength
+def add_points(corner, number, receivers, pair, through, used):
+    points, (normal, offset) = receivers.points_m, _inward_edges(corner)
     first, last = rows_in(corner, receivers)
     for row in range(first, last):
         begin, end = entries_in(corner, receivers, row)
@@ -291,14 +283,8 @@ def add_points(corner, number, receivers, strength, pairs):
                 if side < -TOLERANCE_M:
                     inside = False
                     break
-            if not inside:
-                continue
-            rx, squared = receivers.order[i], (points[i, 0] - x) ** 2 + (points[i, 1] - y) ** 2
-            spread = squared + before * np.sqrt(squared)
-            if power < needed[rx] * spread:
-                unlisted[rx] += EXPECTED * power / spread
-                continue
-            pair, through = grow(pair, used + 1), grow(through, used + 1)
-            pair[used, 0], pair[used, 1], through[used] = number, rx, 1.0
-            used += 1
+            if inside:
+                pair, through = grow(pair, used + 1), grow(through, used + 1)
+                pair[used, 0], pair[used, 1], through[used] = number, receivers.order[i], 1.0
+                used += 1
     return pair, through, used

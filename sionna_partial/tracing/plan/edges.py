@@ -20,8 +20,7 @@ from sionna_partial.scene.outlines import bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.beams import BeamTree, Origins, needed_of, trace_beams
-from sionna_partial.tracing.plan.clipping import EXPECTED
+from sionna_partial.tracing.plan.beams import BeamTree, trace_beams
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, unfold
 from sionna_partial.tracing.plan.room import (
     Building,
@@ -69,8 +68,8 @@ _ASIDE_M = 1e-3
 _NEGLIGIBLE = 3e-5
 """Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
 
-_HALF_DEGREE = 0.0044
-"""Sine of half the angle between a direction and the next half degree."""
+_EXPECTED, _HALF_DEGREE = 0.5, 0.0044
+"""Expected power of unlisted paths, relative to their rough bounds, and sine of half of half a degree."""
 
 _FLAT_RAD = 1e-3
 """Smallest angle between walls and a straight line at an edge [rad]."""
@@ -137,8 +136,7 @@ class _Edges(NamedTuple):
 class _EdgeTask(NamedTuple):
     """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
 
-    `most` (J,) are bounds of the fields of arrivals, `faces` (J, 2) the coefficients of both faces of the edge, `power`
-    (J, 360) bounds of the power after the edge, as in `Origins`, `highest_m` is the largest height that a path rises.
+    `most`, `faces` and `power` are as in `_most_of_arrivals` and `_diffracted_power`; paths rise `highest_m` at most.
     """
 
     tree: BeamTree
@@ -254,23 +252,17 @@ class DiffractionCandidates(_EdgeCandidates):
         reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
         if not len(reached):
             return
-        needed = needed_of(negligible, room, materials.wavelength_m)
         most, faces = _most_of_arrivals(materials, arrivals, edges.material, highest_m)
-        power, start = _diffracted_power(edges, arrivals, most, faces, materials.wavelength_m), arrivals.start[reached]
-        fewest = np.minimum.reduceat(arrivals.reflections, start)
-        most_onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-        strongest, shortest_m = np.maximum.reduceat(power, start), np.minimum.reduceat(arrivals.length_m, start)
+        bounds = most, faces, _diffracted_power(edges, arrivals, most, faces, materials.wavelength_m), highest_m
+        fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[reached])
+        onward = np.minimum(self._walls_a_side, self._reflections - fewest)
         groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
         def of_group(number: int) -> Listed:
-            some = groups[number]
-            group, onward, powers = reached[some], most_onward[some], (strongest[some], shortest_m[some])
-            origins = Origins(*powers, np.zeros(len(found)))
-            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward, (origins, needed))
-            bounds = most, faces, power, highest_m
+            group, more = reached[groups[number]], onward[groups[number]]
+            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], more)
             task = _EdgeTask(tree, pairs, group, edges, arrivals, *bounds, self._building, self._reflections)
             pair, joined, bound, unlisted = _list_joined(task, heights, negligible, trail_of(plan))
-            unlisted += origins.unlisted * (0.25 * materials.wavelength_m / np.pi) ** 2
             write = partial(self._written, task, pair, joined)
             return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
 
@@ -318,7 +310,7 @@ class CrossedEdgeCandidates(_EdgeCandidates):
 
 def _straight_lines(sources_m: Floats) -> BeamTree:
     none = np.full(len(sources_m), -1, np.int32)
-    return BeamTree(none, none, sources_m, np.arange(len(sources_m), dtype=np.int32))
+    return BeamTree(none, none, sources_m)
 
 
 @njit(cache=True)
@@ -414,7 +406,7 @@ def _media(building):
     return tables, materials.largest, building.room.flat_material, materials.wavelength_m
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _strength(media, arrived, face, after, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
@@ -447,19 +439,22 @@ def _list_joined(task, heights, negligible, trail):
     material, cosine, media = np.empty(size, np.int64), np.empty(size), _media(building)
     scratch = material, cosine, np.empty((4, 3)), np.empty(2 * size)
     pieces_m, of_piece, walls, bounce = building.plan.pieces_m, building.material, trail.walls, trail.bounce
+    position_m, face_rad, exterior_rad, normals, _, own = edges
     for i in range(len(pairs)):
-        node, rx = pairs[i, 0], pairs[i, 1]
-        edge = group[tree.origin[node]]
-        origin, target, exterior = edges.position_m[edge], room.rx_m[rx], edges.exterior_rad[edge]
+        root = node = pairs[i, 0]
+        while tree.parent[root] >= 0:
+            root = tree.parent[root]
+        edge, rx = group[root // 4], pairs[i, 1]
+        origin, target, exterior = position_m[edge], room.rx_m[rx], exterior_rad[edge]
         after, onward = unfold(tree, node, pieces_m, target, walls, bounce)
         x, y = (bounce[0, 0], bounce[0, 1]) if after > 0 else (target[0], target[1])
         x, y = x - origin[0], y - origin[1]
-        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(edges.normals[edge], x, y)[1]:
+        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(normals[edge], x, y)[1]:
             continue
         for k in range(after):
             material[k], cosine[k] = of_piece[walls[k]], bounce[k, 3]
-        directions = np.arctan2(y, x), _angle_rad(edges.face_rad[edge], exterior, x, y), exterior
-        face, utd = (edges.material[edge, 0], edges.material[edge, 1]), _constants(edges, edge)
+        directions = np.arctan2(y, x), _angle_rad(face_rad[edge], exterior, x, y), exterior
+        face, utd = (own[edge, 0], own[edge, 1]), _constants(edges, edge)
         pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, *directions, utd, face)
         bounds = most, faces, power, heights[rx], highest, negligible[rx]
         out, rough = _list_pair(media, room, arrivals, pair, bounds, scratch, out)
@@ -478,7 +473,7 @@ def _heights(room, size):
     return heights
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
     """Add the paths of a pair; return the unlisted power: of paths with a rough bound below `negligible`."""
     (_, largest, flat, wavelength), (material, cosine, terms, weight) = media, scratch
@@ -490,18 +485,14 @@ def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
     pairs, joined, bound, used = out
     unlisted, size, first, last = 0.0, len(heights), arrivals.start[pair.edge], arrivals.start[pair.edge + 1]
     most_after = _most_at_walls(largest, material, cosine, pair.after, onward, highest)
-    free_space, azimuth = (
-        (wavelength / (4.0 * np.pi) * most_after) ** 2,
-        int(np.degrees(pair.azimuth_rad) + 360.5) % 360,
-    )
-    departure, is_weak = (0.0, 0.0, 0.0, 0.0), True
+    azimuth, departure, is_weak = int(np.degrees(pair.azimuth_rad) + 360.5) % 360, (0.0, 0.0, 0.0, 0.0), True
     for j in range(first, last):
         left, length = pair.left - reflections[j], lengths[j]
         if left < 0:
             continue
-        rough = free_space * power[j, azimuth] / (onward * (length + onward))
+        rough = most_after**2 * power[j, azimuth] / (onward * (length + onward))
         if rough < negligible:
-            unlisted += EXPECTED * rough
+            unlisted += _EXPECTED * rough
             continue
         if is_weak:
             departure, is_weak = wedge_angle(pair.angle_rad, pair.exterior_rad), False
@@ -516,7 +507,7 @@ def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
             if height < 0.0:
                 continue
             if rough * weight[variant] < negligible:
-                unlisted += EXPECTED * rough * weight[variant]
+                unlisted += _EXPECTED * rough * weight[variant]
                 continue
             total = np.sqrt((length + onward) ** 2 + height**2)
             sine = (length + onward) / total
@@ -532,7 +523,7 @@ def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
     return (pairs, joined, bound, used), unlisted
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _weigh_variants(largest, flat, heights, length, weight):
     """Write the largest powers of variants relative to a path in the plan."""
     for variant in range(len(heights)):
@@ -555,6 +546,7 @@ def _spread(wavelength, length, onward):
 
 @njit(cache=True)
 def _most_of_arrivals(materials, arrivals, material, highest):
+    """Return bounds (J,) of the fields of arrivals, and the coefficients (J, 2) of both faces of the edge."""
     most, faces = np.empty(len(arrivals.lit)), np.empty((len(arrivals.lit), 2), np.complex128)
     for edge in range(len(arrivals.start) - 1):
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
@@ -569,7 +561,7 @@ def _most_of_arrivals(materials, arrivals, material, highest):
 
 @njit(cache=True)
 def _diffracted_power(edges, arrivals, most, faces, wavelength):
-    """Return bounds (J, 360) of the power of arrivals after the edge by azimuth, as in `Origins`."""
+    """Return bounds (J, 360) of the power of arrivals by azimuth after the edge, to be divided by s and s + length."""
     power, terms = np.zeros((len(most), 360)), np.empty((4, 3))
     for edge in range(len(arrivals.start) - 1):
         exterior, utd = edges.exterior_rad[edge], _constants(edges, edge)
@@ -582,10 +574,10 @@ def _diffracted_power(edges, arrivals, most, faces, wavelength):
                 for k in range(4):  # the largest term within half a degree
                     near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
                     terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
-                length = arrivals.length_m[j]
-                boundary = np.sqrt(4.0 * np.pi / wavelength * length)
+                spread, reach = _spread(wavelength, arrivals.length_m[j], 1.0)
+                boundary = np.sqrt(reach * (1.0 + arrivals.length_m[j]))
                 size = most[j] * most_at_edge(terms, boundary, faces[j, 0], faces[j, 1])
-                power[j, azimuth] = wavelength / (4.0 * np.pi**2) * size**2 * arrivals.gain[j] / length
+                power[j, azimuth] = size**2 * spread * arrivals.gain[j]
     return power
 
 

@@ -18,7 +18,7 @@ from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.beams import Beams, BeamTree, Origins, Task, follow, needed_of, trace_beams
+from sionna_partial.tracing.plan.beams import Beams, BeamTree, Task, follow, needed_of, trace_beams
 from sionna_partial.tracing.plan.room import (
     FACES,
     Building,
@@ -336,8 +336,7 @@ class CrossingCandidates:
         for _ in range(limits.reflections + 1):
             weakest = limits.min_power(total)
             needed = needed_of(weakest, room, self.building.materials.wavelength_m)
-            task = Task(receivers, self.building, needed, transmitted, Origins.equal(1, count))
-            beams, pair, through = follow(tree, beams, task)
+            beams, pair, through = follow(tree, beams, Task(receivers, self.building, needed, transmitted))
             listed.append(self._paths(tree, pair, through, weakest))
             total += listed[-1].sums(count)
             tree = tree.extended(beams)
