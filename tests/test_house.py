@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 import pytest
 
@@ -235,6 +235,17 @@ for name in ("", *typer.main.get_command(app).commands):
         assert not libraries(reader) & {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
         assert len(own) <= 56
+
+    def test_a_prediction_runs_few_modules(self) -> None:
+        codes: set[CodeType] = set()
+        predict = sionna_partial.predict_map
+        sys.setprofile(lambda frame, *_: codes.add(frame.f_code))
+        try:
+            predict(ROOT / "scenes/apartment/step050/map.yaml", (2.0, 2.0), spacing_m=2.0)
+        finally:
+            sys.setprofile(None)
+        files = {code.co_filename for code in codes if code.co_name != "<module>"}
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 37
 
 
 class TestPublicNames:
