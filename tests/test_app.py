@@ -208,6 +208,8 @@ class TestTransmitters:
             assert [*window.answer.coverage["tx"].to_numpy()] == ["tx1", "tx2"]
         session.put([("tx1", 1.0, 1.2), ("tx2", *free)])
         assert (session.warnings, session.chosen) == ([], "tx1")
+        session.remove("tx1")
+        assert session.chosen == "tx2"
         window.settle()
 
 
