@@ -195,7 +195,8 @@ def _with_wide_integers(compiled: Any) -> Any:
     def call_template(arguments: Any, named: Any) -> Any:
         return template(tuple(map(wide, arguments)), {name: wide(kind) for name, kind in named.items()})
 
-    template, compiled.get_call_template = compiled.get_call_template, call_template
+    with suppress(AttributeError):  # NUMBA_DISABLE_JIT leaves the function itself
+        template, compiled.get_call_template = compiled.get_call_template, call_template
     return compiled
 
 

@@ -26,8 +26,8 @@ CHAINS = (
 ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "__version__"})
 
 
-SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters")
-"""Names that several examples call with equal arguments, and that take seconds."""
+SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters", "trace_links")
+"""Names that several examples call with equal arguments, and that take time."""
 
 
 @pytest.fixture(scope="module", autouse=True)
