@@ -195,10 +195,9 @@ class SceneSettings(Checked):
         `bridge_gap_m`.
     geometries : int or None
         Number of geometries, 1 to 16, over which powers of links without line of sight are averaged: the mapped
-        outlines, and outlines with vertices moved at random by 3 cm. None is 3 on nearly complete maps with range noise
+        outlines, and outlines with vertices moved at random by 2 cm. None is 3 on nearly complete maps with range noise
         (`PartialMap.wall_noise` above 0.05) and opaque walls, else 1. Gradients, channels, meshes, links with a folder
         and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
-        a folder and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
 
     Raises
     ------

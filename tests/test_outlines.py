@@ -265,6 +265,23 @@ def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: 
     assert farthest_from_walls(partial, outlines) < 2.0
 
 
+@pytest.mark.parametrize(("before", "behind", "noise"), [(0.0, 0.0, 0.0), (0.0, 0.03, 0.3), (0.7, 0.8, 0.5)])
+def test_outlines_are_in_the_middle_of_noisy_walls(before: float, behind: float, noise: float) -> None:
+    """Range noise fills cells before and behind a wall; single cells behind straight walls are its first sign."""
+    rng = np.random.default_rng(1)
+    state = np.full((320, 420), CellState.UNKNOWN)
+    for margin, fraction in ((9, behind), (10, 1.0), (11, before)):
+        inside = state[margin:-margin, margin:-margin]
+        inside[rng.random(inside.shape) < fraction] = CellState.WALL
+        inside[1:-1, 1:-1] = CellState.FREE
+    partial = PartialMap(state.astype(np.uint8), 0.05)
+    assert partial.wall_noise >= noise
+    assert (partial.wall_noise == 0.0) == (noise == 0.0)
+    walls = shapely.LinearRing([[10.5, 10.5], [409.5, 10.5], [409.5, 309.5], [10.5, 309.5]])
+    lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, wall_outlines(partial))))
+    assert shapely.distance(lines, shapely.points(shapely.segmentize(walls, 1.0).coords)).mean() < 0.25
+
+
 def test_niche_of_a_clean_wall_stays() -> None:
     wall = np.zeros((12, 70), dtype=bool)
     wall[2:7, 5:65] = True

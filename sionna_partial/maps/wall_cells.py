@@ -38,6 +38,12 @@ _RAGGED = 0.006, 0.012
 Plans have less than 0.001 (0.01 where tilted); lidars with range noise have 0.007 to 0.1.
 """
 
+_STRAY = (0.002, 0.01), (0.0, 0.5)
+"""Fractions of stray cells, and their noise. Maps without range noise have none, maps with 1 cm 0.01 to 0.1."""
+
+_MIN_FACES = 1000
+"""Number of faces below which a few stray cells are no evidence of noise."""
+
 _DEPTH_M = 0.0125
 """Depth of the wall cells behind faces at which the noise is 1 - 1/e [m]."""
 
@@ -88,7 +94,7 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     wall |= _hidden_corners(wall, free)[0]
     longest = int(bridge_gap_m / resolution_m + 1e-6)
     filled = _unknown_gaps(wall, free, longest)
-    noise = _noise(wall | filled, free, resolution_m)
+    noise = max(_noise(wall | filled, free, resolution_m), float(np.interp(_stray_cells(state), *_STRAY)))
     wall, free, roughness = _levelled(wall | filled, free)
     more = _unknown_gaps(wall, free, longest)
     wall, filled = wall | more, filled | more
@@ -133,6 +139,25 @@ def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
     ragged = np.interp(ragged_edges(wall), _RAGGED, (0.0, 1.0))
     return float(ragged * -math.expm1(-depth_m / _DEPTH_M)) if depth_m > 0.0 else 0.0
+
+
+def _stray_cells(state: States) -> float:
+    """Return the fraction of straight faces, seen from one side, behind which a single wall cell is.
+
+    Rays end in the first wall cell of an exact map.
+    """
+    faces = stray = 0
+    for turns in _TURNS:
+        turned = np.pad(np.rot90(state, turns), 2, constant_values=CellState.UNKNOWN)
+        free, wall, unknown = (turned == kind for kind in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
+        face = free[:, :-3] & wall[:, 1:-2]
+        face[1:-1] &= face[:-2] & face[2:]
+        behind = wall[:, 2:-1] & unknown[:, 3:]
+        alone = np.zeros_like(behind)
+        alone[1:-1] = unknown[:-2, 2:-1] & unknown[2:, 2:-1]
+        faces += int((face & (unknown[:, 2:-1] | wall[:, 2:-1])).sum())
+        stray += int((face & behind & alone).sum())
+    return stray / max(_MIN_FACES, faces)
 
 
 def ragged_edges(wall: Bools) -> float:

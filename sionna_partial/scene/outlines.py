@@ -21,13 +21,16 @@ from scipy.spatial import cKDTree
 from sionna_partial.arrays import Bools, Floats, Indices, States, cross, span_in_strip
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import fit_runs, wall_cells
+from sionna_partial.maps.wall_cells import LEAST_NOISE, fit_runs, row_runs, wall_cells
 from sionna_partial.process import njit
 
 _KEY = 1 << 32
 _LOOK_EDGES = 6
 _THROUGH_COSINE = -0.85
 _REACH_CELLS = 1.0
+_NOISY_REACH_CELLS = 2.0
+_LAYER_CELLS = 3
+_MIN_MIDDLES = 10
 _OFFSET_CELLS = 1.0
 _MIN_SHIFT_CELLS = 0.25
 
@@ -104,7 +107,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 
     `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
     staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
-    ragged faces (`fit_runs`).
+    ragged faces (`fit_runs`). Range noise puts cells before and behind walls; lines of noisy maps are in their middle.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
@@ -116,8 +119,11 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     graph = _wall_graph(walls.cells, cut_spurs=True)
     shift = _layer_shift(graph.points, walls.peeled)
     chains = [_fitted(graph, shift, points, (1.0 + walls.roughness) * tolerance_cells) for points in _chains(graph)]
+    noisy = walls.noise > LEAST_NOISE
+    if noisy:
+        _centre(chains, graph, state)
     while True:
-        lines, runs = _polylines(graph, chains)
+        lines, runs = _polylines(graph, chains, _NOISY_REACH_CELLS if noisy else _REACH_CELLS)
         if not _make_crossing_plain(lines, runs, chains):
             break
     outlines = _assembled(lines, 1.0)
@@ -285,7 +291,46 @@ def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: f
     return _FittedChain(chain, corners, first, lines, np.full(len(lines), is_square))
 
 
-def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points], list[Indices]]:
+def _centre(chains: list[_FittedChain], graph: _Graph, state: States) -> None:
+    """Move lines to the middle of noisy walls, on average over their points.
+
+    Lines with too few walls that are seen from one side move away from FREE cells as far as others do.
+    """
+    middle, (column, row) = _to_middle(graph.points, state), graph.points.T // 2
+    free = (state == CellState.FREE).astype(np.float64)
+    towards_free = np.stack([ndimage.prewitt(free, axis)[row, column] for axis in (1, 0)], axis=1)
+    moves, distances = [], [np.zeros(0)]
+    for chain in chains:
+        last = np.append(chain.first[1:], len(chain.points) - 1)
+        for line, start, end, plain in zip(chain.lines, chain.first, last, chain.plain, strict=True):
+            points, normal = chain.points[start : end + 1], np.array([-line[3], line[2]])
+            axis = int(abs(normal[1]) > abs(normal[0]))
+            offset = middle[points, axis] * normal[axis]
+            offset = offset[np.isfinite(offset)]
+            if not plain:
+                moves.append((line, normal, offset, (towards_free[points] @ normal).mean()))
+                distances.append(np.abs(offset))
+    distance = np.concatenate(distances)
+    depth = float(distance.mean()) if len(distance) >= _MIN_MIDDLES else 0.0
+    for line, normal, offset, side in moves:
+        away = -np.sign(side) * depth if abs(side) > 1.0 else 0.0
+        line[:2] += (offset.mean() if len(offset) >= _MIN_MIDDLES else away) * normal
+
+
+def _to_middle(points: NDArray[np.int64], state: States) -> Points:
+    """Return vectors along x and y to the middle of the wall between a FREE and an UNKNOWN cell; NaN elsewhere."""
+    middle = np.full((2, *state.shape), np.nan)
+    for offset, cells in ((middle[0], state), (middle[1].T, state.T)):
+        row, start, end = row_runs(cells == CellState.WALL)
+        sides = np.sort([cells[row, start - 1], cells[row, end]], axis=0)
+        taken = (sides == [[CellState.FREE], [CellState.UNKNOWN]]).all(axis=0) & (end - start <= _LAYER_CELLS)
+        for i, a, b in zip(row[taken], start[taken], end[taken], strict=True):
+            offset[i, a:b] = (a + b - 1) / 2.0 - np.arange(a, b)
+    column, row = points.T // 2
+    return np.asarray(middle[:, row, column].T)
+
+
+def _polylines(graph: _Graph, chains: list[_FittedChain], reach: float) -> tuple[list[Points], list[Indices]]:
     nodes = _placed_nodes(graph, chains)
     lines, runs = [], []
     for chain in chains:
@@ -303,7 +348,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain]) -> tuple[list[Points],
             elif plain[before[k]] or plain[after[k]]:
                 route.append(positions[k][None])
             else:
-                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k]))
+                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k], reach))
             owner += [before[k]] * (len(route[-1]) - 1) + [after[k]]
         if chain.closed and not fixed[-1]:
             owner = owner[len(route[0]) - 1 :]
@@ -339,13 +384,13 @@ def _closest(lines: Floats, near: Points) -> Points:
     return near + (moved if np.hypot(*moved) <= _REACH_CELLS else (offset[:, None] * normal).mean(axis=0))
 
 
-def _meeting(pair: Floats, near: Points) -> Points:
+def _meeting(pair: Floats, near: Points, reach: float) -> Points:
     direction = pair[:, 2:]
     feet = pair[:, :2] + ((near - pair[:, :2]) * direction).sum(axis=1, keepdims=True) * direction
     if abs(cross(direction[0], direction[1])) > 0.05:
         normal = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
         meeting = np.linalg.solve(normal, (normal * pair[:, :2]).sum(axis=1))
-        if np.hypot(*(meeting - near)) <= _REACH_CELLS:
+        if np.hypot(*(meeting - near)) <= reach:
             return np.asarray(meeting[None])
     if np.hypot(*(feet[1] - feet[0])) > _OFFSET_CELLS:
         return feet

@@ -37,7 +37,7 @@ SIONNA_LOAD_GHZ = 3.5
 """Frequency at which Sionna RT evaluates materials while loading [GHz]."""
 
 
-VERTEX_STD_M = 0.03
+VERTEX_STD_M = 0.02
 """Standard deviation of the vertices of drawn walls, in x and in y [m]."""
 
 
