@@ -253,7 +253,8 @@ class DiffractionCandidates(_EdgeCandidates):
         reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
         if not len(reached):
             return
-        bounds = *_bounds_of_arrivals(edges, arrivals, materials, highest_m), highest_m
+        most, faces, power = _bounds_of_arrivals(edges, arrivals, materials, highest_m)
+        bounds = most, faces, power, highest_m
         fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[reached])
         onward = np.minimum(self._walls_a_side, self._reflections - fewest)
         groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
