@@ -137,7 +137,7 @@ class _Edges(NamedTuple):
 class _EdgeTask(NamedTuple):
     """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
 
-    `most`, `faces` and `power` are as in `_most_of_arrivals` and `_diffracted_power`; paths rise `highest_m` at most.
+    `most`, `faces` and `power` are from `_bounds_of_arrivals`; paths rise `highest_m` at most.
     """
 
     tree: BeamTree
@@ -253,8 +253,8 @@ class DiffractionCandidates(_EdgeCandidates):
         reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
         if not len(reached):
             return
-        most, faces = _most_of_arrivals(materials, arrivals, edges.material, highest_m)
-        bounds = most, faces, _diffracted_power(edges, arrivals, most, faces, materials.wavelength_m), highest_m
+        most, faces, power = _bounds_of_arrivals(edges, arrivals, materials, highest_m)
+        bounds = most, faces, power, highest_m
         fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[reached])
         onward = np.minimum(self._walls_a_side, self._reflections - fewest)
         groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
@@ -546,40 +546,31 @@ def _spread(wavelength, length, onward):
 
 
 @njit(cache=True)
-def _most_of_arrivals(materials, arrivals, material, highest):
-    """Return bounds (J,) of the fields of arrivals, and the coefficients (J, 2) of both faces of the edge."""
+def _bounds_of_arrivals(edges, arrivals, materials, highest):
+    """Return bounds (J,) of the fields of arrivals, coefficients (J, 2) of the edge's faces, and bounds (J, 360).
+
+    The last are for the power after the edge by azimuth, to be divided by the length from there and the total length.
+    """
     most, faces = np.empty(len(arrivals.lit)), np.empty((len(arrivals.lit), 2), np.complex128)
-    for edge in range(len(arrivals.start) - 1):
-        for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
-            length, own = arrivals.length_m[j], material[edge, 0] if arrivals.lit[j] else material[edge, 1]
-            most[j] = _most_at_walls(
-                materials.largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
-            )
-            for k in range(2):
-                faces[j, k] = at_face(materials.reflection, own, arrivals.faces[j, k], 1.0, 0.0)[0]
-    return most, faces
-
-
-@njit(cache=True)
-def _diffracted_power(edges, arrivals, most, faces, wavelength):
-    """Return bounds (J, 360) of the power of arrivals by azimuth after the edge, to be divided by s and s + length."""
-    power, terms = np.zeros((len(most), 360)), np.empty((4, 3))
-    for edge in range(len(arrivals.start) - 1):
-        exterior, utd = edges.exterior_rad[edge], _constants(edges, edge)
-        for azimuth in range(360 if arrivals.start[edge] < arrivals.start[edge + 1] else 0):
+    power, terms = np.empty((len(most), 360)), np.empty((4, 3))
+    for j in range(len(most)):
+        edge, length, count = arrivals.edge[j], arrivals.length_m[j], arrivals.reflections[j]
+        most[j] = _most_at_walls(materials.largest, arrivals.material[j], arrivals.cosine[j], count, length, highest)
+        own, exterior = edges.material[edge, 0 if arrivals.lit[j] else 1], edges.exterior_rad[edge]
+        for k in range(2):
+            faces[j, k] = at_face(materials.reflection, own, arrivals.faces[j, k], 1.0, 0.0)[0]
+        angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
+        spread, reach = _spread(materials.wavelength_m, length, 1.0)
+        for azimuth in range(360):
             x, y = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
             departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
-            for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
-                angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
-                utd_terms(utd, angle, departure, terms)
-                for k in range(4):  # the largest term within half a degree
-                    near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
-                    terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
-                spread, reach = _spread(wavelength, arrivals.length_m[j], 1.0)
-                boundary = np.sqrt(reach * (1.0 + arrivals.length_m[j]))
-                size = most[j] * most_at_edge(terms, boundary, faces[j, 0], faces[j, 1])
-                power[j, azimuth] = size**2 * spread * arrivals.gain[j]
-    return power
+            utd_terms(_constants(edges, edge), angle, departure, terms)
+            for k in range(4):  # the largest term within half a degree
+                near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
+                terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
+            size = most[j] * most_at_edge(terms, np.sqrt(reach * (1.0 + length)), faces[j, 0], faces[j, 1])
+            power[j, azimuth] = size**2 * spread * arrivals.gain[j]
+    return most, faces, power
 
 
 @njit(cache=True)
