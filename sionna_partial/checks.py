@@ -75,7 +75,7 @@ def require_bool(name: str, value: object) -> None:
 
 
 def require_type(name: str, value: object, kind: type, remedy: str) -> None:
-    require(isinstance(value, kind), name, type(value).__name__, remedy)
+    require(isinstance(value, kind), name, value, remedy)
 
 
 def require_choice(name: str, value: object, choices: Iterable[str]) -> None:

@@ -329,9 +329,9 @@ def unzipped(content: bytes, most: int) -> dict[str, bytes]:
 def zipped(contents: Mapping[str, bytes]) -> bytes:
     """Return files as a zip archive; equal files give equal bytes."""
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(stream, "w") as archive:
         for name, content in contents.items():
-            archive.writestr(zipfile.ZipInfo(name), content)
+            archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     return stream.getvalue()
 
 

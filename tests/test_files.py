@@ -33,6 +33,7 @@ from sionna_partial.files import (
     require_writable,
     temporary_folder,
     unzipped,
+    zipped,
 )
 
 
@@ -84,6 +85,12 @@ def test_damaged_zip(content: bytes) -> None:
         unzipped(content, 10_000)
     with pytest.raises(MapError, match=r"the zip cannot be read \(it is damaged: .*: give a zip of a ROS map's YAML"):
         stored_map([("map.zip", content)], Path("nowhere"))
+
+
+def test_zip_is_small_and_returns_what_it_holds() -> None:
+    contents = {"zeros": bytes(10**6), "text": b"text"}
+    assert len(zipped(contents)) < 10_000
+    assert unzipped(zipped(contents), 10**7) == contents
 
 
 def test_channels_with_a_pipe(tmp_path: Path) -> None:
