@@ -1,6 +1,7 @@
 """Input is a regular file of bounded size; output is written whole or not at all."""
 
 import errno
+import gc
 import io
 import os
 import re
@@ -306,6 +307,7 @@ def test_file_size_limit_leaves_whole_files(tmp_path: Path) -> None:
                     call(tmp_path / f"{size}.{name}")
             finally:
                 resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    gc.collect()
     names = {path.name for path in tmp_path.iterdir()}
     assert not {name for name in names if name.startswith(".")}
     assert {f"{size}.nc" for size in (0, 150, 1000, 4000)}.isdisjoint(names)
