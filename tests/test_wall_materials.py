@@ -7,10 +7,11 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.files import temporary_folder
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction.features import features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.wall_materials import COMMON, RESIDUAL_DB, WallMaterials
+from sionna_partial.prediction.wall_materials import COMMON, P_SAME, RESIDUAL_DB, WallMaterials
 from sionna_partial.tracing.links import path_gain_db
 
 WIFI = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False)
@@ -26,9 +27,21 @@ def flat() -> sp.PartialMap:
 
 
 FLAT = flat()
+CONCRETE = sp.Material.named("concrete")
+PARTLY_CONCRETE = FLAT.with_wall_material(CONCRETE, [(2.3, -1.0), (2.7, -1.0), (2.7, 9.0), (2.3, 9.0)])
 RNG = np.random.default_rng(5)
 RX = np.column_stack([RNG.uniform(2.7, 9.4, 120), RNG.uniform(0.4, 3.0, 120), np.full(120, 1.4)])
 RX = RX[FLAT.radios_can_stand(RX)]
+
+
+def as_mesh(partial: sp.PartialMap) -> sp.PartialMap:
+    """Return the scene of a plan as a mesh whose faces have a name only if they are of concrete."""
+    with temporary_folder() as folder:
+        sp.export_scene(partial, folder / "scene")
+        (folder / "scene" / "map.yaml").unlink()
+        mesh = sp.load_map(folder / "scene" / "scene.xml").mesh
+    materials = tuple(CONCRETE if each.itu == CONCRETE.itu else None for each in mesh.materials)
+    return replace(partial, wall_material=None, wall_materials=(), mesh=replace(mesh, materials=materials))
 
 
 def model_of(material: str | None, settings: sp.TraceSettings = WIFI, partial: sp.PartialMap = FLAT) -> sp.LinkModel:
@@ -69,13 +82,18 @@ class TestCandidates:
         found = WallMaterials.at(frequency_hz)
         assert found.prior.sum() == pytest.approx(1.0)
         assert len(found.prior) == len(found.crossing_db) == len(found.names) == 16
-        assert {*found.names} <= {*COMMON}
+        assert {*found.names.ravel()} <= {*COMMON}
         assert found.crossing_db.min() + found.traced_db > 0.0
+        several = WallMaterials.at(frequency_hz, several=True)
+        np.testing.assert_allclose(several.prior[:16], found.prior * P_SAME)
+        assert several.prior.sum() == pytest.approx(1.0)
+        assert np.all(several.crossing_db[16:, 0] != several.crossing_db[16:, 1])
 
     def test_text(self):
         found = WallMaterials.at(2.4e9)
         assert found.text(np.eye(16)[0]) == "drywall 1.00"
         assert found.text(0.6 * np.eye(16)[0] + 0.4 * np.eye(16)[7]) == "drywall .60, concrete .40"
+        assert WallMaterials.at(2.4e9, several=True).text(np.eye(28)[18]) == "drywall 1.00; thick walls concrete 1.00"
 
     def test_predictions_need_fewer_paths(self):
         settings, power = sp.TraceSettings(2.4e9, diffraction=False), np.zeros(len(RX))
@@ -117,12 +135,12 @@ class TestPrediction:
         assert np.all(part.gain_std_db == 0.0)
         assert np.all(model_of("brick", replace(WIFI, refraction=False)).predict(TX, RX).gain_std_db == 0.0)
 
-    def test_known_walls_keep_their_material(self):
+    @pytest.mark.parametrize("converted", [lambda partial: partial, as_mesh], ids=["plan", "mesh"])
+    def test_known_walls_keep_their_material(self, converted):
         """The wall at x = 2.5 m is of concrete, and all others unknown: only they lose more under a candidate."""
         near = RX[RX[:, 0] < 4.7]
-        concrete = [(2.3, -1.0), (2.7, -1.0), (2.7, 9.0), (2.3, 9.0)]
         settings = replace(EVERY_PATH, max_depth=0)
-        model = model_of(None, settings, FLAT.with_wall_material("concrete", concrete))
+        model = model_of(None, settings, converted(PARTLY_CONCRETE))
         parts, _ = model.predict(TX, near).by_material
         named = model_of("concrete", settings).predict(TX, near)
         assert len(parts) == 16
@@ -131,8 +149,21 @@ class TestPrediction:
         traced_db = model.features(TX, far).gain_db
         lost_db = traced_db - np.array([part.gain_mean_db for part in model.predict(TX, far).by_material[0]])
         walls = (far[:, 0] > 5.0).astype(int) + (far[:, 0] > 7.4)
-        expected_db = model.wall_materials.crossing_db[:, None] * walls
+        expected_db = model.wall_materials.crossing_db[:, :1] * walls
         assert np.allclose(lost_db[:, traced_db > -120.0], expected_db[:, traced_db > -120.0], atol=0.5)
+
+    def test_meshes_and_plans_have_the_same_candidates(self):
+        mesh = as_mesh(PARTLY_CONCRETE)
+        parts, others = (
+            model_of(None, EVERY_PATH, each).predict(TX, RX).by_material[0] for each in (PARTLY_CONCRETE, mesh)
+        )
+        gains_db = (np.stack([part.gain_mean_db for part in each]) for each in (parts, others))
+        np.testing.assert_allclose(*gains_db, atol=0.3)
+        coverage = sp.predict_map(model_of(None, partial=mesh), TX, spacing_m=1.0, progress=False)
+        assert coverage.attrs["wall_material"].startswith("drywall .4")
+        assert mesh.unnamed_walls == pytest.approx(PARTLY_CONCRETE.unnamed_walls, abs=0.1)
+        named = replace(mesh, mesh=replace(mesh.mesh, materials=(CONCRETE,) * len(mesh.mesh.materials)))
+        assert not sp.Simulation(named, WIFI).material_unknown
 
     @pytest.mark.parametrize(
         ("partial", "settings"),
@@ -190,7 +221,7 @@ class TestMeasurements:
     def test_powers_find_the_material(self, material, least):
         model, measured = model_of(None), powers(material)
         fitted = self.fit(model, measured)
-        names = np.array(model.wall_materials.names)
+        names = model.wall_materials.names[:, 0]
         found = {name: fitted.material_weights[names == name].sum() for name in COMMON}
         assert max(found, key=found.get) == material, found
         assert found[material] > least
@@ -214,7 +245,7 @@ class TestMeasurements:
         other = self.fit(model, powers("concrete", rx, tx), tx)
         nothing = sp.Measurements(TX, np.zeros((0, 3)), np.zeros(0))
         fitted = self.fit(model, nothing, others=[other])
-        concrete = np.array(model.wall_materials.names) == "concrete"
+        concrete = model.wall_materials.names[:, 0] == "concrete"
         assert fitted.material_weights[concrete].sum() > model.wall_materials.prior[concrete].sum() + 0.15
         assert fitted.offset_db == pytest.approx(OFFSET_DB, abs=10.0)
 
