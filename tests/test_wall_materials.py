@@ -4,10 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from meshes import meshed
+from test_crossings import EVERY, rooms
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.files import temporary_folder
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction.features import features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -32,16 +33,6 @@ PARTLY_CONCRETE = FLAT.with_wall_material(CONCRETE, [(2.3, -1.0), (2.7, -1.0), (
 RNG = np.random.default_rng(5)
 RX = np.column_stack([RNG.uniform(2.7, 9.4, 120), RNG.uniform(0.4, 3.0, 120), np.full(120, 1.4)])
 RX = RX[FLAT.radios_can_stand(RX)]
-
-
-def as_mesh(partial: sp.PartialMap) -> sp.PartialMap:
-    """Return the scene of a plan as a mesh whose faces have a name only if they are of concrete."""
-    with temporary_folder() as folder:
-        sp.export_scene(partial, folder / "scene")
-        (folder / "scene" / "map.yaml").unlink()
-        mesh = sp.load_map(folder / "scene" / "scene.xml").mesh
-    materials = tuple(CONCRETE if each.itu == CONCRETE.itu else None for each in mesh.materials)
-    return replace(partial, wall_material=None, wall_materials=(), mesh=replace(mesh, materials=materials))
 
 
 def model_of(material: str | None, settings: sp.TraceSettings = WIFI, partial: sp.PartialMap = FLAT) -> sp.LinkModel:
@@ -135,7 +126,7 @@ class TestPrediction:
         assert np.all(part.gain_std_db == 0.0)
         assert np.all(model_of("brick", replace(WIFI, refraction=False)).predict(TX, RX).gain_std_db == 0.0)
 
-    @pytest.mark.parametrize("converted", [lambda partial: partial, as_mesh], ids=["plan", "mesh"])
+    @pytest.mark.parametrize("converted", [lambda partial: partial, lambda partial: meshed(partial, CONCRETE)])
     def test_known_walls_keep_their_material(self, converted):
         """The wall at x = 2.5 m is of concrete, and all others unknown: only they lose more under a candidate."""
         near = RX[RX[:, 0] < 4.7]
@@ -153,15 +144,21 @@ class TestPrediction:
         assert np.allclose(lost_db[:, traced_db > -120.0], expected_db[:, traced_db > -120.0], atol=0.5)
 
     def test_meshes_and_plans_have_the_same_candidates(self):
-        mesh = as_mesh(PARTLY_CONCRETE)
-        parts, others = (
-            model_of(None, EVERY_PATH, each).predict(TX, RX).by_material[0] for each in (PARTLY_CONCRETE, mesh)
-        )
-        gains_db = (np.stack([part.gain_mean_db for part in each]) for each in (parts, others))
+        """One wall is of concrete, and others are thin or thick."""
+        state = rooms().state.copy()
+        state[:, 60:62] = sp.CellState.WALL
+        plan = replace(rooms(), state=state)
+        plan = plan.with_wall_material(CONCRETE, [(0.9, 2.9), (1.3, 2.9), (1.3, 6.1), (0.9, 6.1)])
+        mesh, settings = meshed(plan, CONCRETE), replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1)
+        rx, gains_db = [(2.51, 7.23, 1.3), (5.3, 6.04, 1.5), (1.93, 3.81, 1.7)], []
+        for partial in (plan, mesh):
+            parts, _ = model_of(None, settings, partial).predict((-0.52, 4.13, 1.5), rx).by_material
+            gains_db.append([part.gain_mean_db for part in parts])
         np.testing.assert_allclose(*gains_db, atol=0.3)
-        coverage = sp.predict_map(model_of(None, partial=mesh), TX, spacing_m=1.0, progress=False)
-        assert coverage.attrs["wall_material"].startswith("drywall .4")
-        assert mesh.unnamed_walls == pytest.approx(PARTLY_CONCRETE.unnamed_walls, abs=0.1)
+        assert len(gains_db[0]) == 28
+        assert mesh.unnamed_walls == pytest.approx(plan.unnamed_walls, abs=0.1)
+        coverage = sp.predict_map(model_of(None, settings, mesh), (-0.52, 4.13, 1.5), spacing_m=2.0, progress=False)
+        assert coverage.attrs["wall_material"] == "drywall .36, brick .36, concrete .28"
         named = replace(mesh, mesh=replace(mesh.mesh, materials=(CONCRETE,) * len(mesh.mesh.materials)))
         assert not sp.Simulation(named, WIFI).material_unknown
 
@@ -248,6 +245,18 @@ class TestMeasurements:
         concrete = model.wall_materials.names[:, 0] == "concrete"
         assert fitted.material_weights[concrete].sum() > model.wall_materials.prior[concrete].sum() + 0.15
         assert fitted.offset_db == pytest.approx(OFFSET_DB, abs=10.0)
+
+    def test_thin_and_thick_walls_have_materials_of_their_own(self):
+        state = FLAT.state.copy()
+        state[:, [24, 72]] = sp.CellState.FREE
+        partial = sp.PartialMap(state, 0.1)
+        model, rx = model_of(None, partial=partial), RX[partial.radios_can_stand(RX)]
+        truth = partial.with_wall_material(CONCRETE, partial.thick_walls)
+        gain_db = model_of("drywall", partial=truth).predict(TX, rx).gain_mean_db
+        fitted = self.fit(model, sp.Measurements(TX, rx, gain_db + OFFSET_DB))
+        text = model.wall_materials.text(fitted.material_weights)
+        assert text.startswith("drywall")
+        assert "; thick walls concrete" in text
 
     def test_maps_say_what_the_walls_are(self):
         model, options = model_of(None), {"spacing_m": 1.0, "progress": False}
