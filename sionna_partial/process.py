@@ -176,11 +176,26 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         except RuntimeError:  # neither the package nor the home folder can be written
             numba.config.CACHE_DIR = os.environ["NUMBA_CACHE_DIR"] = _private_folder()
             with suppress(RuntimeError):
-                return _outdated_by_others(numba.njit(**options)(function))
-            return numba.njit(**(options | {"cache": False}))(function)
-        return _outdated_by_others(compiled)
+                return _with_wide_integers(_outdated_by_others(numba.njit(**options)(function)))
+            return _with_wide_integers(numba.njit(**(options | {"cache": False}))(function))
+        return _with_wide_integers(_outdated_by_others(compiled))
 
     return decorate
+
+
+def _with_wide_integers(compiled: Any) -> Any:
+    """Let compiled callers pass int64: numba would compile again for each literal and each narrower integer."""
+    from numba import types
+
+    def wide(kind: Any) -> Any:
+        kind = kind.literal_type if isinstance(kind, types.Literal) else kind
+        return types.int64 if isinstance(kind, types.Integer) and kind.bitwidth < 64 else kind
+
+    def call_template(arguments: Any, named: Any) -> Any:
+        return template(tuple(map(wide, arguments)), {name: wide(kind) for name, kind in named.items()})
+
+    template, compiled.get_call_template = compiled.get_call_template, call_template
+    return compiled
 
 
 def _outdated_by_others(compiled: Any) -> Any:

@@ -20,15 +20,14 @@ CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shuti
 
 
 class Tab:
-    """One page."""
-
     def __init__(self, socket: Any, downloads: Path, width: int, height: int) -> None:
         self._socket, self._numbers = socket, itertools.count(1)
         self.console: list[Any] = []
         for domain in ("Page", "Runtime", "Log"):
             self.send(f"{domain}.enable")
         self.send("Browser.setDownloadBehavior", behavior="allow", downloadPath=str(downloads))
-        self.resize(width, height)
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False}
+        self.send("Emulation.setDeviceMetricsOverride", **size)
 
     def post(self, method: str, **given: Any) -> int:
         """Send a command without waiting for its answer, and return its number."""
@@ -46,19 +45,12 @@ class Tab:
             if answer.get("id") == number:
                 return answer["result"]
 
-    def resize(self, width: int, height: int, *, mobile: bool = False) -> None:
-        self.send("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=mobile)
-
-    def open(self, url: str) -> None:
-        self.send("Page.navigate", url=url)
-
     def run(self, code: str) -> Any:
         found = self.send("Runtime.evaluate", expression=code, returnByValue=True, awaitPromise=True)
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
     def wait(self, code: str, seconds: float = 60.0) -> Any:
-        """Return the first true value of an expression."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             found = self.run(f"(() => {{ try {{ return {code} }} catch {{ return null }} }})()")
@@ -99,15 +91,12 @@ class Tab:
         ]
         return [entry for kind, entry in logged if kind not in ("log", "info", "debug", "verbose")]
 
-    def screenshot(
-        self, path: Path, *, whole: bool = False, part: tuple[float, float, float, float] | None = None
-    ) -> None:
-        """Write a PNG of the window, the whole page, or a part of it: left, top, width and height."""
+    def screenshot(self, path: Path, *, part: tuple[float, float, float, float] | None = None) -> None:
+        """Write a PNG of the window, or a part of it: left, top, width and height."""
         self.send("Page.bringToFront")
-        clip = (
-            {} if part is None else {"clip": dict(zip(("x", "y", "width", "height"), part, strict=True)) | {"scale": 1}}
-        )
-        picture = self.send("Page.captureScreenshot", format="png", captureBeyondViewport=whole, **clip)["data"]
+        names = ("x", "y", "width", "height")
+        clip = {} if part is None else {"clip": dict(zip(names, part, strict=True)) | {"scale": 1}}
+        picture = self.send("Page.captureScreenshot", format="png", **clip)["data"]
         path.write_bytes(base64.b64decode(picture))
 
 
@@ -132,7 +121,7 @@ def chromium(folder: Path) -> Iterator[Any]:
             with urllib.request.urlopen(request) as answer:
                 address = json.load(answer)["webSocketDebuggerUrl"]
             tab = Tab(stack.enter_context(connect(address, max_size=None)), folder, width, height)
-            tab.open(url)
+            tab.send("Page.navigate", url=url)
             return tab
 
         yield open_tab

@@ -15,8 +15,10 @@ class Called(Exception):
     """A function was called, with these arguments by name."""
 
 
-def run(*words: object) -> Result:
-    return CliRunner().invoke(cli.app, [str(word) for word in words])
+def run(*words: object, exit_code: int = 0) -> Result:
+    result = CliRunner().invoke(cli.app, [str(word) for word in words])
+    assert result.exit_code == exit_code, result.output
+    return result
 
 
 def arguments_of(monkeypatch: pytest.MonkeyPatch, functions: str, *words: object) -> dict[str, Any]:
@@ -31,7 +33,7 @@ def arguments_of(monkeypatch: pytest.MonkeyPatch, functions: str, *words: object
         for name in before:
             patch.setattr(sp, name, lambda *_, **__: None)
         patch.setattr(sp, last, record)
-        result = run(*words)
+        result = run(*words, exit_code=1)
     assert isinstance(result.exception, Called), result.output
     found: dict[str, Any] = result.exception.args[0]
     return {name: value.tolist() if isinstance(value, np.ndarray) else value for name, value in found.items()}

@@ -29,7 +29,6 @@ def command_line(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 @pytest.fixture
 def coverage() -> xr.Dataset:
-    """A coverage map of one transmitter, which a test may change."""
     from coverage_cases import small_coverage
 
     return small_coverage()
@@ -37,7 +36,6 @@ def coverage() -> xr.Dataset:
 
 @pytest.fixture
 def several() -> xr.Dataset:
-    """A coverage map of two transmitters, which a test may change."""
     from coverage_cases import small_coverage
 
     return small_coverage(several=True)

@@ -11,7 +11,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import Material
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, DiffractionCandidates
+from sionna_partial.tracing.plan.edges import DiffractionCandidates
 from sionna_partial.tracing.plan.reflections import SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import Materials, materials_of
@@ -194,15 +194,7 @@ def specular_blocks(
     return blocks_of(candidates.listed(np.zeros(len(rx_m)), pairs_at_once=pairs_at_once))
 
 
-def diffracted_blocks(
-    geometry: SceneGeometry,
-    wedges: Wedges,
-    tx_m: Floats,
-    rx_m: Floats,
-    max_depth: int,
-    walls_a_side: int = MAX_REFLECTIONS,
-) -> Blocks:
+def diffracted_blocks(geometry: SceneGeometry, wedges: Wedges, tx_m: Floats, rx_m: Floats, max_depth: int) -> Blocks:
     """List all candidates with a diffraction, and the fraction of the work done with each block."""
-    room, bounds = room_of(geometry, tx_m, rx_m), drywall()
-    candidates = DiffractionCandidates(geometry, wedges, room, max_depth, bounds, walls_a_side)
+    candidates = DiffractionCandidates(geometry, wedges, room_of(geometry, tx_m, rx_m), max_depth, drywall())
     return blocks_of(candidates.listed(np.zeros(len(rx_m))))

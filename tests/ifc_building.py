@@ -73,7 +73,6 @@ class Building:
         self.model.createIfcRelAssociatesMaterial(ifcopenshell.guid.new(), None, None, None, [part], whole)
 
     def rooms(self, level_m: float, level: int) -> list[Any]:
-        """Two rooms with a door between them, a window, and a thick column; the outer walls and the inner."""
         z = level_m, level_m + 2.8
         corners = [(0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (0.0, 5.0)]
         walls = [

@@ -52,7 +52,6 @@ def make_dataset(folder, table, frequency_hz=28e9, diffraction=None):
 
 
 def assert_same(first, second):
-    """Check that two tables hold the same links on the same maps."""
     for one, other, names in (
         (first, second, COLUMNS),
         (first.features, second.features, ("link_state", "unobserved_distance_m", "distance_m", "gain_db")),
@@ -73,5 +72,4 @@ def assert_same(first, second):
 
 
 def fitted_baselines():
-    """Return baselines with plausible values, without training."""
     return Baselines(Majority((0.3, 0.3, 0.4), (-150.0, -65.0, -85.0), (0.0, 6.0, 10.0)), quick_predictor())

@@ -26,6 +26,5 @@ def home(picture: str) -> sp.PartialMap:
 
 @cache
 def placed(picture: str = HALF_SEEN, **options: Any) -> sp.TransmitterPlacement:
-    """Place a transmitter with line of sight alone, and the paper's predictor."""
     settings = sp.TraceSettings(max_depth=0, diffraction=False)
     return sp.place_transmitter(home(picture), predictor="paper", trace_settings=settings, **options)

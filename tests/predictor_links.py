@@ -58,7 +58,6 @@ def corridor_of(phi):
 
 
 def walls_of_links(count, loss_db=60.0):
-    """Return what a trace shows of walls that lose so much, none of which any direct path crosses [dB]."""
     return {
         "straight_gain_db": np.full(count, -150.0),
         "straight_walls": np.zeros(count),
@@ -67,7 +66,6 @@ def walls_of_links(count, loss_db=60.0):
 
 
 def make_context(phi):
-    """Return the context of links along the corridor."""
     count = len(phi)
     tx_m = np.tile([0.0, 0.0, 1.5], (count, 1))
     linked, crossed_m = phi.link_state != OUTAGE, phi.unobserved_distance_m
@@ -87,7 +85,6 @@ def make_context(phi):
 
 
 def make_seen_links(count, seed=0):
-    """Return the links of `make_links` with a context and windows."""
     phi, state, gain_db = make_links(count, seed)
     phi = dataclasses.replace(phi, context=make_context(phi))
     return phi.with_windows(corridors(), corridor_of(phi)), state, gain_db
@@ -131,7 +128,6 @@ def features(
 
 
 def p_kept(phi):
-    """Probability that the true state is the partial one."""
     return 1.0 / (1.0 + np.exp(0.8 * phi.unobserved_distance_m - 3.0))
 
 
@@ -159,12 +155,6 @@ def assert_valid(prediction):
 @functools.cache
 def quick_predictor():
     return Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
-
-
-@functools.cache
-def trained_predictor():
-    settings = PredictorSettings(steps=400, batch_size=512, learning_rate=0.02)
-    return Predictor.fit(*make_links(12_000), settings=settings)
 
 
 @contextmanager

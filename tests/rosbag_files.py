@@ -94,11 +94,11 @@ def write_bag(path: Path, rows: Sequence[tuple[str, float, Any]]) -> Path:
     return path
 
 
-def write_drive(path: Path) -> None:
+def write_drive(path: Path) -> Path:
     """Write the bag that the documentation reads: a map, ten poses along x, and as many powers."""
     make = messages_of(path.name)
     rows: list[tuple[str, float, Any]] = [("/map", 1.0, make.grid([[100, 0, 0, 100]] * 3))]
     for time_s in range(10):
         rows.append(("/amcl_pose", time_s, make.pose_stamped(START_S + time_s, 5.0 + 0.2 * time_s, 8.0, 0.0)))
         rows.append(("/rssi", time_s, make.power(-50.0)))
-    write_bag(path, rows)
+    return write_bag(path, rows)

@@ -21,7 +21,6 @@ ERRORS = {"range_noise_m": 0.02, "drift_m_per_m": 0.001, "missed_wall_fraction":
 
 
 def furnished(home: sp.PartialMap, seed: int, pieces: int = 40) -> sp.PartialMap:
-    """Return a home with legs and boxes of 5 to 60 cm in its rooms."""
     rng, state = np.random.default_rng(seed), home.state.copy()
     for row, column in rng.permutation(np.argwhere(home.state == sp.CellState.FREE))[:pieces]:
         part = state[row : row + rng.integers(1, 12), column : column + rng.integers(1, 12)]
@@ -30,7 +29,6 @@ def furnished(home: sp.PartialMap, seed: int, pieces: int = 40) -> sp.PartialMap
 
 
 def explored(seed: int, kind: str, fusion: str) -> sp.PartialMap:
-    """Return the map that a lidar with errors has made of a building."""
     home = furnished(sp.make_home(seed, kind, locked_rooms=False), seed)
     sensor = sp.SensorSettings(**ERRORS, field_of_view_deg=360.0, range_m=8.0, heading_noise_deg=0.3, fusion=fusion)
     return sp.explore(home, steps=(0.95,), seed=seed, sensor=sensor)[0]

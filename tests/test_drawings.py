@@ -13,7 +13,6 @@ import pytest
 import shapely
 from ezdxf.document import Drawing
 
-import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps import drawing_lines
@@ -23,10 +22,6 @@ from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
-
-
-CORNERS = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
-"""A room of 5 x 4 m in millimetres, or 50 x 40 m in centimetres."""
 
 
 def drawing(units: int = 6, unit_m: float = 1.0, layer: str = "A-WALL") -> Drawing:
@@ -70,11 +65,19 @@ def require_rooms(partial: PartialMap) -> None:
     assert (partial.state == FREE).sum() * partial.resolution_m**2 == pytest.approx(7.6 * 4.8, rel=0.05)
 
 
-@pytest.mark.parametrize(("units", "unit_m"), [(6, 1.0), (4, 1e-3), (5, 1e-2), (1, 0.0254), (2, 0.3048)])
-@pytest.mark.parametrize("fmt", ["asc", "bin"])
-def test_rooms(tmp_path: Path, units: int, unit_m: float, fmt: Any) -> None:
-    drawing(units, unit_m).saveas(tmp_path / "plan.dxf", fmt=fmt)
-    partial = load_map(tmp_path / "plan.dxf")
+@pytest.mark.parametrize(
+    ("header", "unit_m", "fmt"),
+    [
+        *((0, 0.001, "asc"), (0, 0.01, "asc"), (4, 0.001, "asc"), (4, 1.0, "bin"), (6, 0.01, "asc")),
+        *((1, 0.0254, "asc"), (2, 0.3048, "bin")),
+    ],
+)
+def test_rooms_in_any_unit(tmp_path: Path, header: int, unit_m: float, fmt: Any) -> None:
+    drawing(header, unit_m).saveas(tmp_path / "plan.dxf", fmt=fmt)
+    is_right = {1: 0.0254, 2: 0.3048, 4: 0.001}.get(header) == unit_m
+    message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
+    with nullcontext() if is_right else pytest.warns(MapWarning, match=message):
+        partial = load_map(tmp_path / "plan.dxf")
     require_rooms(partial)
     assert (partial.resolution_m, partial.wall_height_m) == (0.05, 3.0)
 
@@ -86,8 +89,6 @@ def test_options(tmp_path: Path) -> None:
     assert states(closed, (1.5, 0.12)) == [WALL]
     with pytest.raises(MapError, match=r"height_band_m is for scans alone, but path = '.*dxf' is a drawing: leave"):
         load_map(tmp_path / "plan.dxf", height_band_m=(0, 1))
-    with pytest.raises(MapError, match=r"path = 3 is not a path: give a drawing \(\.dxf\)"):
-        map_from_drawing(3)  # type: ignore[arg-type]
 
 
 REPORTS = Path(__file__).parent / "reports"
@@ -116,65 +117,34 @@ def test_wrong_units(name: str, unit_m: float, message: str | None) -> None:
     assert given == replace(report, unit_source="unit_m")
 
 
-@pytest.mark.parametrize("header", [0, 4, 5, 6])
-@pytest.mark.parametrize("unit_m", [0.001, 0.01, 1.0])
-def test_units_of_a_plan(tmp_path: Path, header: int, unit_m: float) -> None:
-    drawing(header, unit_m).saveas(tmp_path / "plan.dxf")
-    is_right = {4: 0.001, 5: 0.01, 6: 1.0}.get(header) == unit_m
-    message = "give unit_m" if header else r"has no unit \(\$INSUNITS = 0\), and walls of .* units, which are read as"
-    with nullcontext() if is_right else pytest.warns(MapWarning, match=message):
-        require_rooms(load_map(tmp_path / "plan.dxf"))
-
-
-@pytest.mark.parametrize(("unit_m", "used_m"), [(0.01, 0.001), (1.0, 1.0)])
-def test_a_doubtful_unit_is_named(tmp_path: Path, unit_m: float, used_m: float) -> None:
-    """A hall without doors, and a drawing whose walls alone do not fit the header."""
-    doc = ezdxf.new(units=4 if used_m < 1 else 6)
-    scale = 1 / unit_m
-    for x in range(0, 40, 4):
-        for y, end in ((0, 2.4), (3.3, 8), (8.9, 16)):
-            doc.modelspace().add_line((x * scale, y * scale), (x * scale, end * scale), dxfattribs={"layer": "WALL"})
-    square = np.array([(0, 0), (36, 0), (36, 16), (0, 16)]) * scale
-    doc.modelspace().add_lwpolyline(square.tolist(), close=True, dxfattribs={"layer": "WALL"})
-    doc.saveas(tmp_path / "plan.dxf")
-    with pytest.warns(MapWarning, match="centimetres") if unit_m < 1 else nullcontext():
-        report = load_map(tmp_path / "plan.dxf").import_report
-    assert report is not None
-    assert report.extent_m == pytest.approx((36, 16), abs=0.06)
-
-
 @pytest.mark.parametrize(
-    ("name", "state", "message"),
+    ("name", "is_used", "message"),
     [
-        ("A-WALL-FULL-N", sp.LinkState.OUTAGE, None),
-        ("A-WALL-FULL-D", sp.LinkState.LOS, None),
-        ("A-WALL-DEMO", sp.LinkState.LOS, None),
-        ("E-LITE-WALL", sp.LinkState.LOS, None),
-        ("A-WALL-PRHT", sp.LinkState.OUTAGE, "has walls of partial height on .* give layer_heights_m to map_from_draw"),
+        ("A-WALL-FULL-N", True, None),
+        ("A-WALL-FULL-D", False, None),
+        ("A-WALL-DEMO", False, None),
+        ("E-LITE-WALL", False, None),
+        ("A-WALL-PRHT", True, "has walls of partial height on .* give layer_heights_m to map_from_draw"),
     ],
 )
-def test_layers_by_the_standard(name: str, state: sp.LinkState, message: str | None) -> None:
-    path = REPORTS / "dxf_layers" / f"{name}.dxf"
+def test_layers_by_the_standard(name: str, is_used: bool, message: str | None) -> None:
     with pytest.warns(MapWarning, match=message) if message else nullcontext():
-        partial = load_map(path)
+        partial = load_map(REPORTS / "dxf_layers" / f"{name}.dxf")
     assert partial.import_report is not None
     used = {row.name for row in partial.import_report.used}
-    assert (name in used) == (state == sp.LinkState.OUTAGE)
+    assert (name in used) == is_used
     assert used | {row.name for row in partial.import_report.skipped} == {"A-WALL-FULL-E", name}
-    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [state]
+    assert states(partial, (6.02, 4)) == [WALL if is_used else FREE]
 
 
 def test_heights_of_layers() -> None:
     path = REPORTS / "dxf_layers" / "A-WALL-PRHT.dxf"
     partial = map_from_drawing(path, layer_heights_m={"*-prht": 1.1})
     assert partial.obstacle_heights_m == (1.1,)
-    assert sp.trace_links(partial, (3, 4, 1.5), [(9, 4.3, 1.5)]).link_state.tolist() == [sp.LinkState.LOS]
     points_m = np.array([[6.02, 4, 1.0], [6.02, 4, 1.2], [0.02, 4, 1.2]])
     assert partial.is_wall_at(points_m).tolist() == [True, False, True]
     with pytest.raises(MapError, match=r"layer_heights_m\['\*'\] = -1 is not allowed: give a height"):
         map_from_drawing(path, layer_heights_m={"*": -1})
-    with pytest.raises(MapError, match=r"layer_heights_m = 1 is not allowed: give values by the names of layers"):
-        map_from_drawing(path, layer_heights_m=1)  # type: ignore[arg-type]
 
 
 LAYERS = {
@@ -213,9 +183,7 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
         space.add_lwpolyline(corners, close=True, dxfattribs={"layer": "Base"})
     space.add_lwpolyline([(-20, -20), (50, -20), (50, 40), (-20, 40)], close=True, dxfattribs={"layer": "Rahmen"})
     doc.saveas(tmp_path / "plan.dxf")
-    message = (
-        r"walls on \['wand'\] that enclose hardly any area, so layer 'Base' \(2 lines\) is read .* Wand \(5 lines\)"
-    )
+    message = r"walls on \['wand'\] that enclose hardly any area, so layer 'Base' \(2 lines\) is read"
     with pytest.warns(MapWarning, match=message):
         partial = load_map(tmp_path / "plan.dxf")
     assert states(partial, (2, 2), (8, 2), (8, 6), (0.1, 4), (5.1, 1)) == [FREE, FREE, FREE, WALL, WALL]
@@ -224,27 +192,13 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
     assert [(row.name, row.reason) for row in partial.import_report.skipped] == [("Rahmen", "name of no wall")]
 
 
-def test_hardly_any_area(tmp_path: Path) -> None:
-    doc = ezdxf.new(units=6)
-    for corners in ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 9), (12, 9), (12, 9.2), (0, 9.2)]):
-        doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
-    doc.saveas(tmp_path / "plan.dxf")
-    with pytest.warns(MapWarning) as caught:
-        load_map(tmp_path / "plan.dxf")
-    message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
-    assert re.search(message, str(caught[0].message))
-
-
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
     drawing().saveas(tmp_path / "plan.dxf")
-    with pytest.warns(
-        MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* resolution_m of 0\.1"
-    ):
+    with pytest.warns(MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* of 0\.1"):
         load_map(tmp_path / "plan.dxf", resolution_m=0.25)
 
 
 def test_skipped_elements_are_listed(tmp_path: Path) -> None:
-    """Texts and points on layers of walls, blocks in other files, hidden and demolished walls."""
     doc = drawing()
     space = doc.modelspace()
     space.add_point((1, 1), dxfattribs={"layer": "A-WALL"})
@@ -261,9 +215,7 @@ def test_skipped_elements_are_listed(tmp_path: Path) -> None:
     assert report is not None
     assert [(row.name, row.count) for row in report.used] == [("A-GLAZ", 2), ("A-WALL", 8)]
     assert [(row.name, row.count, row.reason) for row in report.skipped] == [
-        ("A-DOOR", 1, "major group of no wall (AIA/NCS)"),
-        ("A-WALL-DEMO", 1, "to be demolished"),
-        ("A-WALL-HEAD", 1, "texts, dimensions or door headers"),
+        *((name, 1, skip_reason(name)) for name in ("A-DOOR", "A-WALL-DEMO", "A-WALL-HEAD")),
         ("AEC_WALL", 1, "object of another program: explode them"),
         ("HIDDEN WALLS", 1, "hidden"),
         ("POINT on A-WALL", 1, "type without lines"),
@@ -272,8 +224,7 @@ def test_skipped_elements_are_listed(tmp_path: Path) -> None:
     ]
 
 
-def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Scaled, mirrored and turned blocks within blocks are where ezdxf explodes them; each is read once."""
+def test_blocks_are_where_ezdxf_explodes_them(tmp_path: Path) -> None:
     doc = drawing()
     inner, outer = doc.blocks.new("INNER"), doc.blocks.new("OUTER", base_point=(0.1, 0.2))
     inner.add_lwpolyline([(0, 0, 0.3), (0.4, 0), (0.4, 0.2)], format="xyb")
@@ -283,12 +234,7 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     for x in range(1, 4):
         placed = doc.modelspace().add_blockref("OUTER", (x, 1.5), dxfattribs={"layer": "A-WALL", "rotation": 50 * x})
         placed.set_scale(0.7 * x).grid((2, x), (0.9, 0.8))
-    lines = drawing_lines.DrawnLines(tmp_path, doc)
-    read = list[str]()
-    pieces = drawing_lines._pieces
-    monkeypatch.setattr(drawing_lines, "_pieces", lambda entity: read.append(entity.dxftype()) or pieces(entity))
-    found = lines.segments({"a-wall"})[0]
-    assert read.count("ARC") == 1
+    found = drawing_lines.DrawnLines(tmp_path, doc).segments({"a-wall"})[0]
 
     def exploded(entities: Any) -> Iterator[Any]:
         for entity in entities:
@@ -296,15 +242,13 @@ def test_blocks_are_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
                 for one in entity.multi_insert() if entity.mcount > 1 else [entity]:
                     yield from exploded(one.virtual_entities())
             elif entity.dxf.layer in ("0", "A-WALL"):
-                yield from (lines[..., :2] for lines in pieces(entity))
+                yield from (lines[..., :2] for lines in drawing_lines._pieces(entity))
 
     expected = np.concatenate(list(exploded(doc.modelspace().query("*[layer=='A-WALL']"))))
     near = shapely.MultiLineString(list(expected)).buffer(0.002)
     assert near.covers(shapely.MultiLineString(list(found)))
-    assert shapely.length(shapely.multilinestrings(found)) == pytest.approx(
-        shapely.length(shapely.multilinestrings(expected)), rel=0.01
-    )
-    assert lines.line_counts()["a-wall"] == 8 + 2 * 2 * (1 + 2 + 3)
+    length, expected_length = (np.linalg.norm(np.diff(pieces, axis=1)).sum() for pieces in (found, expected))
+    assert length == pytest.approx(expected_length, rel=0.01)
 
 
 def test_layers_without_names(tmp_path: Path) -> None:
@@ -341,21 +285,13 @@ def test_every_kind_of_line(tmp_path: Path) -> None:
     require_rooms(partial)
 
 
-def spoiled(change: Callable[[Drawing], object], units: int = 6, unit_m: float = 1.0) -> Callable[[Path], None]:
+def spoiled(change: Callable[[Drawing], object], units: int = 6) -> Callable[[Path], None]:
     def write(path: Path) -> None:
-        doc = drawing(units, unit_m)
+        doc = drawing(units)
         change(doc)
         doc.saveas(path)
 
     return write
-
-
-def blocks_in_blocks(doc: Drawing) -> None:
-    for level in range(12):
-        block = doc.blocks.new(f"B{level}")
-        for _ in range(10 if level else 0):
-            block.add_blockref(f"B{level - 1}", (0, 0))
-    doc.modelspace().add_blockref("B11", (0, 0), dxfattribs={"layer": "A-WALL"})
 
 
 def endless_block(doc: Drawing) -> None:
@@ -366,7 +302,8 @@ def endless_block(doc: Drawing) -> None:
 
 def room_alone(doc: Drawing) -> None:
     doc.modelspace().delete_all_entities()
-    doc.modelspace().add_lwpolyline(CORNERS, close=True, dxfattribs={"layer": "A-WALL"})
+    corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
+    doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "A-WALL"})
 
 
 @pytest.mark.parametrize(
@@ -376,13 +313,10 @@ def room_alone(doc: Drawing) -> None:
         (lambda path: path.write_bytes(b""), {}, "is damaged or no DXF (it does not end with EOF): export it again."),
         (spoiled(lambda doc: None), {"wall_layers": ["WALLS"]}, "wall_layers = ['WALLS'] are none of path = "),
         (spoiled(lambda doc: None), {"wall_layers": ["A-DOOR"]}, "the walls of ['a-door'] enclose nothing: name"),
-        (spoiled(lambda doc: None), {"wall_layers": ["Defpoints"]}, "has no lines on ['defpoints']: name layers"),
         (spoiled(lambda doc: None), {"wall_layers": "A-WALL"}, "wall_layers = 'A-WALL' is not allowed: give names"),
-        (spoiled(lambda doc: None), {"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres"),
         (spoiled(lambda doc: None), {"unit_m": 0.001}, "has walls that span 0.0082 x 0.0052 m with unit_m = 0.001:"),
         (spoiled(room_alone, 0), {}, "has no unit ($INSUNITS = 0), and walls of 5000 units: give unit_m"),
         (spoiled(lambda doc: doc.modelspace().delete_all_entities()), {}, "has no lines on ['a-glaz', 'a-wall']"),
-        (spoiled(blocks_in_blocks), {}, "has more than 1,000 entities in blocks, or 1,000,000 pieces of lines: save"),
         (spoiled(endless_block), {}, "has more than 1,000 entities in blocks"),
     ],
 )
@@ -391,14 +325,3 @@ def test_refused(tmp_path: Path, write: Callable, given: Any, message: str, monk
     write(tmp_path / "plan.dxf")
     with pytest.raises(MapError, match=re.escape(message)):
         map_from_drawing(tmp_path / "plan.dxf", **given)
-
-
-@pytest.mark.parametrize("fmt", ["asc", "bin"])
-def test_every_truncation(tmp_path: Path, fmt: Any) -> None:
-    path = tmp_path / "plan.dxf"
-    drawing().saveas(path, fmt=fmt)
-    content = path.read_bytes()
-    for size in range(0, len(content) - 10, len(content) // 20):
-        path.write_bytes(content[:size])
-        with pytest.raises(MapError, match=r"is damaged or no DXF"):
-            map_from_drawing(path)

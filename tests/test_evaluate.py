@@ -1,22 +1,27 @@
 import dataclasses
 import math
-import re
 
 import numpy as np
 import pytest
 from link_tables import fitted_baselines, make_dataset, make_table
-from predictor_links import NLOS, OUTAGE, QUIET, quick_predictor
+from predictor_links import LOS, NLOS, OUTAGE, QUICK, QUIET, assert_valid, make_links, quick_predictor
 
+from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.evaluation import (
-    ALWAYS_OUTAGE,
     WITH_INDOOR,
     WITHOUT_INDOOR,
     Baselines,
     Majority,
+    baseline_predictions,
     evaluate,
+    indoor_gain_db,
+    indoor_los_probability,
     measure,
+    nothing_seen,
+    tr38901_indoor,
 )
+from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER
 
@@ -34,7 +39,7 @@ def trained_on(*homes):
 
 @pytest.fixture(scope="module")
 def table():
-    return make_table(homes=4)
+    return make_table(homes=4, links=100)
 
 
 @pytest.fixture(scope="module")
@@ -52,17 +57,11 @@ class TestEvaluate:
             assert [(row.ends_seen, row.model) for row in rows] == [
                 (ends, answer) for ends in ("all", "both", "one", "none") for answer in ANSWERS
             ]
-        assert [(each, found.state.links.sum()) for each, found in evaluation.calibrations.items()] == [
-            (0, 900),
-            (100, 900),
-        ]
-
-    def test_links_are_split_by_ends_seen(self, evaluation):
-        for receivers, answer in (("indoor", "majority"), ("anywhere", WITH_INDOOR)):
-            rows = evaluation.select(homes="test", receivers=receivers, stage=0, model=answer)
-            total, *parts = (row.metrics.links for row in rows)
-            assert total == sum(parts) == 3 * 300
-            assert min(parts) > 0
+        assert [found.state.links.sum() for found in evaluation.calibrations.values()] == [300, 300]
+        rows = evaluation.select(homes="test", receivers="anywhere", stage=0, model=WITH_INDOOR)
+        total, *parts = (row.metrics.links for row in rows)
+        assert total == sum(parts) == 3 * 100
+        assert min(parts) > 0
 
     def test_figures_are_those_of_the_links(self, table, evaluation):
         chosen = np.isin(table.home, ["home 0", "home 2", "home 3"]) & ~table.anywhere & (table.stage == 100)
@@ -72,20 +71,12 @@ class TestEvaluate:
         assert row.metrics.as_json() == pytest.approx(expected)
 
     def test_the_indoor_model_helps_where_receivers_may_be_outside(self, evaluation):
-        for homes in ("test", "train"):
-            for stage in (0, 100):
-                rows = evaluation.select(homes=homes, receivers="anywhere", stage=stage, ends_seen="all")
-                found = {row.model: row.metrics for row in rows}
-                with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
-                assert with_it.accuracy > without.accuracy + 0.05
-                for name in ("rmse_db", "nll_state", "calibration_error"):
-                    assert getattr(with_it, name) < getattr(without, name), name
-
-    def test_always_outage_is_right_as_often_as_there_is_one(self, table, evaluation):
-        (row,) = evaluation.select(homes="train", receivers="anywhere", stage=0, ends_seen="all", model=ALWAYS_OUTAGE)
-        truth = table.link_state[(table.home == "home 1") & table.anywhere & (table.stage == 0)]
-        assert row.metrics.accuracy == np.mean(truth == OUTAGE)
-        assert row.metrics.rmse_db > 0.0
+        rows = evaluation.select(homes="test", receivers="anywhere", stage=100, ends_seen="all")
+        found = {row.model: row.metrics for row in rows}
+        with_it, without = found[WITH_INDOOR], found[WITHOUT_INDOOR]
+        assert with_it.accuracy > without.accuracy + 0.05
+        for name in ("rmse_db", "nll_state", "calibration_error"):
+            assert getattr(with_it, name) < getattr(without, name), name
 
     def test_a_receiver_that_is_seen_is_indoors_for_certain(self, table):
         doubtful = quick_predictor().fit_indoor(table.phi, np.zeros(len(table)))
@@ -153,30 +144,102 @@ class TestBaselines:
         assert rows[0] == rows[1] != []
 
 
-OTHERS = "give a data set of other homes, such as other seeds, or train with test_fraction above 0."
+def test_refused(table, tmp_path):
+    wifi = make_dataset(tmp_path, table.take(slice(10)), frequency_hz=60e9)
+    for predictor, dataset, baselines, message in (
+        (trained_on(), table, 5, "baselines = 5 is not allowed: give Baselines, or None"),
+        (trained_on(*set(table.home)), table, None, "was trained on all 4 homes of the data set"),
+        (trained_on(), table.take(slice(0)), None, "dataset has no links"),
+        (trained_on(), wifi, None, "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on"),
+    ):
+        with pytest.raises(PredictorError, match=message):
+            evaluate(predictor, dataset, baselines=baselines)
 
 
-@pytest.mark.parametrize(
-    ("predictor", "links", "baselines", "message"),
-    [
-        ((), slice(None), 5, "baselines = 5 is not allowed: give Baselines, or None"),
-        (
-            [f"home {index}" for index in range(4)],
-            slice(None),
-            None,
-            f"predictor 'fitted' was trained on all 4 homes of the data set: {OTHERS}",
-        ),
-        ((), slice(0), None, "dataset has no links"),
-        (
-            (),
-            None,
-            None,
-            "dataset was traced at 60 GHz with diffraction, predictor 'fitted' was trained on links at 28 GHz with "
-            "diffraction: choose another predictor",
-        ),
-    ],
-)
-def test_refused(table, predictor, links, baselines, message, tmp_path):
-    given = make_dataset(tmp_path, table, frequency_hz=60e9) if links is None else table.take(links)
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        evaluate(trained_on(*predictor), given, baselines=baselines)
+@pytest.fixture(scope="module")
+def fitted():
+    return Baselines.fit(make_table(homes=2), QUICK)
+
+
+def test_majority_by_hand():
+    state = np.array([LOS, LOS, NLOS, OUTAGE], dtype=np.uint8)
+    answer = Majority.fit(state, np.array([-60.0, -70.0, -90.0, -150.0])).predict(make_links(3)[0])
+    assert_valid(answer)
+    never = Majority.fit(np.array([LOS], dtype=np.uint8), np.array([-60.0])).predict(make_links(2)[0])
+    assert_valid(never)
+    assert never.p_nlos.tolist() == [0.0, 0.0]
+    assert (answer.p_los == 0.5).all()
+    assert (answer.p_outage == 0.25).all()
+    assert (answer.gain_los_mean_db == -65.0).all()
+    assert (answer.gain_los_std_db == 5.0).all()
+    assert answer.gain_mean_db == pytest.approx([-(60 + 70 + 90 + 150) / 4] * 3)
+
+
+class TestFittedBaselines:
+    def test_distance_alone_counts(self, fitted):
+        one, other = make_links(50, seed=1)[0], make_links(50, seed=2)[0]
+        moved = LinkFeatures(other.link_state, np.zeros(50), one.distance_m, other.gain_db)
+        seen = (fitted.distance.predict(nothing_seen(phi, 28e9)) for phi in (one, moved))
+        np.testing.assert_array_equal(*(answer.gain_mean_db for answer in seen))
+
+    def test_save_and_load(self, fitted, tmp_path):
+        fitted.save(tmp_path)
+        loaded = Baselines.load(tmp_path)
+        assert loaded.majority == fitted.majority
+        assert loaded.distance.fingerprint == fitted.distance.fingerprint
+
+    def test_missing_or_damaged_file(self, tmp_path):
+        for _ in ("missing", "damaged"):
+            with pytest.raises(PredictorError, match=r"majority\.json' cannot be read.*train the predictor beside it"):
+                Baselines.load(tmp_path)
+            (tmp_path / "majority.json").write_text('{"OUTAGE": 1}')
+
+
+def test_all_of_the_link_is_unobserved():
+    phi = nothing_seen(make_links(20)[0], 28e9)
+    assert set(phi.link_state) == {LOS}
+    np.testing.assert_array_equal(phi.unobserved_distance_m, phi.distance_m)
+    wavelength_m = 299_792_458.0 / 28e9
+    np.testing.assert_allclose(phi.gain_db, 20.0 * np.log10(wavelength_m / (4.0 * math.pi * phi.distance_m)))
+
+
+def test_los_probability_of_table_7_4_2_of_tr_38901():
+    mixed = indoor_los_probability(np.array([1.2, 5.9, 39.1]), "mixed")
+    np.testing.assert_allclose(mixed, [1.0, 0.36788, 0.11772], atol=2e-5)
+    open_office = indoor_los_probability(np.array([5.0, 40.4, 260.7]), "open")
+    np.testing.assert_allclose(open_office, [1.0, 0.60653, 0.19865], atol=2e-5)
+
+
+def test_gain_of_table_7_4_1_of_tr_38901():
+    """InH - Office, by hand; at 1 m NLOS would be stronger than LOS."""
+    for distance_m, frequency_hz, los_db, nlos_db in (
+        (1.0, 1e9, -32.4, -32.4),
+        (10.0, 28e9, -78.6432, -91.6342),
+        (100.0, 10e9, -87.0, -118.8),
+    ):
+        gains_db = indoor_gain_db(np.array([distance_m]), frequency_hz)
+        assert gains_db[LinkState.LOS][0] == pytest.approx(los_db, abs=1e-3)
+        assert gains_db[LinkState.NLOS][0] == pytest.approx(nlos_db, abs=1e-3)
+
+
+@pytest.mark.parametrize("office", ["mixed", "open"])
+def test_tr_38901_is_a_mixture_without_outage(office):
+    distance_m = np.array([0.005, 0.5, 5.9, 30.0, 1e5])
+    answer = tr38901_indoor(LinkFeatures(np.full(5, LOS), np.zeros(5), distance_m, np.full(5, -90.0)), 28e9, office)
+    assert_valid(answer)
+    assert (answer.p_outage == 0.0).all()
+    assert (answer.gain_los_std_db == 3.0).all()
+    assert (answer.gain_nlos_std_db == 8.03).all()
+
+
+def test_all_baselines_answer_for_all_links(fitted):
+    phi = make_links(30)[0]
+    assert "paper" not in baseline_predictions(fitted, None, phi, 28e9)
+    found = baseline_predictions(fitted, fitted.distance, phi, 28e9)
+    assert list(found) == [
+        *("paper", "distance only", "majority", "partial trace"),
+        *("TR 38.901 mixed office", "TR 38.901 open office"),
+    ]
+    for answer in found.values():
+        assert_valid(answer)
+        assert len(answer.p_los) == 30

@@ -1,6 +1,4 @@
 import functools
-import math
-from pathlib import Path
 from typing import get_args
 
 import numpy as np
@@ -22,8 +20,6 @@ from sionna_partial.settings import Fusion, SensorSettings
 from sionna_partial.worlds.homes import make_home
 from sionna_partial.worlds.robot import FORWARD_M, TURN_DEG
 
-GIBSON = Path(__file__).resolve().parents[1] / ".." / "shared" / "gibson"
-
 CLOSET = """
 ##################
 #........##......#
@@ -39,17 +35,6 @@ CLOSET = """
 """
 """A bent room, and a closet (upper right) without a door."""
 
-STAIRS = """
-#########
-#.....###
-#....##.#
-#...##..#
-#..##...#
-#.##....#
-###.....#
-#########
-"""
-"""Two rooms on either side of a diagonal wall."""
 
 plan = functools.partial(drawn, resolution_m=0.2)
 NOISY = SensorSettings(0.05, 0.02, 0.1)
@@ -65,7 +50,7 @@ def exploration(home: PartialMap) -> Exploration:
     return explore_trajectory(home, (0, 30, 60), 3)
 
 
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=8)
 @given(home_seed=st.integers(0, 10**6), seed=st.integers(0, 10**6))
 def test_what_is_seen_is_true_and_grows(home_seed, seed):
     home = make_home(home_seed, "apartment", resolution_m=0.1)
@@ -84,14 +69,13 @@ def test_meshes_are_cut_to_what_is_seen():
     nothing, little, everything = explore(home, (0, 3, 200))
     assert len(nothing.mesh.triangles) == 0
     assert 0.0 < surface_m2(little.mesh) < surface_m2(everything.mesh) <= surface_m2(home.mesh) + 1e-6
-    for partial in (nothing, little, everything):
-        assert partial == cut_to_known(partial)
-        assert partial.height_range_m == (0.0, 3.0)
+    assert little == cut_to_known(little)
+    assert little.height_range_m == (0.0, 3.0)
 
 
 def test_closed_closet_is_never_seen():
     home = plan(CLOSET)
-    for seed in range(12):
+    for seed in range(6):
         (partial,) = explore(home, (300,), seed)
         left, right = home.state.copy(), home.state.copy()
         left[:, 9:][4:] = right[:, :10] = CellState.WALL
@@ -100,18 +84,9 @@ def test_closed_closet_is_never_seen():
         assert (seen & (right == CellState.FREE)).any() != (seen & (left == CellState.FREE)).any()
 
 
-def test_diagonal_walls_are_tight():
-    home = plan(STAIRS)
-    lower_right = np.add.outer(-np.arange(8), np.arange(9)) > 1
-    for seed in range(12):
-        (partial,) = explore(home, (200,), seed)
-        seen = partial.state == CellState.FREE
-        assert (seen & lower_right).any() != (seen & ~lower_right).any()
-
-
 def test_robot_sees_all_of_a_small_home_and_then_stays():
     home = plan(CLOSET.replace("#......#", "########"))
-    for seed in range(6):
+    for seed in range(3):
         found = explore_trajectory(home, (300, 301, 1000), seed)
         maps = found.maps
         assert maps[0].observed_fraction > 0.99
@@ -158,17 +133,11 @@ def test_stages_do_not_depend_on_which_are_asked_for(home, sensor):
     ("arguments", "message"),
     [
         *(
-            ({"steps": steps}, r"steps = .* is not allowed: give increasing whole numbers of 0 to 100,000")
-            for steps in ((), (5, 5), (10, 5), (-1,), (1.5,), (True,), 50, None, (10**9,))
+            ({"steps": steps}, "give increasing whole numbers of 0 to 100,000")
+            for steps in ((5, 5), (1.5,), 50, (10**9,))
         ),
-        *(
-            ({"steps": fractions}, r"steps = .* is not allowed: .* fractions of the free area in \[0, 1\)")
-            for fractions in ((0.5, 0.25), (0.5, 1.0), (-0.1, 0.5), (0.5, 1), (0.5, math.nan))
-        ),
-        *(
-            ({"seed": seed}, r"seed = .* is not allowed: give a whole number of 0 or more\.")
-            for seed in (-1, 0.5, "1", False)
-        ),
+        *(({"steps": steps}, r"fractions of the free area in \[0, 1\)") for steps in ((0.5, 0.25), (0.5, 1.0))),
+        ({"seed": -1}, r"seed = -1 is not allowed: give a whole number of 0 or more\."),
         ({"policy": "haste"}, "policy = 'haste' is not allowed: choose one of random, coverage"),
         ({"policy": "coverage", "tx": (99.0, 0.0)}, "tx = .* is outside the map"),
         ({"sensor": 0.1}, r"sensor = 0\.1 is not allowed: give SensorSettings\(\.\.\.\), or None"),
@@ -181,31 +150,21 @@ def test_refused(arguments, message):
         explore(**{"home": plan(CLOSET), **arguments})
 
 
-@pytest.mark.parametrize(
-    ("homes", "expected"),
-    [
-        ([HOUSE], [0.10, 0.18, 0.25, 0.26]),
-        ([VACUUM], [0.49, 0.53, 0.56, 0.74]),
-        (sorted(GIBSON.glob("*/map.yaml")), [0.30, 0.45, 0.55, 0.62]),
-    ],
-    ids=["cluttered house", "apartment of a vacuum robot", "real homes"],
-)
-def test_observed_fractions_on_real_homes(homes, expected):
-    if not homes:
-        pytest.skip("the real homes are not here")
-    seen = [[partial.observed_fraction for partial in explore(load_map(home), seed=0)] for home in homes]
-    assert np.mean(seen, axis=0) == pytest.approx(expected, abs=0.05)
+@pytest.mark.parametrize(("path", "expected"), [(HOUSE, [0.10, 0.18, 0.26]), (VACUUM, [0.49, 0.53, 0.74])])
+def test_observed_fractions_on_cluttered_homes(path, expected):
+    seen = [partial.observed_fraction for partial in explore(load_map(path), (50, 100, 200), seed=0)]
+    assert seen == pytest.approx(expected, abs=0.05)
 
 
 class TestFractions:
     def test_each_is_reached_and_not_long_before(self, home):
-        exploration = explore_trajectory(home, (0, 0.25, 0.5), 3)
+        exploration = explore_trajectory(home, (0, 0.5), 3)
         assert exploration.steps[0] == 0
-        for fraction, step, observed in zip(
-            (0.25, 0.5), exploration.steps[1:], exploration.observed_fractions[1:], strict=True
-        ):
-            assert observed >= fraction
-            assert explore(home, (step - 1,), 3)[0].observed_fraction < fraction
+        assert (
+            exploration.observed_fractions[1]
+            >= 0.5
+            > explore(home, (exploration.steps[1] - 1,), 3)[0].observed_fraction
+        )
         assert exploration.maps == explore(home, exploration.steps, 3)
 
     def test_what_cannot_be_seen_is_given_up(self):
@@ -213,18 +172,11 @@ class TestFractions:
         assert exploration.observed_fractions[1] < 0.99
         assert len(exploration.poses) == exploration.steps[1] + 1 < 2000
 
-    def test_large_buildings_and_errors(self):
-        building = make_home(7, "hall")
-        sensor = SensorSettings(0.03, 0.002, 0.05, 360.0, 15.0)
-        exploration = explore_trajectory(building, (0.25, 0.5, 0.75), 1, sensor=sensor)
-        assert (exploration.observed_fractions >= (0.25, 0.5, 0.75)).all()
-
 
 class TestTrajectory:
     def test_it_is_the_trajectory_of_explore(self, home, exploration):
         assert exploration.maps == explore(home, (0, 30, 60), 3)
         assert exploration.steps == (0, 30, 60)
-        assert (exploration.maps[0].state == CellState.UNKNOWN).all()
         fractions = [partial.observed_fraction for partial in exploration.maps]
         assert exploration.observed_fractions.tolist() == pytest.approx(fractions, abs=1e-12)
 
@@ -242,12 +194,6 @@ class TestTrajectory:
         assert (exploration.maps[-1].state_at(exploration.poses[:, :2]) == CellState.FREE).all()
         assert np.array_equal(exploration.poses, exploration.believed_poses)
 
-    def test_poses_are_in_the_world(self):
-        home = plan(CLOSET)
-        moved = PartialMap(home.state, home.resolution_m, (100.0, -50.0))
-        here, there = (explore_trajectory(each, (20,), 1).poses for each in (home, moved))
-        assert there == pytest.approx(np.add(here, [100.0, -50.0, 0.0]))
-
     def test_some_of_the_moments(self, home, exploration):
         some = exploration.at([30])
         assert (some.steps, some.maps) == ((30,), exploration.maps[1:2])
@@ -257,30 +203,13 @@ class TestTrajectory:
             with pytest.raises(SettingsError, match=r"steps = .* is not allowed: choose from the steps that were kept"):
                 exploration.at(steps)
 
-    def test_progress(self):
-        reported = []
-        explore_trajectory(plan(CLOSET), (25,), progress=lambda *report: reported.append(report))
-        assert [fraction for fraction, _ in reported] == [0.0, 0.4, 0.8, 1.0]
-        assert reported[-1][1] == "exploring: step 25"
-
 
 class TestSensor:
-    """What is mapped with errors; the home is an apartment, seen for 60 steps."""
-
-    def test_what_is_known_stays_known(self, home):
-        first, later = explore_trajectory(home, (30, 60), 3, sensor=NOISY).states
-        assert not ((first != CellState.UNKNOWN) & (later == CellState.UNKNOWN)).any()
-
     def test_wall_noise_grows_with_range_noise(self, home):
-        noises_m = (0.0, 0.02, 0.05)
-        for drift in (0.0, 0.002):
-            lidars = (SensorSettings(noise_m, drift, field_of_view_deg=360.0, range_m=12.0) for noise_m in noises_m)
-            found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
-            assert found == sorted(found), drift
-            assert drift > 0.0 or found[0] <= LEAST_NOISE
-            assert found[1] > 0.5
-            assert found[2] > found[1] + 0.02
+        lidars = [SensorSettings(noise_m, field_of_view_deg=360.0, range_m=12.0) for noise_m in (0.0, 0.02, 0.05)]
+        found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
         assert home.wall_noise == 0.0
+        assert found[0] <= LEAST_NOISE < 0.5 < found[1] < found[2] - 0.02
 
     @pytest.mark.parametrize("fusion", get_args(Fusion))
     def test_without_errors_all_mappers_make_the_true_map(self, home, fusion):
@@ -292,7 +221,6 @@ class TestSensor:
         travelled_m = np.concatenate([[0.0], np.hypot(*np.diff(exploration.poses[:, :2], axis=0).T).cumsum()])
         assert travelled_m[-1] > 3.0
         assert error_m[0] == 0.0
-        assert (error_m >= 0.02 * travelled_m - 1e-9).all()
         assert error_m == pytest.approx(0.02 * travelled_m, abs=0.02)
         assert np.array_equal(exploration.believed_poses[:, 2], exploration.poses[:, 2])
 

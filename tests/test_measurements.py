@@ -41,22 +41,16 @@ def csv_file(folder: Path, text: str) -> Path:
     return path
 
 
-def rows(columns: dict[str, NDArray[np.float64]]) -> str:
-    return "\n".join(",".join(f"{value:.17g}" for value in row) for row in zip(*columns.values(), strict=True))
-
-
 class TestForms:
     @pytest.mark.parametrize(
         "source",
         [
             Measurements(TX, RX, GAIN_DB),
             FIELDS,
-            FLAT,
             Frame({"tx": [*map(tuple, TX)], "rx": [*RX], "gain_db": [*GAIN_DB]}),
             Frame({name: [*values] for name, values in FLAT.items()}),
             xr.Dataset({"tx": (("link", "axis"), TX), "rx": (("link", "axis"), RX), "gain_db": ("link", GAIN_DB)}),
         ],
-        ids=["measurements", "mapping", "flat mapping", "frame of triples", "flat frame", "xarray"],
     )
     def test_all_give_the_same(self, source: object) -> None:
         found = measurements_of(source)
@@ -70,14 +64,6 @@ class TestForms:
         found = measurements_of(path)
         assert (found.tx.tolist(), found.rx.tolist(), found.gain_db.tolist()) == ([[3, 4, 1.5]], [[1, 2, 1.5]], [-80])
 
-    @pytest.mark.parametrize("end", ["\n", "\r", "\r\n"])
-    def test_csv(self, tmp_path: Path, end: str) -> None:
-        path = tmp_path / "measured.csv"
-        path.write_bytes(f"{HEADER}\n{rows(FLAT)}\n\n".replace("\n", end).encode())
-        found = measurements_of(str(path) if end == "\n" else path)
-        for name, values in FIELDS.items():
-            np.testing.assert_array_equal(getattr(found, name), values)
-
     def test_one_transmitter_and_copies(self) -> None:
         gain_db = GAIN_DB.copy()
         found = measurements_of({"tx": TX[0], "rx": RX, "gain_db": gain_db})
@@ -86,70 +72,46 @@ class TestForms:
         np.testing.assert_array_equal(found.tx, [TX[0]] * 3)
 
 
-class TestMerged:
-    def test_repetitions_are_averaged(self) -> None:
-        rows = np.array([2, 0, 1, 0, 2, 2])
-        moved = RX[rows] + np.linspace(-0.002, 0.002, 6)[:, None]
-        noise_db = np.array([0.0, 1.0, 0.0, -1.0, 3.0, -3.0])
-        links, link, variance = merged(Measurements(TX[rows], moved, GAIN_DB[rows] + noise_db))
-        assert link.tolist() == [0, 1, 2, 1, 0, 0]
-        np.testing.assert_array_equal(links.rx, moved[[0, 1, 2]])
-        np.testing.assert_allclose(links.gain_db, GAIN_DB[[2, 0, 1]])
-        np.testing.assert_allclose(variance, (1.0 + 1.0 + 9.0 + 9.0) / (3 + 10) / np.array([3, 2, 1]))
-
-    def test_too_many_links(self) -> None:
-        rx = np.column_stack([np.arange(6001) * 0.02, np.ones(6001), np.ones(6001)])
-        message = "measurements has 6,001 links that are not repetitions, more than 3,000: give one in 3, which"
-        with pytest.raises(MeasurementError, match=message):
-            merged(Measurements(TX[0], rx, np.full(6001, -80.0)))
-
-
-class TestMeasurements:
-    def test_outages(self) -> None:
-        found = Measurements(TX, RX, np.array([-139.9, -150.0, -157.0]))
-        assert found.is_outage.tolist() == [False, True, True]
-        assert len(found) == 3
-
-    @pytest.mark.parametrize(
-        ("changes", "message"),
-        [
-            ({"gain_db": GAIN_DB[:, None]}, "gain_db has shape (3, 1): give one gain for each link, (N,)."),
-            ({"gain_db": [-70.0, np.nan, np.nan]}, "gain_db[1] = nan (and 1 more) is not allowed: give finite numbers"),
-            ({"gain_db": [-70.0, -np.inf, -80.0]}, "gain_db[1] = -inf is not allowed: give finite numbers, or leave"),
-            ({"gain_db": [70.0, 80.0, 90.0]}, "gain_db[0] = 70 (and 2 more) is not allowed: path gains are negative;"),
-            ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
-            ({"gain_db": "loud"}, "gain_db = 'loud' is not numeric: give"),
-            ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
-            ({"rx": RX[:, :2]}, "rx has shape (3, 2) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
-            ({"rx": [[1.0, 2.0, 3.0], [1.0, np.nan, 3.0], [0, 0, 1]]}, "rx[1, 1] = nan is not allowed: give finite"),
-            ({"tx": [[1.0, 2.0, 3.0], [1.0, 3.0], [0, 0, 1]]}, "is not numeric: give finite numbers"),
-            ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "is not numeric: give finite numbers"),
-        ],
-    )
-    def test_what_is_unusable(self, changes: dict[str, object], message: str) -> None:
-        with pytest.raises(MeasurementError, match=re.escape(message)):
-            measurements_of({**FIELDS, **changes})
+def test_repetitions_are_averaged() -> None:
+    rows = np.array([2, 0, 1, 0, 2, 2])
+    moved = RX[rows] + np.linspace(-0.002, 0.002, 6)[:, None]
+    noise_db = np.array([0.0, 1.0, 0.0, -1.0, 3.0, -3.0])
+    links, link, variance = merged(Measurements(TX[rows], moved, GAIN_DB[rows] + noise_db))
+    assert link.tolist() == [0, 1, 2, 1, 0, 0]
+    np.testing.assert_array_equal(links.rx, moved[[0, 1, 2]])
+    np.testing.assert_allclose(links.gain_db, GAIN_DB[[2, 0, 1]])
+    np.testing.assert_allclose(variance, (1.0 + 1.0 + 9.0 + 9.0) / (3 + 10) / np.array([3, 2, 1]))
 
 
 @pytest.mark.parametrize(
-    ("source", "message"),
+    ("changes", "message"),
     [
-        *(
-            (
-                kind({key: [*values] for key, values in FIELDS.items() if key != name}),
-                f"{name} is missing from .*: give a",
-            )
-            for kind in (dict, Frame)
-            for name in ("rx", "gain_db")
-        ),
-        (None, "gain_db is missing from measurements of type NoneType: give a mapping"),
-        ([1.0, 2.0], "gain_db is missing from measurements of type list: give a mapping"),
-        ({**FLAT, "tx_y": TX[:2, 1]}, r"tx_x, tx_y and tx_z have shapes \(3,\), \(2,\), \(3,\): give one"),
+        ({"gain_db": GAIN_DB[:, None]}, "gain_db has shape (3, 1): give one gain for each link, (N,)."),
+        ({"gain_db": [-70.0, np.nan, np.nan]}, "gain_db[1] = nan (and 1 more) is not allowed: give finite numbers"),
+        ({"gain_db": [70.0, 80.0, 90.0]}, "gain_db[0] = 70 (and 2 more) is not allowed: path gains are negative;"),
+        ({"gain_db": [-70.0, -80.0, -201.0]}, "gain_db[2] = -201 is not allowed: give dB, not below -200;"),
+        ({"gain_db": "loud"}, "gain_db = 'loud' is not numeric: give"),
+        ({"gain_db": np.ma.masked_less(GAIN_DB, -100.0)}, "gain_db has masked values"),
+        ({"gain_db": GAIN_DB + 1j}, "is not numeric"),
+        ({"gain_db": GAIN_DB.astype(str).astype(object)}, "is not numeric"),
+        ({"tx": TX[:2]}, "tx has shape (2, 3) for 3 gains: give x, y, z of each link in metres, (3, 3)."),
+        ({"tx": None, **FLAT, "tx_y": TX[:2, 1]}, "tx_x, tx_y and tx_z have shapes (3,), (2,), (3,): give one"),
+        ({"gain_db": None}, "gain_db is missing from measurements of type dict: give a mapping"),
+        ({"rx": None}, "rx is missing from the measurements: give a mapping"),
+        ({"rx": [[1.0, 2.0, 3.0], [1.0, np.nan, 3.0], [0, 0, 1]]}, "rx[1, 1] = nan is not allowed: give finite"),
+        ({"tx": Frame({"tx": [(1, 2, 3), (1, 2), (0, 0, 1)]})["tx"]}, "is not numeric: give finite numbers"),
     ],
 )
-def test_missing_fields(source: object, message: str) -> None:
-    with pytest.raises(MeasurementError, match=message):
-        measurements_of(source)
+def test_what_is_unusable(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(MeasurementError, match=re.escape(message)):
+        measurements_of({**FIELDS, **changes})
+
+
+def test_outages_and_links_that_are_too_many_to_be_merged() -> None:
+    assert Measurements(TX, RX, np.array([-139.9, -150.0, -157.0])).is_outage.tolist() == [False, True, True]
+    rx = np.column_stack([np.arange(6001) * 0.02, np.ones(6001), np.ones(6001)])
+    with pytest.raises(MeasurementError, match="has 6,001 links that are not repetitions, more than 3,000: give"):
+        merged(Measurements(TX[0], rx, np.full(6001, -80.0)))
 
 
 DOTS = "is not a number: write decimal points."
@@ -157,31 +119,21 @@ OWN = {"rx_x": "east", "rx_y": "north", "gain_db": "level"}
 REFUSED_CSV = [
     (None, None, "measured.csv' cannot be read (No such file or directory): check the path"),
     (b"PK\x03\x04\xff\xfe", None, "measured.csv' cannot be read ("),
-    *((text, None, "with the columns tx_x, tx_y, tx_z, rx_x") for text in ("", "tx_x,tx_y\n1,2\n")),
+    ("tx_x,tx_y\n1,2\n", None, "with the columns tx_x, tx_y, tx_z, rx_x"),
     (f"{HEADER},gain_db\n1,2,1.5,3,4,1.5,-70,-71\n", None, "' has 2 columns of gain_db (gain_db, gain_db): keep one"),
     (f"{HEADER}\n1,2,1.5,3,4,1.5,-7", None, "' ends in '1,2,1.5,3,4,1.5,-7', without a line end: the file may be cut"),
     (f"{HEADER}\n1,2,1,5,3,4,1,5,-70\n", None, ", line 2 has 9 cells for 7 columns: separate columns by commas, and"),
     ("tx_x;tx_y;gain_db\n1,5;2,0;-70,5\n", None, "' has the header 'tx_x;tx_y;gain_db': separate columns by commas,"),
     (f'{HEADER}\n"1,5",2,1.5,3,4,1.5,-70\n', None, f"line 2: tx_x = '1,5' {DOTS}"),
-    (f"{HEADER}\n{'1' * 200_000},2\n", None, ", line 2 cannot be read (field larger than field limit"),
-    *(
-        (
-            f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n{row}\n",
-            None,
-            f"line 4: gain_db = {cell} is not a number: correct the line",
-        )
-        for row, cell in (("1,2,1.5,3,4,1.5,loud", "'loud'"), ("1,2,1.5,3,4,1.5", "''"))
-    ),
+    (f"{HEADER}\n1,2,1.5,3,4,1.5,-70\n\n1,2,1.5,3,4,1.5\n", None, "line 4: gain_db = '' is not a number: correct the"),
     ("rx_x,rx_y,x,gain_db\n3.0,2.0,1,-52\n", None, "2 columns of rx_x (rx_x, x): keep one"),
     ("x,y,rssi\n1,2,-52\n", ["rssi"], "columns = ['rssi'] is no mapping: name the headers of a file, as columns"),
     ("x,y,rssi\n", None, "has a header and no rows"),
     ("x,y,rssi,gain_db\n1,2,-52,-60\n", None, "has 2 columns of gain_db (a gain and a power)"),
-    ("east,north,level\n1,2,-52\n", None, "(its other headers are east, north, level): name the headers"),
     ("x,y,level\n1,2,-52\n", None, "as columns={'gain_db': 'HEADER'} of load_measurements or --column gain_db=H"),
     ("east,north,level\n3.0,2.0,-52\n", OWN | {"rx_z": "up"}, "has no column 'up'"),
     ("east,north,level\n3.0,2.0,-52\n", {"rssi": "level"}, "give a header for some of tx_x"),
 ]
-"""Content of a file, names of its columns, and words of the message."""
 
 
 @pytest.mark.parametrize(("content", "columns", "message"), REFUSED_CSV, ids=lambda value: repr(value)[:40])
@@ -191,22 +143,6 @@ def test_csv_that_would_be_misread(tmp_path: Path, content: str | bytes | None, 
         path.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(MeasurementError, match=re.escape(message)):
         sp.load_measurements(path, columns=columns)
-
-
-@pytest.mark.parametrize(
-    "gains_db",
-    [
-        np.ma.masked_array([-70.0, -20.0], mask=[False, True]),
-        np.array([-70.0 + 1j, -60.0]),
-        np.array([-70, -60], dtype="timedelta64[s]"),
-        ["-70", "-60"],
-        np.array(["-70", "-60"], dtype=object),
-    ],
-    ids=["masked", "complex", "seconds", "texts", "objects"],
-)
-def test_only_real_numbers_are_gains(gains_db: Any) -> None:
-    with pytest.raises(MeasurementError, match=r"gain_db (has masked values|has dtype|= .* is not numeric)"):
-        sp.Measurements((1.0, 1.0, 1.5), [(2.0, 1.0, 1.5), (3.0, 1.0, 1.5)], gains_db)
 
 
 class TestSurveys:
@@ -222,9 +158,7 @@ class TestSurveys:
         ("header", "columns", "gain_db"),
         [
             ("rssi", None, -72.0),
-            ("power_dbm", None, -72.0),
             ("level", {"gain_db": "level"}, -72.0),
-            ("level", {"power_dbm": "level"}, -72.0),
             ("gain_db", None, -52.0),
             ("Gain", {"gain_db": "Gain"}, -52.0),
         ],

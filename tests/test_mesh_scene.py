@@ -9,7 +9,6 @@ import pytest
 from meshes import box, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps.mesh import files as mesh_files
 from sionna_partial.maps.mesh.files import read_exported_mesh, read_mitsuba_scene
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
@@ -40,7 +39,6 @@ def moved(*steps: str) -> str:
     ("name", "triangles", "materials"),
     [
         ("box", 12, {"metal"}),
-        ("simple_wedge", 4, {"concrete"}),
         ("simple_street_canyon", 74, {"glass", "wood", "marble", "brick", "concrete"}),
     ],
 )
@@ -98,8 +96,6 @@ def test_other_materials_are_those_of_the_settings(tmp_path: Path) -> None:
     ("steps", "low", "high"),
     [
         ([], (0, 0, 0), (5, 4, 3)),
-        (['<translate x="1" z="-2"/>'], (1, 0, -2), (6, 4, 1)),
-        (['<scale value="2"/>'], (0, 0, 0), (10, 8, 6)),
         (['<rotate z="2" angle="90"/>'], (-4, 0, 0), (0, 5, 3)),
         (['<rotate value="1 0 0" angle="90"/>'], (0, -3, 0), (5, 0, 4)),
         (['<translate x="1"/>', '<scale value="2"/>'], (2, 0, 0), (12, 8, 6)),
@@ -128,21 +124,9 @@ def test_rectangle_and_cube(tmp_path: Path) -> None:
         ("", "holds no shape: give a Mitsuba scene with meshes"),
         ('<include filename="/etc/passwd"/>' + shape("cube"), "has an <include>, which is not followed: put"),
         (shape("sphere") + shape("disk"), "has shapes of type disk, sphere: give ply, obj, rectangle, cube; Mitsuba"),
-        (RADIO + shape("obj"), "shape 'it' has the filename '', which is not allowed: put it into"),
         (shape("cube"), "shape 'it' refers to 'wall', which is no bsdf of the scene: add it, or correct the id"),
         (RADIO.replace("concrete", "cheese") + shape("cube"), "bsdf 'wall' is no radio material (itu = 'cheese' is"),
-        ('<bsdf type="itu-radio-material" id="a"/>' + shape("cube"), "bsdf 'a' is no radio material (itu = '' is not"),
-        (
-            '<bsdf type="radio-material" id="a"><float name="conductivity" value="much"/></bsdf>' + shape("cube"),
-            "bsdf 'a' is no radio material (could not convert string to float: 'much'): correct it",
-        ),
-        (
-            RADIO + shape("cube", moved("").replace("to_world", "toWorld")),
-            "<shape> 'it' has the property 'toWorld', which is not read: give the names of Mitsuba 3 (filename, to_wor",
-        ),
-        (RADIO + shape("cube", moved('<translate X="1"/>')), "has a to_world with <translate {'X': '1'}>, which"),
         (RADIO + shape("cube", moved("<lookat/>")), "shape 'it' has a to_world with <lookat {}>, which cannot be read"),
-        (RADIO + shape("cube", moved('<rotate angle="9"/>')), "has a to_world with <rotate {'angle': '9'}>, which"),
         (RADIO + shape("cube", moved('<scale value="nan"/>')), "cannot be read (a transform is not finite): "),
         (RADIO + shape("cube", moved('<scale value="0"/>')), "which cannot be read (it flattens the shape): "),
         (
@@ -157,7 +141,7 @@ def test_refused(tmp_path: Path, content: str, message: str) -> None:
         read_mitsuba_scene(path)
 
 
-@pytest.mark.parametrize("file", ["/etc/passwd", "../box.ply", "meshes/../../box.ply", "gone.ply"])
+@pytest.mark.parametrize("file", ["/etc/passwd", "../box.ply", "gone.ply"])
 def test_meshes_lie_in_the_folder(tmp_path: Path, file: str) -> None:
     folder = tmp_path / "scene"
     folder.mkdir()
@@ -170,12 +154,9 @@ def test_meshes_lie_in_the_folder(tmp_path: Path, file: str) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "is not valid XML (no element found"),
-        ("<scene>", "is not valid XML (no element found"),
         ("<scene>&boom;</scene>", "is not valid XML (undefined entity"),
         ("<svg/>", "has the root <svg>: give a Mitsuba scene file, with <scene>"),
         ('<!DOCTYPE scene [<!ENTITY a "aa">]><scene>&a;</scene>', "has a DOCTYPE, which is not followed: remove it"),
-        ('<!DOCTYPE scene SYSTEM "file:///etc/passwd"><scene/>', "has a DOCTYPE, which is not followed"),
     ],
 )
 def test_no_scene(tmp_path: Path, text: str, message: str) -> None:
@@ -184,29 +165,10 @@ def test_no_scene(tmp_path: Path, text: str, message: str) -> None:
         read_mitsuba_scene(tmp_path / "a.xml")
 
 
-def test_unreadable_and_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(MapError, match=r"gone.xml' cannot be read \(No such file or directory\): check the path"):
-        read_mitsuba_scene(tmp_path / "gone.xml")
-    monkeypatch.setattr(mesh_files, "MAX_XML_BYTES", 10)
-    with pytest.raises(MapError, match=r"any.xml' has more than 10 bytes: split the scene"):
-        read_mitsuba_scene(scene(tmp_path, RADIO))
-
-
-def test_other_shapes_than_exported(tmp_path: Path) -> None:
+def test_damaged_exported_meshes(tmp_path: Path) -> None:
+    for record in (None, {"height_range": [0, 1], "materials": [{"itu": "cheese"}]}):
+        with pytest.raises(MapError, match=r"map.yaml' has a damaged mesh entry \(.*\): export it again"):
+            read_exported_mesh(tmp_path, record, [0, 0, 0])  # type: ignore[arg-type]
     scene(tmp_path, shape("cube")).rename(tmp_path / "scene.xml")
     with pytest.raises(MapError, match="has a shape 'it' that was not exported: export the scene again"):
         read_exported_mesh(tmp_path, {"height_range": [0, 1], "materials": [None]}, [0, 0, 0])
-
-
-@pytest.mark.parametrize(
-    ("record", "offset_m"),
-    [
-        (None, [0, 0, 0]),
-        ({"height_range": [0, 1], "materials": [{"itu": "cheese"}]}, [0, 0, 0]),
-        ({"height_range": [0], "materials": []}, [0, 0, 0]),
-        ({"height_range": [0, 1], "materials": [None]}, [0, 0]),
-    ],
-)
-def test_damaged_entry_of_an_exported_mesh(tmp_path: Path, record: dict | None, offset_m: list[float] | None) -> None:  # type: ignore[type-arg]
-    with pytest.raises(MapError, match=r"map.yaml' has a damaged mesh entry \(.*\): export it again"):
-        read_exported_mesh(tmp_path, record, offset_m)  # type: ignore[arg-type]

@@ -53,64 +53,37 @@ class TestMeasure:
         assert found.nll == pytest.approx(-(np.log([0.5, 0.7, 0.2]).sum() + np.log(densities).sum()) / 3)
         assert found.calibration_error == pytest.approx((abs(1 - 0.5) + abs(1 - 0.7) + abs(0 - 0.8)) / 3)
 
-    def test_the_gain_of_an_outage_is_the_floor_whatever_was_traced(self):
-        answer, state = prediction([1.0], [0.0], [0.0]), np.array([OUTAGE], dtype=np.uint8)
-        one, other = (measure(answer, state, np.array([gain_db])).as_json() for gain_db in (-99.0, -150.0))
-        assert one == other
-        assert one["rmse_db"] == 0.0
-
-    def test_one_that_knows_the_model_is_calibrated(self):
-        found = measure(*drawn(40_000))
-        assert found.calibration_error < 0.015
-        assert found.coverage_90 == pytest.approx(0.9, abs=0.006)
-
-    def test_too_narrow_and_too_wide_intervals_are_told(self):
-        assert measure(*drawn(20_000, narrow=2.0)).coverage_90 < 0.86
-        assert measure(*drawn(20_000, narrow=0.3)).coverage_90 > 0.93
-
     def test_a_trace_has_no_interval(self):
         phi, state, gain_db = make_links(500)
         found = measure(LinkPrediction.of_trace(phi), state, gain_db)
         assert math.isnan(found.coverage_90)
         assert found.calibration_error == pytest.approx(1.0 - found.accuracy)
         assert found.rmse_db > 0.0
+        found = measure(LinkPrediction.of_trace(make_links(9)[0]), *make_links(9)[1:]).as_json()
+        assert list(found) == list(DEFINITIONS) == list(Metrics.__dataclass_fields__)
+        assert json.loads(json.dumps(found, allow_nan=False))["coverage_90"] is None
 
     def test_a_gain_held_certain_has_a_least_spread_and_density(self):
         answer, los = prediction([0.0, 0.0], [1.0, 1.0], [0.0, 0.0], los_db=(-60.0, 0.0)), np.full(2, LOS, np.uint8)
         right, wrong = math.log(0.1 * math.sqrt(2.0 * math.pi)), -math.log(1e-4 / 150.0)
         assert measure(answer, los, np.array([-60.0, -35.0])).nll == pytest.approx((right + wrong) / 2)
 
-    def test_a_state_held_impossible_has_the_least_probability(self):
-        answer = prediction([0.0, 0.5], [1.0, 0.5], [0.0, 0.0])
-        found = measure(answer, np.array([OUTAGE, LOS], dtype=np.uint8), np.array([-150.0, -60.0]))
-        assert found.nll_state == pytest.approx(-0.5 * (math.log(1e-4) + math.log(0.5)))
-        assert math.isfinite(found.coverage_90)
-
     def test_no_links_and_none_but_outages(self):
         empty = measure(prediction([], [], []), np.zeros(0, dtype=np.uint8), np.zeros(0))
         assert empty.links == 0
         assert all(value is None for name, value in empty.as_json().items() if name != "links")
-        outages = measure(prediction([0.5], [0.5], [0.0]), np.array([OUTAGE], dtype=np.uint8), np.array([-150.0]))
+        outages = measure(prediction([0.5], [0.5], [0.0]), np.array([OUTAGE], dtype=np.uint8), np.array([-99.0]))
         assert math.isnan(outages.rmse_linked_db)
         assert outages.rmse_db == pytest.approx(45.0)
 
-    def test_every_figure_is_defined_and_fits_json(self):
-        found = measure(LinkPrediction.of_trace(make_links(9)[0]), *make_links(9)[1:]).as_json()
-        assert list(found) == list(DEFINITIONS) == list(Metrics.__dataclass_fields__)
-        assert json.loads(json.dumps(found, allow_nan=False))["coverage_90"] is None
-
 
 class TestPitShares:
-    def test_an_outage_is_spread_over_its_probability(self):
+    def test_transforms_by_hand(self):
         answer, state = prediction([0.4], [0.6], [0.0]), np.array([OUTAGE], dtype=np.uint8)
         found = pit_fractions(answer, state, np.array([-150.0]), np.array([0.1, 0.2, 0.4, 0.9]))
         np.testing.assert_allclose(found, [0.25, 0.5, 1.0, 1.0], atol=1e-9)
-
-    def test_a_gain_lies_where_its_quantile_is(self):
         answer, state = prediction([0.4], [0.6], [0.0]), np.array([LOS], dtype=np.uint8)
         assert pit_fractions(answer, state, np.array([-60.0]), np.array([0.699, 0.701])).tolist() == [0.0, 1.0]
-
-    def test_a_gain_without_spread_is_an_atom(self):
         answer, state = prediction([0.0], [1.0], [0.0], los_db=(-60.0, 0.0)), np.array([LOS], dtype=np.uint8)
         for gain_db, share in ((-61.0, 1.0), (-60.0, 0.5), (-59.0, 0.0)):
             assert pit_fractions(answer, state, np.array([gain_db]), np.array([0.5])).tolist() == [share]
@@ -130,9 +103,12 @@ class TestReliability:
 
 
 class TestCalibration:
-    def test_histogram_is_flat_when_calibrated(self):
-        found = calibration(*drawn(100_000))
+    def test_a_prediction_that_knows_the_model_is_calibrated(self):
+        drawn_links = drawn(100_000)
+        found, figures = calibration(*drawn_links), measure(*drawn_links)
         assert found.gain_pit.sum() == pytest.approx(1.0)
         np.testing.assert_allclose(found.gain_pit, 1.0 / PIT_BINS, atol=0.004)
         assert found.state.error < 0.01
-        assert math.isnan(reliability(prediction([], [], []), np.zeros(0, dtype=np.uint8)).error)
+        assert figures.calibration_error < 0.015
+        assert figures.coverage_90 == pytest.approx(0.9, abs=0.006)
+        assert measure(*drawn(20_000, narrow=2.0)).coverage_90 < 0.86

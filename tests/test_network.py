@@ -2,7 +2,6 @@
 
 import itertools
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ TX = {"west": (1.0, 1.0, 1.5), "east": (4.5, 2.5, 1.5)}
 
 @pytest.fixture(scope="module")
 def half_seen() -> sp.PartialMap:
-    """A room of 6 x 3 m, open to the unknown in the east."""
     state = np.pad(np.zeros((30, 55), np.uint8), ((1, 1), (1, 0)), constant_values=1)
     return sp.PartialMap(np.pad(state, ((0, 0), (0, 15)), constant_values=2), 0.1)
 
@@ -101,43 +99,37 @@ def test_several_are_placed_as_well_as_by_exhaustive_search(half_seen: sp.Partia
     assert len(sp.plot_network_placement(placed).axes) == 2
 
 
-def test_no_transmitter_is_no_network(half_seen: sp.PartialMap) -> None:
-    with pytest.raises(PositionError, match="at least 1 position"):
-        sp.predict_map(half_seen, np.zeros((0, 3)), spacing_m=0.4)
-
-
-@pytest.mark.parametrize(
-    ("options", "match"),
-    [
+def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Dataset) -> None:
+    for options, match in (
         ({"tx_power_dbm": [1.0, 2.0, 3.0]}, "one for each of the 2 transmitters"),
         ({"load": 1.5}, "load"),
-        ({"n": 1}, "n = 1"),
         ({"sinr_threshold_db": float("nan")}, "sinr_threshold_db"),
-    ],
-)
-def test_bad_settings_of_a_network(coverage: xr.Dataset, options: dict[str, Any], match: str) -> None:
-    with pytest.raises(SettingsError, match=match):
-        sp.network_map(coverage, **options)
+    ):
+        with pytest.raises(SettingsError, match=match):
+            sp.network_map(coverage, **options)
+    for other, match in (
+        (coverage.isel(tx=[]), "give each a name"),
+        (coverage.assign(valid=coverage.valid & False), "no position at which receivers"),
+        (coverage.isel(tx=0), "no dimension tx"),
+        (coverage.assign_coords(tx=["a\nb", "b"]), "of printable characters"),
+    ):
+        with pytest.raises(SettingsError, match=match):
+            sp.network_map(other)
+    with pytest.raises(PositionError, match="at least 1 position"):
+        sp.predict_map(half_seen, np.zeros((0, 3)), spacing_m=0.4)
+    for names in ((1, "1"), ("\udc80", "b")):
+        with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
+            sp.predict_map(half_seen, dict.fromkeys(names, (3.0, 1.0, 1.5)))
+    with pytest.raises(SettingsError, match="count"):
+        sp.place_transmitters(half_seen, 0)
 
 
-def test_maps_that_are_no_network(coverage: xr.Dataset) -> None:
-    with pytest.raises(SettingsError, match="give each a name"):
-        sp.network_map(coverage.isel(tx=[]))
-    with pytest.raises(SettingsError, match="no position at which receivers"):
-        sp.network_map(coverage.assign(valid=coverage.valid & False))
+def test_the_order_of_dimensions_does_not_count(coverage: xr.Dataset) -> None:
     turned = sp.network_map(coverage.transpose("y", "x", "tx"), n=10)
     xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))
 
 
-@pytest.mark.parametrize("names", [(1, "1"), ("\0a", "b"), ("\udc80", "b"), ("", "b"), ("a\nb", "b")])
-def test_names_of_transmitters_are_texts_for_files(coverage: xr.Dataset, names: tuple[Any, Any]) -> None:
-    with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
-        sp.predict_map(sp.make_home(7), dict(zip(names, [(3.0, 4.0, 1.5), (6.0, 3.0, 1.5)], strict=True)))
-    with pytest.raises(SettingsError, match="give each a name of its own, of printable characters"):
-        sp.network_map(coverage.assign_coords(tx=("tx", [str(name) for name in names])))
-
-
-@pytest.mark.parametrize("value", [np.datetime64("now"), np.timedelta64(3), object(), 1j, 2**70])
+@pytest.mark.parametrize("value", [np.datetime64("now"), object(), 2**70])
 def test_attributes_that_no_file_holds(coverage: xr.Dataset, tmp_path: Path, value: object) -> None:
     with pytest.raises(SettingsError, match="attribute mine = "):
         sp.save_coverage(coverage.chunk(x=3).assign_attrs(mine=value), tmp_path / "coverage.nc")
@@ -152,8 +144,6 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     assert xr.load_dataset(tmp_path / "network.nc").sizes["tx"] == 2
     with pytest.raises(OutputError, match=r"\.txt"):
         sp.save_network(network, tmp_path / "network.txt")
-    with pytest.raises(SettingsError, match="no dimension tx"):
-        sp.network_map(coverage.isel(tx=0))
     sp.save_network(xr.load_dataset(tmp_path / "network.nc"), tmp_path / "again.nc")
     assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "network.nc").read_bytes()
     others = coverage, network.drop_vars("p_best"), network.isel(x=0), network.assign_attrs(load="much")
@@ -161,5 +151,3 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     for other in others:
         with pytest.raises(SettingsError, match="give what network_map returned"):
             sp.plot_network(other)
-    with pytest.raises(SettingsError, match="count"):
-        sp.place_transmitters(sp.map_from_array([[0]], 1.0), 0)

@@ -27,7 +27,6 @@ CELLS = {
 
 @pytest.fixture(scope="module")
 def outputs(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Any]]:
-    """Outputs of each cell, by its name."""
     folder = tmp_path_factory.mktemp("notebook")
     sp.save_coverage(small_coverage(), folder / "coverage.nc")
     notebook = new_notebook(cells=[new_code_cell(source, id=name) for name, source in CELLS.items()])

@@ -1,6 +1,7 @@
 """The paper's networks: architecture, evaluation, and training on links of a known model."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
@@ -11,12 +12,10 @@ from predictor_links import (
     OUTAGE,
     QUICK,
     QUIET,
-    arrays,
     assert_valid,
     make_links,
     p_kept,
     quick_predictor,
-    trained_predictor,
     true_gain,
 )
 
@@ -63,38 +62,16 @@ def test_gain_networks_are_the_papers(quick):
     assert sorted(served) == [(state, partial) for state in (LOS, NLOS) for partial in LinkState]
 
 
-@pytest.mark.parametrize("state", LinkState)
-def test_classifiers_are_logistic(quick, state):
-    classifier = quick.model.get_layer(f"state_given_{state.name.lower()}")
-    assert list(classifier.input) == ["distance_m", "unobserved_distance_m"]
-    assert [weights.shape for weights in classifier.get_weights()] == [(2, 3), (3,)]
-    indoor = quick.model.get_layer(f"indoor_given_{state.name.lower()}")
-    assert list(indoor.input) == ["unobserved_distance_m"]
-    assert [weights.shape for weights in indoor.get_weights()] == [(1, 1), (1,)]
-
-
-def test_links_do_not_depend_on_each_other(quick):
-    phi, _, _ = make_links(300, seed=3)
-    together, alone = quick.predict(phi), quick.predict(phi.take(slice(7, 8)))
-    for name, values in arrays(alone).items():
-        np.testing.assert_allclose(values, arrays(together)[name][7:8], rtol=1e-5, err_msg=name)
-
-
-@pytest.mark.parametrize("partial_state", LinkState)
-def test_sane_far_beyond_the_training_links(quick, partial_state):
+def test_sane_far_beyond_the_training_links(quick):
     distance_m = np.array([0.0, 1e-6, 0.1, 1.0, 10.0, 60.0, 1e4, 1e9, 1e200])
-    for fraction in (0.0, 1.0):
-        for gain_db in (-150.0, -40.0, 1e300):
-            states, gains_db = np.full(9, partial_state), np.full(9, gain_db)
-            assert_valid(quick.predict(LinkFeatures(states, fraction * distance_m, distance_m, gains_db)))
+    for state, fraction, gain_db in itertools.product(LinkState, (0.0, 1.0), (-150.0, -40.0, 1e300)):
+        phi = LinkFeatures(np.full(9, state), fraction * distance_m, distance_m, np.full(9, gain_db))
+        assert_valid(quick.predict(phi))
 
 
-@pytest.fixture(scope="module")
-def trained():
-    return trained_predictor()
-
-
-def test_recovers_a_known_model(trained):
+def test_recovers_a_known_model():
+    settings = PredictorSettings(steps=400, batch_size=512, learning_rate=0.02)
+    trained = Predictor.fit(*make_links(12_000), settings=settings)
     phi, _, _ = make_links(3000, seed=1)
     answer = trained.predict(phi)
     p_partial = np.choose(phi.link_state, [answer.p_outage, answer.p_los, answer.p_nlos])
@@ -113,13 +90,8 @@ def test_same_training_same_weights_whatever_the_gain_of_outages(quick):
     """The likelihood has the gains of links with a path alone."""
     phi, state, gain_db = make_links(900)
     again = Predictor.fit(phi, state, np.where(state == OUTAGE, -77.0, gain_db), homes=["a", "b"], settings=QUICK)
-    for one, other in zip(quick.model.get_weights(), again.model.get_weights(), strict=True):
-        assert np.array_equal(one, other)
     other_seed = Predictor.fit(phi, state, gain_db, settings=dataclasses.replace(QUICK, seed=1))
-    assert any(
-        not np.array_equal(one, other)
-        for one, other in zip(quick.model.get_weights(), other_seed.model.get_weights(), strict=True)
-    )
+    assert again.fingerprint == quick.fingerprint != other_seed.fingerprint
 
 
 def test_cells_without_links_fall_back_to_prior_knowledge():

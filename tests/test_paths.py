@@ -14,21 +14,11 @@ def _paths(*rows: tuple[int, int, float, complex]) -> SolvedPaths:
         path_rx=rx.astype(np.int32),
         transfer=a.astype(np.complex128)[:, None, None],
         delay_s=delay_s.astype(np.float64),
-        departure_rad=np.stack([a.real, -a.real], axis=1).astype(float),
-        arrival_rad=np.stack([2 * a.real, -2 * a.real], axis=1).astype(float),
+        departure_rad=np.zeros((count, 2)),
+        arrival_rad=np.zeros((count, 2)),
         interactions=np.full((count, 1), 1, np.uint8),
-        vertices_m=np.broadcast_to(a.real[:, None, None], (count, 1, 3)).astype(np.float32),
+        vertices_m=np.zeros((count, 1, 3), np.float32),
     )
-
-
-def test_orders_by_transmitter_then_receiver_then_delay() -> None:
-    first = _paths((1, 0, 1e-8, 1), (0, 2, 3e-8, 2), (0, 2, 1e-8, 3))
-    second = _paths((0, 0, 9e-8, 4), (1, 0, 5e-9, 5), (0, 2, 2e-8, 6))
-    joined = join_paths([first, second], 1)
-    assert joined.a.tolist() == [4, 3, 6, 2, 5, 1]
-    assert joined.path_tx.tolist() == [0, 0, 0, 0, 1, 1]
-    assert joined.path_rx.tolist() == [0, 2, 2, 2, 0, 0]
-    assert joined.delay_s.tolist() == [9e-8, 1e-8, 2e-8, 3e-8, 5e-9, 1e-8]
 
 
 def test_ties_keep_their_order() -> None:

@@ -10,7 +10,7 @@ import trimesh
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
 
-from sionna_partial.constants import POINT_SUFFIXES, CellState
+from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh import points as points_module
@@ -22,7 +22,6 @@ INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)
 
 
 def shell(low: tuple[float, float, float], high: tuple[float, float, float], rng: np.random.Generator) -> NDArray:
-    """Points on the six faces of a box, about 1,000 per square metre."""
     low_m, size = np.array(low), np.subtract(high, low)
     faces = []
     for axis in range(3):
@@ -48,7 +47,6 @@ ROOM = room()
 
 
 def write(path: Path, points: NDArray) -> Path:
-    """Write a cloud with the library of its format."""
     kind = path.suffix
     if kind in (".las", ".laz"):
         header = laspy.LasHeader(point_format=3, version="1.2")
@@ -88,21 +86,15 @@ FORMATS = ("room.las", "room.laz", "room_ascii.pcd", "room_binary.pcd", "room.pc
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_format_gives_the_room(tmp_path: Path, name: str) -> None:
-    assert {Path(each).suffix for each in FORMATS} == {*POINT_SUFFIXES, ".ply"}
     path = write(tmp_path / name, ROOM)
     partial = load_map(path)
     require_room(partial)
     assert load_map(path, wall_height_m=2.2).wall_height_m == 2.2
-    assert map_from_points(path) == partial
 
 
-@pytest.mark.parametrize("floor_m", [-1.23, 512.34])
-def test_heights_count_from_the_floor(floor_m: float) -> None:
-    require_room(map_from_points(room(floor_m)))
-
-
-@pytest.mark.parametrize("noise_m", [0.0, 0.003, 0.02])
-@pytest.mark.parametrize(("floor_m", "height_m"), [(0.0, 2.5), (0.024, 2.6), (-1.23, 2.62), (7.0, 2.75)])
+@pytest.mark.parametrize(
+    ("floor_m", "height_m", "noise_m"), [(0.0, 2.5, 0.0), (0.024, 2.6, 0.003), (-1.23, 2.62, 0.02), (7.0, 2.75, 0.003)]
+)
 def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
     """A flat surface without noise fills one layer of voxels, with noise two."""
     rng = np.random.default_rng(1)
@@ -112,7 +104,7 @@ def test_wall_height(floor_m: float, height_m: float, noise_m: float) -> None:
 
 
 def test_feet() -> None:
-    points = shell((0, 0, 0), (40, 30, 9), np.random.default_rng(0))[::3]
+    points = shell((0, 0, 0), (40, 30, 9), np.random.default_rng(0))[::9]
     message = r"points spans 40.1 x 30.1 m, with a storey of 9 m, as if it were in feet: give unit_m=0.3048 for"
     with pytest.warns(MapWarning, match=message):
         map_from_points(points)
@@ -121,9 +113,8 @@ def test_feet() -> None:
     assert partial.wall_height_m == pytest.approx(9 * 0.3048, abs=0.02)
     report = partial.import_report
     assert report is not None
-    assert (report.unit_m, report.unit_source, report.rooms) == (0.3048, "unit_m", 1)
+    assert (report.unit_m, report.rooms, report.used[0].count) == (0.3048, 1, len(points))
     assert report.extent_m == pytest.approx((40 * 0.3048, 30 * 0.3048), abs=0.3)
-    assert [(row.name, row.count) for row in report.used] == [("points", len(points))]
 
 
 def test_map_coordinates(tmp_path: Path) -> None:
@@ -149,7 +140,6 @@ def test_two_storeys() -> None:
 
 
 def test_walls_alone() -> None:
-    """Without floor and ceiling, only what sensors see across is free."""
     walls = ROOM[(ROOM[:, 2] > 0.3) & (ROOM[:, 2] < 2.3)]
     walls = walls[(np.abs(walls[:, :2] - (1.4, 1.3)) > 0.6).any(axis=1)]
     assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
@@ -174,15 +164,12 @@ def test_parts_and_order_change_nothing(tmp_path: Path, monkeypatch: pytest.Monk
         ({"points": np.zeros((3, 2))}, "points has shape (3, 2): give x, y, z in metres, (N, 3), or the path of a"),
         ({"points": np.zeros((0, 3))}, "points holds no finite point: give a cloud with x, y, z in metres"),
         ({"points": ROOM / 1000}, "points spans 0.05 x 0.05 x 0.05 m: give unit_m, the length of its unit in metres"),
-        ({"points": ROOM * 1000}, "give unit_m, the length of its unit in metres, 0.01 for centimetres"),
         ({"points": [(0, 0, 0), (1e5, 0, 0)]}, "points spans more than 52,429 m: remove stray points, or cut it"),
         ({"points": [(0, 0, 0), (1e9, 0, 0)]}, "points holds coordinates above 1e+08 m: give a cloud in metres"),
         ({"points": [(0, 0, 0), (9e3, 9e3, 0)]}, "more than 100,000,000: give"),
         ({"sensor_positions_m": (1.0, 2.0)}, "sensor_positions_m has shape (2,) or values that are not finite: give x"),
         ({"sensor_positions_m": [(1.0, 2.0)], "up": "y"}, 'with up = "y": give x, y, z of the cloud, (M, 3)'),
         ({"sensor_positions_m": [(1e7, 0.0)]}, "sensor_positions_m has [10000000.0, 0.0], more than 200 m from the"),
-        ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high)"),
-        ({"unit_m": 0}, "unit_m = 0 is not allowed: give the length of a unit in metres, such as 0.3048 for feet"),
     ],
 )
 def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
@@ -190,27 +177,12 @@ def test_refused(given: dict, message: str) -> None:  # type: ignore[type-arg]
         map_from_points(**{"points": ROOM, **given})
 
 
-@pytest.mark.parametrize("name", FORMATS)
-def test_every_truncation(tmp_path: Path, name: str) -> None:
-    """A file that was cut is refused, wherever; of texts only what is no row."""
-    path = write(tmp_path / name, ROOM[::50])
-    content = path.read_bytes()
-    for size in range(0, len(content) - 1, len(content) // 25):
-        path.write_bytes(content[:size])
-        if path.suffix in (".xyz", ".pts") and size:
-            continue
-        with pytest.raises(MapError, match=r"is damaged or no|holds no finite point|holds 0 triangles"):
-            map_from_points(path)
-
-
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [
         ("room_binary.pcd", rb"POINTS \d+", b"POINTS 999999999999"),
-        ("room_ascii.pcd", rb"POINTS \d+", b"POINTS 5"),
         ("room_binary.pcd", rb"FIELDS x y z", b"FIELDS a b c"),
         ("room.ply", rb"element vertex \d+", b"element vertex 99999999999"),
-        ("room.xyz", rb"//X,Y,Z,R", b"\n" * 60),
         ("room.xyz", rb"\n", b"\nx,y,z\n"),
     ],
 )
@@ -226,14 +198,6 @@ def test_other_files(tmp_path: Path) -> None:
         map_from_points(tmp_path / "room.e57")
     with pytest.raises(MapError, match=r"room.las' cannot be read \(No such file or directory\)"):
         map_from_points(tmp_path / "room.las")
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_compressed_pcd_holds_what_an_uncompressed_one_does(tmp_path: Path, seed: int) -> None:
-    floor = np.random.default_rng(seed).uniform((0.02, 0.02, 0.0), (4.0, 3.0, 0.01), (2000, 3))
-    points = np.concatenate([floor, floor * (1.0, 0.0, 0.0) + (0.0, 2.98, 1.0) + floor[::-1] * (0.0, 0.0, 100.0)])
-    compressed, plain = (load_map(write(tmp_path / name, points)) for name in ("room.pcd", "room_binary.pcd"))
-    assert compressed == plain
 
 
 @pytest.mark.parametrize(

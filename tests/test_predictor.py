@@ -1,11 +1,12 @@
 import dataclasses
+import math
 import re
 
 import numpy as np
 import pytest
+from placement_cases import home
 from predictor_links import (
     LOS,
-    OUTAGE,
     QUIET,
     arrays,
     assert_valid,
@@ -17,8 +18,8 @@ from predictor_links import (
     quick_predictor,
 )
 
+import sionna_partial as sp
 from sionna_partial.errors import PredictorError
-from sionna_partial.prediction.map_networks import LINK_NETWORK, MAP_NETWORKS, evaluate_context_networks
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
 from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
 
@@ -32,7 +33,6 @@ def quick():
 
 @pytest.fixture(params=["paths", "map"])
 def seeing(request):
-    """A predictor that sees where links run."""
     return context_predictor(request.param)
 
 
@@ -63,12 +63,9 @@ def test_total_expectation_and_variance():
     probabilities = np.array([[0.2], [0.5], [0.3]])
     means_db, stds_db = np.array([[-150.0], [-60.0], [-90.0]]), np.array([[0.0], [2.0], [7.0]])
     answer = LinkPrediction.of_parts(probabilities, means_db, stds_db)
-    rng = np.random.default_rng(0)
-    state = rng.choice(3, size=400_000, p=probabilities[:, 0])
-    samples_db = means_db[state, 0] + stds_db[state, 0] * rng.normal(size=len(state))
     assert answer.gain_mean_db == pytest.approx([-87.0])
-    assert answer.gain_mean_db == pytest.approx([samples_db.mean()], abs=0.3)
-    assert answer.gain_std_db == pytest.approx([samples_db.std()], abs=0.3)
+    second_moment = 0.2 * 150.0**2 + 0.5 * (60.0**2 + 2.0**2) + 0.3 * (90.0**2 + 7.0**2)
+    assert answer.gain_std_db == pytest.approx([math.sqrt(second_moment - 87.0**2)])
     assert answer.link_state.tolist() == [LOS]
 
 
@@ -77,8 +74,6 @@ def test_of_trace():
     answer = LinkPrediction.of_trace(phi)
     assert_valid(answer)
     assert np.array_equal(answer.link_state, phi.link_state)
-    assert np.array_equal(answer.p_los, phi.link_state == LOS)
-    assert np.array_equal(answer.p_outage, phi.link_state == OUTAGE)
     np.testing.assert_allclose(answer.gain_mean_db, phi.gain_db, rtol=1e-15)
     for name in ("gain_std_db", "gain_los_std_db", "gain_nlos_std_db"):
         np.testing.assert_allclose(getattr(answer, name), 0.0, atol=1e-12)
@@ -95,19 +90,6 @@ def test_anywhere_is_indoors_or_in_outage(quick):
     second_moment = p_indoor * (indoors.gain_std_db**2 + indoors.gain_mean_db**2) + 150.0**2 * (1.0 - p_indoor)
     np.testing.assert_allclose(answer.gain_std_db**2 + answer.gain_mean_db**2, second_moment)
     assert answer.p_outage[0] == 1.0
-
-
-@pytest.mark.parametrize(
-    ("p_indoor", "message"),
-    [
-        ([0.5, 1.1], "p_indoor[1] = 1.1 is not allowed: it lies between 0 and 1."),
-        ([-0.1, 1.0], "p_indoor[0] = -0.1 is not allowed: it lies between 0 and 1."),
-        ([0.5], "p_indoor has shape (1,): give one number for each of the 2 links."),
-    ],
-)
-def test_bad_probability_of_being_indoors(p_indoor, message):
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        LinkPrediction.of_trace(make_links(2)[0]).anywhere(p_indoor)
 
 
 @pytest.mark.parametrize("networks", ["paper", "paths", "map"])
@@ -134,35 +116,24 @@ def test_shipped_predictor(name):
     model = Predictor.load(name)
     assert model.name == model.settings.networks == name
     assert (Predictor.load().fingerprint == model.fingerprint) == (name == "map")
-    assert len(model.archive) < 20_000_000
-    assert len(model.homes) >= 10
     assert not set(model.homes) & set(model.metrics["held_out_homes"])
-    phi, _, _ = make_seen_links(500)
-    assert_valid(model.predict(phi))
-    assert model.predict_indoor(phi).min() < 0.999
+    assert model.predict_indoor(make_seen_links(500)[0]).min() < 0.999
     for stage in model.metrics["exploration_steps"].values():
         assert 0.8 < stage["predictor"]["coverage_90"] < 0.98
         assert stage["predictor"]["rmse_db"] < stage["majority"]["rmse_db"]
 
 
 class TestNetworksOfMapsAndPaths:
-    def test_its_networks_answer_where_maps_are_partial(self, seeing):
-        phi = make_seen_links(100, seed=3)[0]
-        expected = LinkPrediction.of_parts(*evaluate_context_networks(parts(seeing.model), phi, 28e9))
-        for name, values in arrays(seeing.predict(phi)).items():
-            np.testing.assert_array_equal(values, getattr(expected, name), err_msg=name)
-
-    @pytest.mark.parametrize("complete", [range(4), [], [1, 3]], ids=str)
-    def test_the_trace_is_the_prediction_where_maps_are_complete(self, seeing, complete):
+    def test_the_trace_is_the_prediction_where_maps_are_complete(self, seeing):
         phi = make_seen_links(200, seed=3)[0]
-        sure = np.isin(corridor_of(phi), [*complete])
+        sure = np.isin(corridor_of(phi), [1, 3])
         mixed = dataclasses.replace(phi, context=dataclasses.replace(phi.context, complete=sure))
         answer, traced, unsure = seeing.predict(mixed), LinkPrediction.of_trace(phi), seeing.predict(phi)
         assert_valid(answer)
         for name, values in arrays(answer).items():
             np.testing.assert_array_equal(values[sure], getattr(traced, name)[sure], err_msg=name)
             np.testing.assert_allclose(values[~sure], getattr(unsure, name)[~sure], rtol=1e-5, err_msg=name)
-        assert answer.gain_std_db[~sure].min(initial=1.0) > 0.1
+        assert answer.gain_std_db[~sure].min() > 0.1
 
     def test_without_a_context_the_papers_networks_answer(self, seeing):
         """They are fitted to the same links, whatever other networks there are."""
@@ -175,13 +146,6 @@ class TestNetworksOfMapsAndPaths:
             np.testing.assert_array_equal(values, getattr(paper.predict(phi), name), err_msg=name)
         assert abs(seeing.predict(phi).p_los - seeing.predict(blind).p_los).max() > 0.05
 
-    def test_links_do_not_depend_on_each_other(self, seeing):
-        phi = make_seen_links(300, seed=3)[0]
-        together = seeing.predict(phi)
-        for index in ([7], [200, 3, 41], np.arange(150)):
-            for name, values in arrays(seeing.predict(phi.take(np.array(index)))).items():
-                np.testing.assert_allclose(values, getattr(together, name)[index], rtol=1e-5, err_msg=name)
-
     def test_fit_indoor_keeps_its_networks(self, seeing):
         phi = make_seen_links(400, seed=4)[0]
         settings = dataclasses.replace(seeing.settings, minimum_links=50)
@@ -193,49 +157,71 @@ class TestNetworksOfMapsAndPaths:
         assert model.predict_indoor(phi).min() < 0.5 < 0.999 < seeing.predict_indoor(phi).min()
         assert model.fingerprint != seeing.fingerprint
 
-    def test_networks_by_settings(self, quick):
-        own = {name: set(parts(context_predictor(name).model)) - set(parts(quick.model)) for name in ("paths", "map")}
-        assert own == {"paths": {LINK_NETWORK}, "map": {LINK_NETWORK, *MAP_NETWORKS}}
 
-    def test_links_that_cannot_train_it(self, seeing):
-        _, state, gain_db = make_seen_links(5)
-        message = (
-            "features has no context, which all networks but the paper's need: give the LinkFeatures of link_features, "
-            "or PredictorSettings(networks='paper')."
-        )
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            Predictor.fit(make_links(5)[0], state, gain_db, settings=seeing.settings)
-        with pytest.raises(PredictorError, match="features has no links: give at least one"):
-            Predictor.fit(make_seen_links(0)[0], [], [], settings=seeing.settings)
-        wifi = dataclasses.replace(make_links(5)[0], frequency_hz=5e9)
-        message = "features are at 5 GHz, settings at 28 GHz: give PredictorSettings(frequency_hz=5e+09)."
-        with pytest.raises(PredictorError, match=re.escape(message)):
-            Predictor.fit(wifi, state, gain_db)
-
-    def test_features_without_windows(self):
-        phi, state, gain_db = make_links(5)
-        phi = dataclasses.replace(phi, context=make_context(phi))
-        assert_valid(context_predictor("paths").predict(phi))
-        message = r"features has no windows, which map networks read: call link_features with windows=True\."
-        with pytest.raises(PredictorError, match=message):
-            context_predictor("map").predict(phi)
-        with pytest.raises(PredictorError, match=message):
-            Predictor.fit(phi, state, gain_db, settings=context_predictor("map").settings)
-
-
-def test_bad_training_data(quick):
+def test_what_is_refused(quick):
     phi, state, gain_db = make_links(5)
-    for arguments, message in (
-        ((make_links(0)[0], [], []), "features has no links: give at least one."),
-        ((phi, state[:4], gain_db), "link_state has shape (4,): give one number for each of the 5 links."),
-        ((phi, state + 3, gain_db), "use LinkState: OUTAGE 0, LOS 1, NLOS 2."),
-        ((phi, state, gain_db * np.nan), "gain_db[0] = nan is not allowed: give finite numbers."),
-        (("phi", state, gain_db), "features is of type str: give the LinkFeatures of link_features."),
+    no_windows = dataclasses.replace(phi, context=make_context(phi))
+    paths, maps = context_predictor("paths"), context_predictor("map")
+    assert_valid(paths.predict(no_windows))
+    for features, states, gains_db, settings, message in (
+        (make_links(0)[0], [], [], None, "features has no links: give at least one."),
+        (phi, state + 3, gain_db, None, "use LinkState: OUTAGE 0, LOS 1, NLOS 2."),
+        (phi, state, gain_db * np.nan, None, "gain_db[0] = nan is not allowed: give finite numbers."),
+        ("phi", state, gain_db, None, "features is of type str: give the LinkFeatures of link_features."),
+        (phi, state, gain_db, paths.settings, "features has no context, which all networks but the paper's need: give"),
+        (dataclasses.replace(phi, frequency_hz=5e9), state, gain_db, None, "features are at 5 GHz, settings at 28 GHz"),
+        (no_windows, state, gain_db, maps.settings, "features has no windows, which map networks read"),
     ):
         with pytest.raises(PredictorError, match=re.escape(message)):
-            Predictor.fit(*arguments)
-    for call in (quick.predict, quick.predict_indoor, lambda phi: quick.fit_indoor(phi, [])):
-        with pytest.raises(PredictorError, match="features is of type NoneType"):
-            call(None)
-    with pytest.raises(PredictorError, match=re.escape("inside has shape (4,)")):
+            Predictor.fit(features, states, gains_db, settings=settings)
+    with pytest.raises(PredictorError, match=r"features has no windows, .*: call link_features with windows=True\."):
+        maps.predict(no_windows)
+    with pytest.raises(PredictorError, match="features is of type NoneType"):
+        quick.predict(None)
+    with pytest.raises(PredictorError, match=r"inside has shape \(4,\)"):
         quick.fit_indoor(phi, np.ones(4))
+    for p_indoor, message in (
+        ([0.5] * 4 + [1.1], "p_indoor[4] = 1.1 is not allowed"),
+        ([0.5], "p_indoor has shape (1,)"),
+    ):
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            LinkPrediction.of_trace(phi).anywhere(p_indoor)
+
+
+HALF_SEEN = "#####???\n#..#????\n#......?\n#..#????\n#####???"
+TX = (0.75, 1.25, 1.5)
+
+
+class Constant:
+    """A model of the user that predicts the same for all links."""
+
+    def __init__(self, **columns: float) -> None:
+        self.columns = {"p_los": 0.25, "p_nlos": 0.5, "p_outage": 0.25, "gain_mean_db": -90.0, "gain_std_db": 5.0}
+        self.columns |= columns
+
+    def predict(self, phi: sp.LinkFeatures) -> dict[str, np.ndarray]:
+        assert phi.context is not None
+        return {name: np.full(len(phi), value) for name, value in self.columns.items() if not np.isinf(value)}
+
+
+def test_a_model_of_the_user_predicts_what_is_not_certain() -> None:
+    model = sp.LinkModel(home(HALF_SEEN), Constant())
+    found = model.predict(TX, [[3.2, 0.4, 1.5]])
+    assert found.p_los.tolist() == [0.25]
+    assert found.gain_mean_db[0] == pytest.approx(0.75 * -90.0 + 0.25 * -150.0)
+    coverage = sp.predict_map(home(HALF_SEEN), TX, predictor=Constant(), spacing_m=0.5)
+    assert "Constant" in coverage.attrs["predictor"]
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"p_los": 0.9}, "p_los.*the three probabilities sum to 1"),
+        ({"gain_std_db": -1.0}, "std.*give 0 or more"),
+        ({"gain_mean_db": np.nan}, "gain_los_mean_db.*give finite numbers"),
+        ({"gain_mean_db": np.inf}, "returned no 'gain_los_mean_db'"),
+    ],
+)
+def test_what_is_no_distribution_is_refused(columns: dict[str, float], message: str) -> None:
+    with pytest.raises(PredictorError, match=message):
+        sp.LinkModel(home(HALF_SEEN), Constant(**columns)).predict(TX, [[3.2, 0.4, 1.5]])

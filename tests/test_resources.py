@@ -25,30 +25,21 @@ def add_homes(folder: Path, text: str = '{"flat": {"seed": 3, "transmitter": [1,
 
 
 def test_scenes_of_the_package_come_before_those_of_the_repository(package: Path) -> None:
+    (package / "scenes").mkdir(parents=True)
+    with pytest.raises(SceneError, match=r"demo scenes are missing in '.*scenes': install sionna-partial again\."):
+        resources.scenes_folder()
     in_repository = add_homes(package.parent / "scenes")
     assert resources.scenes_folder() == in_repository
+    (package / "scenes").rmdir()
     in_package = add_homes(package / "scenes")
     assert resources.scenes_folder() == in_package
 
 
-def test_no_scenes(package: Path) -> None:
-    (package / "scenes").mkdir(parents=True)
-    with pytest.raises(SceneError, match=r"demo scenes are missing in '.*scenes': install sionna-partial again\."):
-        resources.scenes_folder()
-
-
-@pytest.mark.parametrize("text", ["{", "[]", '{"flat": {}}', '{"flat": {"transmitter": ["x"]}}', '{"flat": 3}'])
+@pytest.mark.parametrize("text", ["{", "[]", '{"flat": {"transmitter": ["x"]}}'])
 def test_damaged_description(package: Path, text: str) -> None:
     add_homes(package / "scenes", text)
     with pytest.raises(SceneError, match=r"homes.json' cannot be read \(.*\): install sionna-partial again\."):
         resources.demo_homes()
-
-
-def test_shipped_homes_are_folders() -> None:
-    homes = resources.demo_homes()
-    assert len(homes) >= 3
-    for name in homes:
-        assert (resources.scenes_folder() / name / "complete" / "scene.xml").is_file()
 
 
 WITHOUT_OPTIONAL_PACKAGES = """
@@ -84,7 +75,6 @@ main()
 
 
 def test_base_installation_predicts_and_names_what_else_is_needed(tmp_path: Path) -> None:
-    """All optional packages are hidden from one interpreter."""
     import sionna_partial as sp
 
     cells = [[1, 1, 1, 1], [1, 0, 0, 1], [1, 0, 0, 1], [1, 1, 1, 1]]

@@ -17,7 +17,6 @@ from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.maps import ros_map
 from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -42,7 +41,6 @@ def write_sheet(folder: Path, *, without: str = "", **changes: object) -> Path:
 
 
 def write_map(folder: Path, shades: object, **changes: object) -> Path:
-    """Write an image (rows from the top; grey, RGB(A), or 16 bit) and its YAML."""
     array = np.asarray(shades)
     suffix = ".pgm" if array.ndim == 2 and array.dtype != np.uint16 else ".png"
     array = array if array.dtype == np.uint16 else array.astype(np.uint8)
@@ -65,19 +63,17 @@ def test_orientation_and_place(tmp_path: Path) -> None:
     assert partial.state_at(np.array([[-0.99, 2.01], [-0.99, 2.09]])).tolist() == [FREE, WALL]
 
 
-PGMS = {
-    "binary": b"P5\n3 1\n255\n\x00\xcd\xfe",
-    "text": b"P2\n3 1\n255\n0 205 254\n",
-    "text with comments": b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
-    "binary, maxval 100": b"P5\n3 1\n100\n\x00\x32\x64",
-    "binary, 16 bit": b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
-    "text, 16 bit": b"P2\n3 1\n65535\n0 40000 65535\n",
-}
+PGMS = (
+    b"P5\n3 1\n255\n\x00\xcd\xfe",
+    b"P2\n# hand made\n3 1\n255\n0 # wall\n205\n# free:\n254\n",
+    b"P5\n3 1\n100\n\x00\x32\x64",
+    b"P5\n3 1\n65535\n\x00\x00\xcd\xcd\xff\xff",
+)
 
 
-@pytest.mark.parametrize("kind", PGMS)
-def test_every_pgm(tmp_path: Path, kind: str) -> None:
-    (tmp_path / "map.pgm").write_bytes(PGMS[kind])
+@pytest.mark.parametrize("content", PGMS)
+def test_every_pgm(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "map.pgm").write_bytes(content)
     assert load_map(write_sheet(tmp_path)).state.tolist() == [[WALL, UNKNOWN, FREE]]
 
 
@@ -92,39 +88,25 @@ def test_every_image_mode(tmp_path: Path, mode: str) -> None:
     assert state == [[WALL, FREE if mode == "1" else UNKNOWN, FREE]]
 
 
-def test_colours_are_averaged(tmp_path: Path) -> None:
-    pixels = [[[255, 0, 0], [255, 255, 250], [20, 10, 30], [0, 255, 255]]]
-    assert load_state(tmp_path, pixels) == [[WALL, FREE, WALL, UNKNOWN]]
+BLACK, WHITE, CLEAR = [0, 0, 0, 255], [255] * 4, [255, 255, 255, 0]
 
 
-def test_thresholds_are_strict(tmp_path: Path) -> None:
-    """nav2: occupancy > occupied_thresh is wall, < free_thresh is free; negated 51 and 204 have exactly 0.2 and 0.8."""
-    thresholds = {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}
-    assert load_state(tmp_path, [[50, 51, 52, 203, 204, 205]], **thresholds) == [[FREE, 2, 2, 2, 2, WALL]]
-
-
-@pytest.mark.parametrize("mode", ["trinary", "Trinary", "scale", "SCALE"])
-def test_between_the_thresholds_is_unknown(tmp_path: Path, mode: str) -> None:
-    assert load_state(tmp_path, [[0, 80, 100, 150, 205, 210, 255]], mode=mode) == [[1, 1, 2, 2, 2, 0, 0]]
-
-
-def test_raw_mode(tmp_path: Path) -> None:
-    """Raw pixels are percent of occupancy; above 100 they are unknown; negate is ignored, as in nav2."""
-    shades = [[0, 19, 20, 21, 64, 65, 100, 101, 205, 255]]
-    for negate in (0, 1):
-        assert load_state(tmp_path, shades, mode="raw", negate=negate) == [[0, 0, 0, 2, 2, 1, 1, 2, 2, 2]]
-
-
-def test_alpha_in_scale_mode(tmp_path: Path) -> None:
-    pixels = [[[0, 0, 0, 255], [255, 255, 255, 255], [0, 0, 0, 254], [255, 255, 255, 0]]]
-    assert load_state(tmp_path, pixels, mode="scale") == [[WALL, FREE, UNKNOWN, UNKNOWN]]
-
-
-def test_alpha_in_trinary_mode_is_a_fourth_channel(tmp_path: Path) -> None:
-    """nav2 averages alpha with the colours: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4."""
-    pixels = [[[0, 0, 0, 255], [60, 60, 60, 255], [255, 255, 255, 255], [255, 255, 255, 0], [255, 255, 255, 0]]]
-    for strict in (False, True):
-        assert load_state(tmp_path, pixels, strict=strict) == [[WALL, UNKNOWN, FREE, UNKNOWN, UNKNOWN]]
+@pytest.mark.parametrize(
+    ("pixels", "options", "states"),
+    [
+        # Colours are averaged; occupancy > occupied_thresh is wall, < free_thresh free (negated 51 and 204: 0.2, 0.8).
+        ([[255, 0, 0], [255, 255, 250], [20, 10, 30], [0, 255, 255]], {}, [WALL, FREE, WALL, UNKNOWN]),
+        ([50, 51, 52, 203, 204, 205], {"free_thresh": 0.2, "occupied_thresh": 0.8, "negate": 1}, [0, 2, 2, 2, 2, 1]),
+        # Raw pixels are percent of occupancy; above 100 they are unknown; negate is ignored.
+        *(([0, 19, 20, 21, 64, 65, 100, 101], {"mode": "raw", "negate": k}, [0, 0, 0, 2, 2, 1, 1, 2]) for k in (0, 1)),
+        # Alpha is a fourth channel in trinary mode: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4.
+        ([BLACK, [60, 60, 60, 255], WHITE, CLEAR], {}, [WALL, UNKNOWN, FREE, UNKNOWN]),
+        ([BLACK, WHITE, [0, 0, 0, 254], CLEAR], {"mode": "Scale"}, [WALL, FREE, UNKNOWN, UNKNOWN]),
+        ([0, 128, 205, 254], {"free_thresh": 0.25}, [WALL, UNKNOWN, FREE, FREE]),  # more would be unknown otherwise
+    ],
+)
+def test_pixels_are_read_as_by_nav2(tmp_path: Path, pixels: Any, options: dict[str, Any], states: list[int]) -> None:
+    assert load_state(tmp_path, [pixels], **options) == [states]
 
 
 def test_transparent_is_unknown(tmp_path: Path) -> None:
@@ -134,7 +116,7 @@ def test_transparent_is_unknown(tmp_path: Path) -> None:
     assert load_state(tmp_path, pixels, strict=True) == [[WALL, FREE, WALL, WALL]]
 
 
-@pytest.mark.parametrize("colour", ["grey", "grey, 16 bit", "RGB", "RGBA", "grey, negated", "RGBA, negated"])
+@pytest.mark.parametrize("colour", ["grey", "grey, 16 bit", "RGB", "RGBA, negated"])
 def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
     shades = np.array([[0, 254, 205], [205, 205, 254]])
     state = [[WALL, FREE, UNKNOWN], [UNKNOWN, UNKNOWN, FREE]]
@@ -147,48 +129,30 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
         pixels = np.stack([pixels] * 3 + [opaque] * ("RGBA" in colour), axis=-1)
     thresholds = {"free_thresh": 0.55, "occupied_thresh": 0.9} if colour == "RGBA, negated" else {"free_thresh": 0.25}
     shade = 50 if negate else 205
-    with pytest.warns(MapWarning, match=rf"3 cells of shade {shade} would read as free .* Pass strict=True"):
+    with pytest.warns(MapWarning, match=rf"3 cells of shade {shade} would read as free") as caught:
         read = load_state(tmp_path, pixels, negate=int(negate), **thresholds)
-    assert read == state
+    assert (read, caught[0].filename) == (state, __file__)
     letter = load_state(tmp_path, pixels, negate=int(negate), strict=True, **thresholds)
     assert letter == [[WALL, FREE, FREE], [FREE, FREE, FREE]]
 
 
-def test_205_is_free_where_more_is_unknown_otherwise(tmp_path: Path) -> None:
-    assert load_state(tmp_path, [[0, 128, 205, 254]], free_thresh=0.25) == [[WALL, UNKNOWN, FREE, FREE]]
-
-    with pytest.warns(MapWarning, match="2 cells of shade 205"):
-        assert load_state(tmp_path, [[0, 128, 205, 205]], free_thresh=0.25) == [[WALL, 2, 2, 2]]
-
-
-@pytest.mark.parametrize("negate", [False, True])
-def test_dark_grey_walls(tmp_path: Path, negate: bool) -> None:
+def test_dark_grey_walls(tmp_path: Path) -> None:
     shades = np.repeat(np.array([[90, 90, 254], [0, 205, 254]], dtype=np.uint8), 60, axis=0)
-    path = write_map(tmp_path, 255 - shades if negate else shades, negate=int(negate))
+    path = write_map(tmp_path, 255 - shades, negate=1)
     message = r"120 dark grey cells \(occupancy from 0\.65\) are read as unknown: if they are walls, set occupied_thr"
     with pytest.warns(MapWarning, match=message):
         assert load_map(path).state[[0, -1]].tolist() == [[WALL, UNKNOWN, FREE], [UNKNOWN, UNKNOWN, FREE]]
-    assert (load_map(path, strict=True).state == UNKNOWN).sum() == 180
     assert load_state(tmp_path, [[90, 127, 127, 0]] * 150)[0] == [UNKNOWN, UNKNOWN, UNKNOWN, WALL]
 
 
-@pytest.mark.parametrize(("mode", "grey"), [("trinary", 205), ("scale", 120)])
-def test_inflated_costmap(tmp_path: Path, mode: str, grey: int) -> None:
-    """Grey between walls and free cells gets a warning, walls beside free cells with grey behind them none."""
+def test_inflated_costmap(tmp_path: Path) -> None:
     shades = np.full((80, 80), 254)
-    shades[20:60, 20:60] = grey
+    shades[20:60, 20:60] = 120
     shades[22:58, 22:58] = 0
     with pytest.warns(MapWarning, match=r"between 100% of the walls and the free cells, as in an inflated costmap"):
-        load_map(write_map(tmp_path, shades, mode=mode))
+        load_map(write_map(tmp_path, shades, mode="scale"))
     shades[20:60, 20:22] = 254
-    load_map(write_map(tmp_path, shades, mode=mode))
-
-
-def test_warning_points_to_the_caller(tmp_path: Path) -> None:
-    path = write_map(tmp_path, [[0, 205, 254]], free_thresh=0.25)
-    with pytest.warns(MapWarning) as caught:
-        load_map(path)
-    assert caught[0].filename == __file__
+    load_map(write_map(tmp_path, shades, mode="scale"))
 
 
 def test_numbers_as_people_write_them(tmp_path: Path) -> None:
@@ -204,31 +168,19 @@ def test_numbers_as_people_write_them(tmp_path: Path) -> None:
     assert load_map(path, wall_height_m=2.4).wall_height_m == 2.4
 
 
-def test_image_beside_and_elsewhere(tmp_path: Path) -> None:
-    (tmp_path / "pictures").mkdir()
-    (tmp_path / "pictures" / "a b.pgm").write_bytes(PGMS["binary"])
-    for image in ("pictures/a b.pgm", str(tmp_path / "pictures" / "a b.pgm")):
-        assert load_map(write_sheet(tmp_path, image=image)).shape == (1, 3)
-
-
-@pytest.mark.parametrize("key", SHEET)
-def test_missing_key(tmp_path: Path, key: str) -> None:
-    (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
-    path = write_sheet(tmp_path, without=key)
-    with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} is missing: add it"):
-        load_map(path)
+def test_missing_keys(tmp_path: Path) -> None:
+    (tmp_path / "map.pgm").write_bytes(PGMS[0])
+    for key in SHEET:
+        with pytest.raises(MapError, match=f"map.yaml: {key} is missing: add it"):
+            load_map(write_sheet(tmp_path, without=key))
 
 
 @pytest.mark.parametrize(
     ("key", "values", "message"),
     [
-        (
-            "resolution",
-            (0, 50, 1e-9, 10**400, math.nan, "fine", None, True, [0.05], {}),
-            r"a number of metres per cell",
-        ),
-        ("occupied_thresh", (-0.1, 65, math.nan, "high", None), r"give a number in \[0, 1\]"),
-        ("free_thresh", (-0.1, 19.6, math.nan, "low", None), r"give a number in \[0, 1\]"),
+        ("resolution", (0, 50, 10**400, math.nan, "fine", None, True, [0.05]), r"a number of metres per cell"),
+        ("occupied_thresh", (-0.1, 65, "high"), r"give a number in \[0, 1\]"),
+        ("free_thresh", (-0.1, 19.6, "low"), r"give a number in \[0, 1\]"),
         ("free_thresh", (0.65, 0.9), "give less than occupied_thresh, which is 0.65"),
         ("origin", ([0, 0], [0] * 4, [0, math.nan, 0], [0, 0, "north"], 7, None, "0, 0"), r"give \[x, y, yaw\] of the"),
         ("origin", ([0, 0, 90],), r"the yaw in radians, one turn at most \(not degrees\)"),
@@ -242,26 +194,22 @@ def test_missing_key(tmp_path: Path, key: str) -> None:
     ],
 )
 def test_wrong_value(tmp_path: Path, key: str, values: tuple[object, ...], message: str) -> None:
-    (tmp_path / "map.pgm").write_bytes(PGMS["binary"])
+    (tmp_path / "map.pgm").write_bytes(PGMS[0])
     (tmp_path / "loop").symlink_to("loop")
     for value in values:
         path = write_sheet(tmp_path, **{key: value})
-        with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}") as caught:
+        with pytest.raises(MapError, match=f"{re.escape(str(path))}: {key} = .* is not allowed: .*{message}"):
             load_map(path)
-        shown = str(value)
-        assert len(shown) > 100 or shown in str(caught.value) or {"\0", "\ud800"} & {*shown}
 
 
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (b"", "holds None in place of keys such as image, resolution and origin"),
-        (b"image: [unclosed", "is not valid YAML"),
-        (b"\x00\x01\xff\xfe rubbish", "is not valid YAML"),
         (b"P5\n3 1\n255\n\x00\xcd\xfe", "is not valid YAML"),
         (b"image: a.pgm\nimage: b.pgm", r"is not valid YAML \(it has the key 'image' twice\)"),
         (b"a: 2020-99-99", r"is not valid YAML \(month must be"),
-        (b"[" * 5000, "is not valid YAML"),
+        (b"[" * 2000, "is not valid YAML"),
         (b"a: !!python/object/apply:os.system ['true']", "is not valid YAML"),
         (b"#" * 1_000_001, "has more than 1,000,000 bytes: give the YAML of a ROS map"),
     ],
@@ -288,39 +236,21 @@ NO_IMAGE, TOO_MANY = "it is damaged or not a PGM, PNG or BMP", "it has more than
 @pytest.mark.parametrize(
     ("message", "content"),
     [
-        *((NO_IMAGE, b"P5" + end) for end in (b"", b"\n# only a comment")),
-        *((NO_IMAGE, b"P5\n3 1\n" + end) for end in (b"255\n\x00\xcd", b"100\n\x00\x32", b"65535\n\x00\x00\xcd")),
-        *((NO_IMAGE, b"P5\n%s 1\n255\n\x00\xcd\xfe" % width) for width in (b"0", b"-3", b"three")),
-        *((NO_IMAGE, b"P2\n3 1\n255\n0 205" + end) for end in (b"", b" 300", b" white")),
-        *((NO_IMAGE, b"\x89PNG\r\n\x1a\n" + end) for end in (b"\x00\x00\x00\rIHDR", b"rubbish" * 20)),
-        (NO_IMAGE, b"GIF89a\x01\x00\x01\x00\x00\x00\x00;"),
-        *((NO_IMAGE, content) for content in (b"", bytes(range(256)) * 4)),
-        *((TOO_MANY, b"P5\n%d %d\n255\n" % size) for size in ((20_000, 20_000), (10_001, 10_000), (2**30, 2**30))),
+        *((NO_IMAGE, b"P5" + end) for end in (b"\n3 1\n255\n\x00\xcd", b"\nthree 1\n255\n\x00\xcd\xfe")),
+        *((NO_IMAGE, content) for content in (b"", b"GIF89a\x01\x00\x01\x00\x00\x00\x00;", b"\x89PNG\r\n\x1a\nIHDR")),
+        *((TOO_MANY, b"P5\n%d %d\n255\n" % size) for size in ((10_001, 10_000), (2**30, 2**30))),
         ("it holds floating-point shades; save a PGM or PNG", b"Pf\n1 1\n-1.0\n\x00\x00\x80\x3f"),
     ],
 )
 def test_damaged_image(tmp_path: Path, message: str, content: bytes) -> None:
-    """Of a large image only the header is read, and no warning of Pillow gets out."""
     (tmp_path / "map.pgm").write_bytes(content)
     with pytest.raises(MapError, match=rf"image = '.*map\.pgm' is not allowed: {message}"):
         load_map(write_sheet(tmp_path))
 
 
-def test_truncated_png(tmp_path: Path) -> None:
-    path = write_map(tmp_path, np.random.default_rng(0).integers(0, 255, (40, 40, 3)))
-    whole = (tmp_path / "map.png").read_bytes()
-    for share in (0.2, 0.6, 0.95):
-        (tmp_path / "map.png").write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(MapError, match=r"it is damaged or not a PGM, PNG or BMP \(.*\); save the map again"):
-            load_map(path)
-
-
 def test_interior_cells_follow_the_cell_size(tmp_path: Path) -> None:
-    path = write_map(tmp_path, np.full((9, 9), 254), origin=[0, 0, 0.5], interior_cells=81)
-    partial = load_map(path)
-    assert partial.resolution_m == 0.025
-    assert partial.interior_cells == 324
-    assert partial.observed_fraction == pytest.approx(1.0, abs=0.05)
+    partial = load_map(write_map(tmp_path, np.full((9, 9), 254), origin=[0, 0, 0.5], interior_cells=81))
+    assert (partial.resolution_m, partial.interior_cells) == (0.025, 324)
 
 
 PARTIAL = PartialMap(np.array([[0, 1, 2], [2, 1, 0]]), 0.1, (1 / 3, -2e5 - 0.1), 2.4, 17)
@@ -353,7 +283,6 @@ def test_further_keys(tmp_path: Path) -> None:
     assert (sheet["score"], sheet["steps"], sheet["path"]) == (1.5, 3, [[1, 0], [0, 1]])
     refused: list[tuple[object, str]] = [
         ({"resolution": 0.5}, "holds 'resolution', which the map sets itself: give a mapping of further keys"),
-        ({"mesh": {}}, "holds 'mesh', which the map sets itself"),
         ({3: 4}, "extra = {3: 4} has keys that are no text: give a mapping"),
         (5, "extra = 5 has keys that are no text: give a mapping"),
         ({"a": object()}, r"extra cannot be written as YAML \(.*\): give numbers, texts, lists and mappings"),
@@ -373,19 +302,17 @@ def test_neither_file_without_the_other(tmp_path: Path, blocked: str) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [blocked]
 
 
-GRID = np.array([[0, 1, 2], [0, 0, 1]], dtype=np.uint8)
 grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 2))
 
 
 @given(grids, st.integers(-4, 4))
 def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
     yaw = turns * math.pi / 2
-    partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw))[:1], 1.0, turn_grid(state, 1.0, (3.0, -2.0, yaw))[2])
+    partial = PartialMap(*turn_grid(state, 1.0, (3.0, -2.0, yaw)))
     v, u = np.mgrid[: state.shape[0], : state.shape[1]] + 0.5
     x = 3.0 + math.cos(yaw) * u - math.sin(yaw) * v
     y = -2.0 + math.sin(yaw) * u + math.cos(yaw) * v
     assert np.array_equal(partial.state_at(np.stack([x, y], axis=-1)), state)
-    assert partial.state.size == state.size
 
 
 @given(grids, st.floats(-6.28, 6.28), st.integers(0, 2**32 - 1))
@@ -399,15 +326,13 @@ def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float, seed:
     back = np.stack([math.cos(yaw) * x + math.sin(yaw) * y, math.cos(yaw) * y - math.sin(yaw) * x], axis=-1)
     fraction = np.abs(back - np.rint(back)).min(axis=-1)
     clear = fraction > 1e-6
-    expected = PartialMap(state, 1.0).state_at(back)
-    differs = clear & (new != expected)
-    assert (expected[differs] == FREE).all()
+    differs = clear & (new != PartialMap(state, 1.0).state_at(back))
     assert (new[differs] == WALL).all()
+    assert (PartialMap(state, 1.0).state_at(back)[differs] == FREE).all()
     assert cell == 0.5
 
 
 def room(ny: int, nx: int) -> np.ndarray:
-    """Build a closed room with walls of one cell amid unknown cells."""
     state = np.full((ny + 4, nx + 4), UNKNOWN, dtype=np.uint8)
     state[1:-1, 1:-1] = WALL
     state[2:-2, 2:-2] = FREE
@@ -416,7 +341,6 @@ def room(ny: int, nx: int) -> np.ndarray:
 
 @given(st.integers(1, 12), st.integers(1, 12), st.floats(-6.28, 6.28), st.booleans())
 def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -> None:
-    """Also where the walls meet at a corner alone."""
     state = room(ny, nx)
     if not corners:
         for row in (1, -2):
@@ -428,19 +352,6 @@ def test_closed_rooms_stay_closed(ny: int, nx: int, yaw: float, corners: bool) -
     assert not PartialMap(turn_grid(state, 0.1, (0.0, 0.0, yaw))[0], resolution_m).is_complete
 
 
-def test_diagonal_walls_stay_closed() -> None:
-    """A diamond of cells that touch at corners alone, free inside."""
-    y, x = np.mgrid[-12:13, -12:13]
-    distance = np.abs(x) + np.abs(y)
-    state = np.where(distance < 10, FREE, np.where(distance == 10, WALL, UNKNOWN)).astype(np.uint8)
-    assert PartialMap(state, 0.1).is_complete
-    for yaw in np.linspace(-3, 3, 41):
-        new, resolution_m, origin_m = turn_grid(state, 0.1, (0.0, 0.0, yaw))
-        assert PartialMap(new, resolution_m, origin_m).is_complete
-        if resolution_m < 0.1:
-            assert (new == FREE).sum() == pytest.approx(4 * (state == FREE).sum(), rel=0.06)
-
-
 def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) -> None:
     state = room(96, 96)
     limit = 0.5 / math.hypot(100, 100)
@@ -450,34 +361,22 @@ def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) ->
     assert "rad: the map is turned onto cells of 0.05 m" in caplog.text
 
 
-def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
-    with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
-        turn_grid(GRID, 0.1, (0.0, 1.0, 0.5))
-
-
 REPORTS = Path(__file__).parent / "reports"
 
 
 def levels(*parts: tuple[int, int, int]) -> NDArray[np.int64]:
-    """Return a square grid of occupancies with `count` cells for each value from low to high."""
     values = np.concatenate([np.repeat(np.arange(low, high + 1), count) for low, high, count in parts])
     size = math.ceil(math.sqrt(len(values)))
     return np.append(values, np.full(size**2 - len(values), -1)).reshape(size, size)
 
 
 class TestContinuousValues:
-    """Occupancies of many values between the thresholds, as Cartographer exports them."""
-
     def test_thresholds_fit_the_map(self) -> None:
-        """The map has 26,480 free cells, 1,520 of wall, and 15,200 unknown ones."""
         path = REPORTS / "continuous_occupancy" / "carto.yaml"
         with pytest.warns(MapWarning, match=r"95% of the seen cells have an occupancy between 19.6 and 65 %"):
             partial = load_map(path)
         assert np.bincount(partial.state.ravel()).tolist() == [26_480, 1_520, 15_200]
-        assert "26,543 of 28,000 seen cells have an occupancy between 19.6 and 65 %: walls" in str(
-            partial.import_report
-        )
+        assert "26,543 of 28,000 seen cells have an occupancy between" in str(partial.import_report)
         shade = np.asarray(Image.open(path.with_suffix(".pgm")))[::-1]
         percent = np.where(shade == 128, -1, np.rint(100 * (1 - shade / 255))).astype(np.int8)
         with pytest.warns(MapWarning, match=r"walls are the cells from 54.0 % on, and other seen cells are free"):
@@ -500,24 +399,17 @@ class TestContinuousValues:
             partial = map_from_occupancy(levels(*parts), 0.05)
         assert np.bincount(partial.state.ravel(), minlength=2)[:2].tolist() == [free, wall]
 
-    @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(0, 100, 50)], [(28, 48, 500)], [(50, 99, 100)]])
+    @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(28, 48, 500)], [(50, 99, 100)]])
     def test_values_that_are_not_separate(self, parts: list[tuple[int, int, int]]) -> None:
         message = "seen cells have an occupancy between 25 and 65 % and are read as unknown: Give free_percent"
         with pytest.warns(MapWarning, match=message):
             partial = map_from_occupancy(levels(*parts), 0.05)
         assert partial.import_report is not None
-        (row,) = partial.import_report.skipped
-        assert row.count == sum(
-            count for low, high, count in parts for value in range(low, high + 1) if 25 < value < 65
-        )
+        percent = levels(*parts)
+        assert partial.import_report.skipped[0].count == ((percent > 25) & (percent < 65)).sum()
 
     @pytest.mark.parametrize(
-        "parts",
-        [
-            [(0, 0, 5000), (100, 100, 500)],
-            [(0, 0, 5000), (50, 50, 3000), (100, 100, 500)],
-            [(0, 0, 5000), (26, 64, 20), (99, 100, 500)],
-        ],
+        "parts", [[(0, 0, 5000), (50, 50, 3000), (100, 100, 500)], [(0, 0, 5000), (26, 64, 20), (99, 100, 500)]]
     )
     def test_other_maps_keep_the_standard_thresholds(self, parts: list[tuple[int, int, int]]) -> None:
         percent = levels(*parts)

@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from importlib import import_module
-from typing import get_type_hints
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 import pytest
@@ -70,7 +70,6 @@ BESIDE = {
 
 
 def settings_classes(kind: type = Checked) -> dict[str, type]:
-    """Return the settings classes of all modules by name."""
     for module in ("app.session", "coverage.link_budget", "live.topics", "tracing.antennas"):
         import_module(f"sionna_partial.{module}")
     own = {each.__name__: each for each in kind.__subclasses__()}
@@ -102,7 +101,6 @@ def test_every_range_is_in_the_table() -> None:
 
 @pytest.mark.parametrize(("name", "field", "number", "span"), ranges())
 def test_ranges(name: str, field: str, number: str, span: str) -> None:
-    """Both ends are allowed, and nothing beyond; each message has the name, the value and the interval."""
     kind, beside = CLASSES[name], BESIDE.get((name, field), {})
     low, high = map(int if number == "whole" else float, span[1:-1].split(", "))
     if number == "whole":
@@ -138,29 +136,20 @@ def test_switches(name: str, field: str) -> None:
 
 @pytest.mark.parametrize(("name", "field"), [key for key, hint in FIELDS.items() if re.search(r"\bstr\b", str(hint))])
 def test_texts(name: str, field: str) -> None:
-    for value in (3, 2.5, True, b"map", ["map"]):
+    for value in (3, b"map", ["map"]):
         with pytest.raises(SettingsError, match=f"^{field}.* is not allowed: "):
             CLASSES[name](**{field: value})
 
 
 @pytest.mark.parametrize(
-    ("name", "field", "allowed"),
-    [
-        ("SceneSettings", "floor_extent", "observed, none"),
-        ("SceneSettings", "outline", "lines, cells"),
-        ("SensorSettings", "fusion", "slam_toolbox, gmapping, cartographer, vacuum"),
-        ("PredictorSettings", "networks", "paper, paths, map"),
-        ("PlacementSettings", "objective", "coverage, percentile"),
-    ],
+    ("name", "field", "words"), [(*key, get_args(hint)) for key, hint in FIELDS.items() if get_origin(hint) is Literal]
 )
-def test_choices(name: str, field: str, allowed: str) -> None:
-    kind = CLASSES[name]
-    for word in allowed.split(", "):
-        assert getattr(kind(**{field: word}), field) == word
+def test_choices(name: str, field: str, words: tuple[str, ...]) -> None:
+    for word in words:
+        assert getattr(CLASSES[name](**{field: word}), field) == word
     for value in ("all", None):
-        message = f"{field} = {value!r} is not allowed: choose one of {allowed}."
-        with pytest.raises(SettingsError, match=f"^{re.escape(message)}$"):
-            kind(**{field: value})
+        with pytest.raises(SettingsError, match=f"^{field} = .* is not allowed: choose one of {', '.join(words)}.$"):
+            CLASSES[name](**{field: value})
 
 
 STAGES = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
@@ -174,21 +163,16 @@ FREQUENCIES = "give a number in [1e+06, 1e+12]."
         ("SceneSettings", "material", "cheese", "choose one of drywall, brick"),
         ("Material", "itu", "cheese", "choose one of vacuum, concrete, brick, "),
         ("TraceSettings", "frequency_hz", 28, f"{FREQUENCIES} Did you mean 28e9?"),
-        ("TraceSettings", "frequency_hz", 3.5, f"{FREQUENCIES} Did you mean 3.5e9?"),
         ("TraceSettings", "frequency_hz", 3500, f"{FREQUENCIES} Did you mean 3500e6?"),
-        *(("TraceSettings", "frequency_hz", value, f"{FREQUENCIES}$") for value in (0, 2e12)),
+        ("TraceSettings", "frequency_hz", 0, f"{FREQUENCIES}$"),
         ("DatasetSettings", "links_per_home", 3, "give at least 4, one for each of the transmitters_per_home."),
-        *(("DatasetSettings", "stages", value, STAGES) for value in ((), [0, 50], (50, 0), (0, 0), (0, 2.5), (-1, 2))),
+        *(("DatasetSettings", "stages", value, STAGES) for value in ((), [0, 50], (50, 0), (0, 2.5), (-1, 2))),
         ("DatasetSettings", "sensor", TraceSettings(), "give SensorSettings(...), or 'mixed'."),
-        ("DatasetSettings", "scene", None, "give SceneSettings(...)."),
         ("DatasetSettings", "trace", SceneSettings(), "give TraceSettings(...)."),
         ("Topics", "map", "map", "give the full name of a topic, such as /map."),
-        ("Topics", "prefix", "/", "give the full name of a topic"),
         ("Topics", "powers", {"rssi": None}, "give the full name of a topic"),
         ("Topics", "powers", 3, "give a mapping of topics to transmitters."),
-        ("Topics", "key_values", "/a b", "give the full name of a topic"),
         ("Topics", "robot_frame", "", "give a frame, such as base_link."),
-        ("RadioSettings", "material", "cheese", "choose one of "),
     ],
 )
 def test_refused(name: str, field: str, value: object, remedy: str) -> None:
@@ -198,22 +182,13 @@ def test_refused(name: str, field: str, value: object, remedy: str) -> None:
         CLASSES[name](**{field: value})
 
 
-@pytest.mark.parametrize("name", ITU_BANDS_GHZ)
-def test_frequencies_of_the_material(name: str) -> None:
-    for low_ghz, high_ghz in ITU_BANDS_GHZ[name]:
-        for frequency_ghz in (low_ghz, high_ghz):
-            Material(itu=name).require_frequency(frequency_ghz * 1e9)
-
-
 @pytest.mark.parametrize(
     ("name", "frequency_hz", "spans"),
-    [
-        ("brick", 60e9, "1-40 GHz or 110-330 GHz"),
-        ("concrete", 0.9e9, "1-100 GHz or 110-330 GHz"),
-        ("concrete", 105e9, "1-100 GHz or 110-330 GHz"),
-    ],
+    [("brick", 60e9, "1-40 GHz or 110-330 GHz"), ("concrete", 0.9e9, "1-100 GHz or 110-330 GHz")],
 )
 def test_frequency_outside_the_material(name: str, frequency_hz: float, spans: str) -> None:
+    for frequency_ghz in np.ravel(ITU_BANDS_GHZ[name]):
+        Material(itu=name).require_frequency(frequency_ghz * 1e9)
     message = f"frequency_hz = {frequency_hz!r} is not allowed: ITU material {name!r} is defined for {spans}"
     with pytest.raises(SettingsError, match=rf"{re.escape(message)}.*; choose a frequency there or a custom"):
         Material(itu=name).require_frequency(frequency_hz)
@@ -238,9 +213,7 @@ def test_materials_by_name() -> None:
     [
         (lambda: sp.predict_map(None, frequency_hz=5e9), "frequency_hz = 5000000000.0 is a setting: give trace_sett"),
         (lambda: sp.predict_map(None, ceiling=False), "give scene_settings=SceneSettings(ceiling=...)."),
-        (lambda: sp.LinkModel(None, max_depth=3), "give trace_settings=TraceSettings(max_depth=...)."),
         (lambda: sp.Simulation(None, material="brick"), "give scene_settings=SceneSettings(material=...)."),
-        (lambda: sp.trace_links(None, None, None, refraction=True), "give trace_settings=TraceSettings(refraction="),
     ],
 )
 def test_settings_given_as_arguments(call: Callable[[], object], message: str) -> None:

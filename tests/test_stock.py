@@ -1,5 +1,6 @@
 """Paths by shooting rays: against closed forms, and independent of other receivers and runs."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,14 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import build_scene, export_scene, write_scene
 from sionna_partial.settings import ITU_BANDS_GHZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.engine import load_sionna, open_scene
+from sionna_partial.tracing.interactions import (
+    DIFFRACTION,
+    DIFFUSE,
+    REFLECTION,
+    REFRACTION,
+    only_by_rays,
+    with_defaults,
+)
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.stock import listed_before, stock_paths
 
@@ -64,31 +73,24 @@ class TestStockPaths:
         length = np.linalg.norm(points - tx, axis=1) + np.linalg.norm(points - rx, axis=1)
         np.testing.assert_allclose(paths.delay_s[diffuse] * SPEED_OF_LIGHT_M_S, length, rtol=1e-5)
 
-    def test_the_answer_does_not_depend_on_the_other_receivers(self, room_xml: Path) -> None:
-        settings = TraceSettings(max_depth=3, refraction=True, samples_per_tx=10_000)
-        together = _solve(room_xml, settings, TX, RX)
+    def test_the_answer_depends_on_no_other_receiver_and_no_run(self, room_xml: Path) -> None:
+        options = {"refraction": True, "diffraction": True, "diffuse_reflection": True}
+        settings = TraceSettings(max_depth=3, samples_per_tx=5_000, **options)
+        together, again = (_solve(room_xml, settings, TX, RX) for _ in range(2))
         alone = _solve(room_xml, settings, TX, RX[2:])
         last = together.path_rx == 2
         assert last.sum() == len(alone.a) > 10
         for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m"):
+            assert getattr(together, name).tobytes() == getattr(again, name).tobytes()
             assert getattr(together, name)[last].tobytes() == getattr(alone, name).tobytes()
 
-    def test_two_runs_give_the_same_bytes(self, room_xml: Path) -> None:
-        settings = TraceSettings(max_depth=2, diffraction=True, diffuse_reflection=True, samples_per_tx=5_000)
-        first, second = (_solve(room_xml, settings, TX, RX[:2]) for _ in range(2))
-        assert len(first.a) > 20
-        for name in ("a", "delay_s", "departure_rad", "arrival_rad", "interactions", "vertices_m"):
-            assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-
-    @pytest.mark.parametrize("depth", [0, 3])
-    def test_a_receiver_that_nothing_reaches(self, tmp_path: Path, depth: int) -> None:
+    def test_a_receiver_that_nothing_reaches(self, tmp_path: Path) -> None:
         state = np.full((40, 40), CellState.FREE, np.uint8)
         state[:, 20] = CellState.WALL
         xml = _write(PartialMap(state, 0.1), tmp_path)
-        settings = TraceSettings(max_depth=depth, samples_per_tx=1000)
+        settings = TraceSettings(max_depth=0, samples_per_tx=1000)
         paths = _solve(xml, settings, np.array([1.0, 1.0, 1.5]), np.array([[3.0, 1.0, 1.5]]))
-        assert paths.interactions.shape == (0, max(1, depth))
-        assert paths.vertices_m.shape == (0, max(1, depth), 3)
+        assert paths.vertices_m.shape == (0, 1, 3)
 
     def test_failure_of_sionna_is_a_backend_error(self, room_xml: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         def fail(*_: object, **__: object) -> None:
@@ -138,8 +140,20 @@ def test_one_path_of_each_kind_is_listed() -> None:
     assert listed_before(np.zeros((0, 2), np.uint8), np.zeros((0, 2, 3))).shape == (0,)
 
 
-def test_itu_bands_are_those_of_sionna() -> None:
+def test_bands_and_numbers_are_those_of_sionna() -> None:
     load_sionna()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
     assert {name: tuple(bands) for name, bands in ITU_MATERIALS_PROPERTIES.items()} == ITU_BANDS_GHZ
+    theirs = load_sionna().constants.InteractionType
+    numbers = theirs.SPECULAR, theirs.DIFFUSE, theirs.REFRACTION, theirs.DIFFRACTION
+    assert numbers == (REFLECTION, DIFFUSE, REFRACTION, DIFFRACTION)
+
+
+def test_by_default_candidates_alone_find_the_paths() -> None:
+    for settings in (TraceSettings(5e9), TraceSettings(28e9)):
+        for environment in ("plan", "mesh"):
+            assert only_by_rays(with_defaults(settings, environment), environment) == []
+    asked = replace(settings, diffuse_reflection=True, refraction=True, diffraction=True)
+    assert [kind.setting for kind in only_by_rays(asked, "plan")] == ["diffuse_reflection"]
+    assert [kind.setting for kind in only_by_rays(asked, "mesh")] == ["diffuse_reflection", "diffraction"]

@@ -8,12 +8,10 @@ from extruded import ROOM, SPLINTERS, drawn, extrude, specular_blocks, specular_
 from numpy.typing import NDArray
 from test_trace import _grid, _half_seen_room, _room, all_paths
 
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.constants import SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.scene.scene import SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings
 from sionna_partial.tracing.engine import SceneSolver
-from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.simulation import trace_links
 
@@ -28,12 +26,9 @@ GAP = np.array([[(1.0, 2.0), (2.99, 2.0)], [(3.01, 2.0), (5.0, 2.0)]])
 FLOOR = ((-10.0, -10.0, 16.0, 14.0),)
 PLANS = {
     "no walls": (extrude(np.zeros((0, 2, 2)), floor_m=FLOOR), (1.07, 1.93, 1.2)),
-    "no walls, no floor": (extrude(np.zeros((0, 2, 2)), floor_m=()), (1.07, 1.93, 1.2)),
-    "free-standing wall": (extrude([[(2.0, 1.0), (2.4, 3.1)]], floor_m=FLOOR), (1.07, 1.93, 1.2)),
     "crossing walls": (extrude(SPLINTERS, floor_m=FLOOR), (1.07, 1.93, 1.2)),
     "collinear walls with a gap": (extrude(GAP, floor_m=FLOOR), (2.97, 0.5, 1.2)),
     "2 cm from a corner": (extrude(ROOM), (0.02, 0.02, 1.2)),
-    "2 cm from a door jamb": (extrude(ROOM), (2.98, 1.5, 1.2)),
     "in the door": (extrude(ROOM), (3.0, 2.0, 1.2)),
     "in line with a wall": (extrude(GAP, floor_m=FLOOR), (0.5, 2.0, 1.2)),
     "no ceiling": (extrude(ROOM, ceiling=False), (1.07, 1.93, 1.2)),
@@ -85,16 +80,8 @@ def test_blocks_of_candidates_together_hold_what_one_block_holds() -> None:
 
 
 class TestJunctions:
-    def test_nothing_leaks_through_the_joints_of_a_closed_wall(self) -> None:
-        state = _room().state.copy()
-        state[:, 30] = CellState.WALL
-        links = trace_links(PartialMap(state, 0.1), (1.05, 2.95, 1.5), _grid(PartialMap(state, 0.1), 0.5))
-        beyond = links.rx[:, 0] > 3.1
-        assert (links.link_state[beyond] == LinkState.OUTAGE).all()
-        assert (links.link_state[~beyond] == LinkState.LOS).all()
-
-    @pytest.mark.parametrize("partial", [_room(), _half_seen_room()], ids=["complete", "partial"])
-    def test_no_path_bends_where_three_walls_meet(self, partial: PartialMap) -> None:
+    def test_no_path_bends_where_three_walls_meet(self) -> None:
+        partial = _half_seen_room()
         settings = all_paths(open_ends=True)
         links = trace_links(partial, (1.05, 2.95, 1.5), _grid(partial, 0.5), trace_settings=settings)
         edges = np.unique(links.vertices_m[links.interactions == 8][:, :2].round(2), axis=0)
@@ -118,57 +105,20 @@ class TestOpenEnds:
         assert 8 in asked.interactions
 
 
-class TestCeiling:
-    def test_without_it_the_paths_that_do_not_touch_it_remain(self) -> None:
-        tx, rx, settings = (1.05, 2.95, 1.5), _grid(_room(), 1.0), all_paths(max_depth=3)
-        under, open_air = (
-            trace_links(_room(), tx, rx, trace_settings=settings, scene_settings=SceneSettings(ceiling=each))
-            for each in (True, False)
-        )
-        below = ~(under.vertices_m[..., 2] > 3.0 - 1e-3).any(axis=1)
-        assert 0 < below.sum() < len(below)
-        assert np.nanmax(open_air.vertices_m[..., 2]) < 3.0 - 1e-3
-        np.testing.assert_array_equal(open_air.path_rx, under.path_rx[below])
-        np.testing.assert_array_equal(open_air.delay_s, under.delay_s[below])
-        np.testing.assert_allclose(np.abs(open_air.a), np.abs(under.a[below]), rtol=1e-4)
-
-
 class TestTransmitters:
     TX = ((1.05, 2.95, 1.5), (5.03, 0.64, 2.1), (2.2, 1.1, 1.2))
 
-    def _one_by_one(self, rx: NDArray[np.float64]) -> list[TracedLinks]:
-        return [trace_links(_room(), tx, rx) for tx in self.TX]
-
     def test_several_are_the_same_as_one_by_one(self) -> None:
         rx = _grid(_room(), 1.0)
-        together, apart = trace_links(_room(), self.TX, rx), self._one_by_one(rx)
-        assert together.link_state.shape == together.gain_db.shape == (3, len(rx))
-        assert together.tx.tolist() == [list(tx) for tx in self.TX]
-        for index, links in enumerate(apart):
+        together, listed = trace_links(_room(), self.TX, rx), trace_links(_room(), self.TX[:1], rx)
+        np.testing.assert_array_equal(listed.gain_db, together.gain_db[:1])
+        for index, tx in enumerate(self.TX):
+            links = trace_links(_room(), tx, rx)
             assert together.gain_db[index].tobytes() == links.gain_db.tobytes()
-            assert together.link_state[index].tobytes() == links.link_state.tobytes()
             own = together.path_tx == index
             assert together.path_rx[own].tobytes() == links.path_rx.tobytes()
             for name in ARRAYS:
                 assert getattr(together, name)[own].tobytes() == getattr(links, name).tobytes()
-            assert (links.path_tx == 0).all()
-
-    def test_one_may_be_given_as_a_list(self) -> None:
-        alone, listed = (trace_links(_room(), tx, [(2.0, 1.0, 1.5)]) for tx in (self.TX[0], self.TX[:1]))
-        assert (alone.tx.shape, listed.tx.shape, listed.link_state.shape) == ((3,), (1, 3), (1, 1))
-        np.testing.assert_array_equal(listed.gain_db, alone.gain_db[None])
-
-    def test_no_receivers_give_no_links(self) -> None:
-        links = trace_links(_room(), self.TX, np.zeros((0, 3)))
-        assert links.link_state.shape == links.gain_db.shape == (len(self.TX), 0)
-        assert links.a.shape == links.path_tx.shape == (0,)
-
-    def test_progress_runs_through_all_of_them(self) -> None:
-        seen: list[float] = []
-        trace_links(_room(), self.TX, [[2.0, 1.0, 1.5]], progress=lambda fraction, message: seen.append(fraction))
-        assert seen == sorted(seen)
-        assert seen[0] == 0.0
-        assert seen[-1] == pytest.approx(1.0)
 
 
 def test_coefficients_do_not_depend_on_how_deep_others_go() -> None:

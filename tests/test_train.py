@@ -1,14 +1,14 @@
 import dataclasses
+import itertools
 import json
-import re
 
 import numpy as np
 import pytest
 from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET, shallow_map_networks
 
-from sionna_partial.errors import OutputError, PredictorError, PredictorWarning, SettingsError
-from sionna_partial.evaluation import Baselines, evaluate, measure
+from sionna_partial.errors import OutputError, PredictorError, PredictorWarning, SionnaPartialError
+from sionna_partial.evaluation import Baselines, evaluate
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 from sionna_partial.training.predictor import split_homes, train
@@ -31,10 +31,14 @@ def run(table):
     return train(table, test_fraction=0.4, settings=QUICK)
 
 
+@pytest.fixture(scope="module")
+def untrained(table):
+    return train(table, test_fraction=0.4, settings=UNTRAINED)
+
+
 class TestSplitHomes:
-    @pytest.mark.parametrize("share", [0.01, 0.3, 0.5, 0.99])
-    def test_no_home_is_on_both_sides_and_none_is_lost_whatever_their_order(self, share):
-        for seed in range(5):
+    def test_no_home_is_on_both_sides_and_none_is_lost_whatever_their_order(self):
+        for share, seed in itertools.product((0.01, 0.5, 0.99), range(2)):
             train_homes, test_homes = split_homes(HOMES, share, seed)
             assert not set(train_homes) & set(test_homes)
             assert sorted([*train_homes, *test_homes]) == HOMES
@@ -42,27 +46,14 @@ class TestSplitHomes:
             assert split_homes(HOMES[::-1], share, seed) == (train_homes, test_homes)
             assert split_homes(HOMES, 0.0, seed) == (tuple(HOMES), ())
 
-    @pytest.mark.parametrize(
-        ("homes", "share", "error", "message"),
-        [
-            *(
-                (
-                    homes,
-                    share,
-                    PredictorError,
-                    f"dataset has {count}: give at least 2 to train on some and test on others, or",
-                )
-                for homes, share, count in (([], 0.3, "0 homes"), (["a"], 0.3, "1 home"), ([], 0.0, "0 homes"))
-            ),
-            *(
-                (HOMES, share, SettingsError, r"test_fraction = .* is not allowed: give a number in \[0, 0.99\]")
-                for share in (-0.1, 1.0, np.nan, "a")
-            ),
-        ],
-    )
-    def test_refused(self, homes, share, error, message):
-        with pytest.raises(error, match=message):
-            split_homes(homes, share, 0)
+    def test_refused(self):
+        for homes, share, message in (
+            (["a"], 0.3, "dataset has 1 home: give at least 2 to train on some and test on others"),
+            ([], 0.0, "dataset has 0 homes"),
+            (HOMES, 1.0, r"test_fraction = 1.0 is not allowed: give a number in \[0, 0.99\]"),
+        ):
+            with pytest.raises(SionnaPartialError, match=message):
+                split_homes(homes, share, 0)
 
 
 class TestTrain:
@@ -71,15 +62,20 @@ class TestTrain:
         assert len(run.test_homes) == 2
         assert run.predictor.homes == run.baselines.distance.homes == run.train_homes
         assert run.predictor.metrics["held_out_homes"] == list(run.test_homes)
+        (row,) = run.evaluation.select(homes="test", stage=100, model="majority", ends_seen="all")
+        assert run.predictor.metrics["exploration_steps"]["100"]["majority"] == row.metrics.as_json()
+        anywhere = run.predictor.metrics["exploration_steps_receivers_anywhere"]["0"]
+        assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
+        assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
 
-    def test_links_of_test_homes_are_not_learned(self, table):
-        spoiled = np.isin(table.home, split_homes(sorted(set(table.home)), 0.4, 0)[1])
+    def test_links_of_test_homes_are_not_learned(self, table, untrained):
+        spoiled = np.isin(table.home, untrained.test_homes)
         other = dataclasses.replace(table, gain_db=np.where(spoiled, -77.0, table.gain_db))
-        one, again = (train(links, test_fraction=0.4, settings=UNTRAINED) for links in (table, other))
-        assert again.predictor.fingerprint == one.predictor.fingerprint
-        assert again.baselines.distance.fingerprint == one.baselines.distance.fingerprint
-        assert again.baselines.majority == one.baselines.majority
-        assert again.predictor.metrics != one.predictor.metrics
+        again = train(other, test_fraction=0.4, settings=UNTRAINED)
+        assert again.predictor.fingerprint == untrained.predictor.fingerprint
+        assert again.baselines.distance.fingerprint == untrained.baselines.distance.fingerprint
+        assert again.baselines.majority == untrained.baselines.majority
+        assert again.predictor.metrics != untrained.predictor.metrics
 
     def test_links_indoors_make_the_predictor_and_those_anywhere_the_indoor_model(self, table, run):
         links = table.take(np.isin(table.home, run.train_homes))
@@ -89,17 +85,8 @@ class TestTrain:
         assert p_indoor[hidden.inside].mean() > p_indoor[~hidden.inside].mean() + 0.3
         assert p_indoor.mean() == pytest.approx(hidden.inside.mean(), abs=0.02)
 
-    def test_the_card_says_what_was_measured_on_test_homes(self, run):
-        (row,) = run.evaluation.select(homes="test", stage=100, model="majority", ends_seen="all")
-        assert run.predictor.metrics["exploration_steps"]["100"]["majority"] == row.metrics.as_json()
-        anywhere = run.predictor.metrics["exploration_steps_receivers_anywhere"]["0"]
-        assert set(anywhere) == {"with indoor model", "without indoor model", "always outage"}
-        assert "paper" not in run.predictor.metrics["exploration_steps"]["0"]
-
     def test_few_homes(self, table):
-        with pytest.raises(
-            PredictorWarning, match="'map' are trained on 5 homes, fewer than 20, and may be worse than"
-        ):
+        with pytest.raises(PredictorWarning, match="'map' are trained on 5 homes, fewer than 20"):
             train(table, test_fraction=0.0, settings=PredictorSettings("map"))
 
     @pytest.mark.filterwarnings("ignore::sionna_partial.errors.PredictorWarning")
@@ -112,10 +99,6 @@ class TestTrain:
         assert seeing.predictor.settings == settings
         assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")
-        links = table.take(~table.anywhere & np.isin(table.home, seeing.test_homes))
-        (row,) = seeing.evaluation.select(receivers="indoor", ends_seen="all", model="predictor")
-        expected = measure(seeing.predictor.predict(links.phi), links.link_state, links.gain_db)
-        assert row.metrics.as_json() == pytest.approx(expected.as_json(), rel=1e-6)
         assert [share for share, _ in calls] == sorted(share for share, _ in calls)
         assert any(message.startswith("step 0 of 1, loss ") for _, message in calls)
 
@@ -128,24 +111,19 @@ class TestTrain:
 
     def test_settings_of_a_data_set_are_its_own(self, table, tmp_path):
         folder = make_dataset(tmp_path, table, frequency_hz=60e9, diffraction=False)
-        message = (
-            "dataset was traced at 60 GHz without diffraction, settings are for links at 28 GHz with diffraction: give "
-            "PredictorSettings with frequency_hz, diffraction and through_walls of the data set."
-        )
-        with pytest.raises(PredictorError, match=re.escape(message)):
+        message = "dataset was traced at 60 GHz without diffraction, settings are for links at 28 GHz with diffraction"
+        with pytest.raises(PredictorError, match=message):
             train(folder, settings=UNTRAINED)
         settings = dataclasses.replace(UNTRAINED, frequency_hz=60e9, diffraction=False)
         assert train(folder, test_fraction=0.0, settings=settings).predictor.settings == settings
 
 
 class TestSave:
-    def test_same_links_and_seed_give_the_same_bytes(self, table, tmp_path):
-        files, again = (
-            train(table, test_fraction=0.4, settings=UNTRAINED).save(tmp_path / name) for name in ("one", "two")
-        )
-        assert [file.name for file in files] == [
-            *("distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json")
-        ]
+    def test_same_links_and_seed_give_the_same_bytes(self, table, untrained, tmp_path):
+        files = untrained.save(tmp_path / "one")
+        again = train(table, test_fraction=0.4, settings=UNTRAINED).save(tmp_path / "two")
+        names = ["distance.json", "distance.keras", "majority.json", "predictor.json", "predictor.keras", "split.json"]
+        assert [file.name for file in files] == names
         for one, two in zip(files, again, strict=True):
             assert one.read_bytes() == two.read_bytes(), one.name
 

@@ -14,7 +14,6 @@ from sionna_partial.prediction.unseen_walls import (
     UnseenWalls,
     corrected,
     count_probabilities,
-    map_image,
     walls_met,
     walls_per_m,
 )
@@ -38,22 +37,6 @@ def unseen_home() -> list[Lines]:
     return lines_of(540_000, None, robot=False)
 
 
-def test_lines_count_the_walls_that_they_cross():
-    """Those along x by the extent along x, those along y by that along y."""
-    per_m = np.zeros((1, 10, 20, 2), dtype=np.float32)
-    per_m[..., 0], per_m[..., 1] = 0.5, 2.0
-    start, end = (np.array([[ends]], dtype=np.float32) for ends in ((2.0, 3.0), (12.0, 7.0)))
-    assert float(walls_met(per_m, start, end)[0, 0]) == pytest.approx((10 * 0.5 + 4 * 2.0) * CELL_M, rel=1e-5)
-
-
-def test_images_have_fractions_of_cells():
-    image = map_image(half_known())
-    assert image.shape == (14, 27, 2)
-    np.testing.assert_allclose(image[5, 5] / 255.0, (1.0, 0.0))
-    np.testing.assert_allclose(image[5, 0] / 255.0, (2 / 3, 1 / 3))
-    assert not image[5, 20].any()
-
-
 def test_no_walls_are_expected_in_what_is_known():
     model = sp.LinkModel(half_known(), trace_settings=WIFI)
     phi = model.features((4.0, 0.0, 1.5), [(x, 0.0, 1.5) for x in (6.0, 7.5, 9.0, 10.5)])
@@ -63,24 +46,6 @@ def test_no_walls_are_expected_in_what_is_known():
     seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
     first_x, first_y = np.round(-seen.origin_m / CELL_M).astype(int)
     assert not np.any(seen.per_m[0, first_y : first_y + 13, first_x : first_x + 13])
-
-
-@pytest.mark.parametrize("origin_m", [(3.0, -2.0), (-12.3456, 4_500_000.05)])
-def test_the_corner_of_the_grid_does_not_matter(origin_m):
-    """Padded or cropped by unknown cells, the walls that are expected are the same to the byte."""
-    base = half_known().state
-    rx = np.array([*origin_m, 0.0]) + [(x, 2.0, 1.5) for x in (2.0, 4.7, 5.3, 6.5)]
-    first = None
-    for below, above, left, right in ((0, 0, 0, 0), *np.random.default_rng(5).integers(0, 14, (5, 4)), (0, 0, 0, -13)):
-        state = np.pad(base, ((below, above), (left, max(right, 0))), constant_values=CellState.UNKNOWN)
-        state = state[:, : state.shape[1] + min(right, 0)]
-        partial = sp.PartialMap(state, 0.1, (origin_m[0] - 0.1 * left, origin_m[1] - 0.1 * below))
-        phi = sp.LinkModel(partial, trace_settings=WIFI).features(rx[0] - (1.0, 0.4, 0.0), rx)
-        density = UnseenWalls.shipped().of_map(partial)
-        first = first or density
-        assert density.per_m.numpy().tobytes() == first.per_m.numpy().tobytes()
-        assert density.origin_m.tobytes() == first.origin_m.tobytes()
-        np.testing.assert_allclose(density.counts(phi), first.counts(phi), rtol=1e-5)
 
 
 def test_the_number_of_walls_is_negative_binomial():
@@ -104,18 +69,6 @@ def test_long_lines_have_as_many_walls_on_a_metre_as_the_longest_of_the_training
     per_m = density.counts(phi) / lengths_m
     assert per_m[0] > per_m[1]
     np.testing.assert_allclose(per_m[2:], per_m[1], rtol=0.1)
-
-
-def test_a_grown_map_is_read_again():
-    model = sp.LinkModel(half_known(), trace_settings=WIFI)
-    ends = (4.0, 0.0, 1.5), [(10.5, 0.0, 1.5)]
-    before = model.predict(*ends)
-    grown = half_known().state.copy()
-    grown[1:-1, 40:50] = CellState.FREE
-    model.update(sp.PartialMap(grown, 0.1, (3.0, -2.0)))
-    fresh = sp.LinkModel(model.partial, trace_settings=WIFI).predict(*ends)
-    assert model.predict(*ends).gain_mean_db == fresh.gain_mean_db
-    assert before.p_los < fresh.p_los
 
 
 def test_better_than_as_many_walls_on_every_metre(unseen_home):

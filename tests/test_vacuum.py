@@ -6,7 +6,6 @@ import re
 from pathlib import Path
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import xarray as xr
@@ -16,16 +15,6 @@ from vacuum_files import LEFT, PIXEL_CM, ROOMS, SIZE_CM, TOP, recording, valetud
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, MeasurementError
-
-SHARED = Path(__file__).resolve().parents[1] / ".." / "shared" / "vacuum"
-SIZES = {
-    VACUUM: (8.6, 8.05, 0, 11220),
-    SHARED / "3irobotix_converted_3790.json": (9.55, 11.25, 7, 20718),
-    SHARED / "3irobotix_viomi_v7_47_cleaned_segment_ids.json": (4.35, 10.2, 2, 4333),
-    SHARED / "dreame_d9_1093_multi_map.json": (6.2, 11.6, 7, 17604),
-    SHARED / "roborock_S5_FW2020_with_segments.json": (22.9, 15.95, 8, 44832),
-}
-"""Extent along x and y [m], number of rooms, and free pixels (the sum of `pixelCount`, or of half of `pixels`)."""
 
 
 @pytest.mark.parametrize("compressed", [True, False])
@@ -39,9 +28,8 @@ def test_map_of_a_robot(tmp_path: Path, compressed: bool) -> None:
     assert partial.resolution_m == PIXEL_CM / 100
     bottom_cm = SIZE_CM - PIXEL_CM * (TOP + len(marks))
     assert partial.bounds_m == pytest.approx((PIXEL_CM * LEFT / 100, bottom_cm / 100, 12.0, bottom_cm / 100 + 3.5))
-    text = str(partial.import_report)
-    for line in ("segment 'kitchen': 25", "no_go_area: 1 (no part", "wall: 42", "charger at (5.75, 9.25) m"):
-        assert line in text
+    assert "no_go_area: 1 (no part" in str(partial.import_report)
+    assert "charger at (5.75, 9.25) m" in str(partial.import_report)
     assert partial.state_at(np.array([5.75, 9.25])) == CellState.FREE
 
 
@@ -61,48 +49,29 @@ def test_unknown_cells_and_layers(tmp_path: Path) -> None:
     assert "unknown: 1 (no floor, segment or wall)" in str(partial.import_report)
 
 
-def test_names_of_rooms(tmp_path: Path) -> None:
-    content = valetudo_map("kkbb")
-    content["layers"][0]["metaData"] = {"segmentId": "7"}
-    content["layers"][1]["metaData"]["name"] = "k\x1b[2Jitchen\n2"
-    assert sp.load_map(write_json(tmp_path / "home.json", content)).room_names == ("room 7", "k\\x1b[2Jitchen 2")
-
-
-@pytest.mark.parametrize("path", SIZES, ids=lambda path: path.stem)
-def test_maps_of_real_homes(path: Path) -> None:
-    if not path.is_file():
-        pytest.skip("needs the maps of the shared folder")
-    partial = sp.load_map(path)
-    x_m, y_m, rooms, free = SIZES[path]
-    report = partial.import_report
-    assert report is not None
-    assert (report.extent_m, len(partial.room_names)) == (pytest.approx((x_m, y_m)), rooms)
-    assert (partial.state == CellState.FREE).sum() == free
-
-
-def spoilt(**changes: Any) -> dict[str, Any]:
-    return valetudo_map() | changes
+def test_map_of_an_apartment() -> None:
+    partial = sp.load_map(VACUUM)
+    assert partial.import_report is not None
+    assert partial.import_report.extent_m == pytest.approx((8.6, 8.05))
+    assert (partial.state == CellState.FREE).sum() == 11220
 
 
 def with_layer(**changes: Any) -> dict[str, Any]:
-    return spoilt(layers=[*valetudo_map()["layers"], {"type": "floor", **changes}])
+    return valetudo_map() | {"layers": [*valetudo_map()["layers"], {"type": "floor", **changes}]}
 
 
 @pytest.mark.parametrize(
     ("content", "message"),
     [
         ([1], "path = '*' holds no ValetudoMap: give a map in the JSON of Valetudo"),
-        ({"map": None}, "path = '*' holds no ValetudoMap"),
-        (spoilt(pixelSize=0), "pixelSize = 0 is not allowed: give a length in centimetres."),
-        (spoilt(size=None), "size.y = None is not allowed: give a length in centimetres."),
-        (spoilt(layers=None), "layers = None is not allowed: give a map in the JSON of Valetudo"),
-        (spoilt(layers=[]), "layers has no pixels of a floor or a segment (none): let the robot map a room first."),
-        (spoilt(layers=[7]), "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo writes."),
-        (spoilt(entities=3), "entities = 3 is not allowed"),
+        (valetudo_map() | {"pixelSize": 0}, "pixelSize = 0 is not allowed: give a length in centimetres."),
+        (valetudo_map() | {"size": None}, "size.y = None is not allowed: give a length in centimetres."),
+        (valetudo_map() | {"layers": None}, "layers = None is not allowed: give a map in the JSON of Valetudo"),
+        (valetudo_map() | {"layers": []}, "layers has no pixels of a floor or a segment (none): let the robot map"),
+        (valetudo_map() | {"layers": [7]}, "layers[0] = 7 is not allowed: give a layer with a type, as Valetudo"),
         (with_layer(pixels=[1, 2, 3]), "layers[4].pixels has shape (3,): give whole numbers from 0 to"),
         (with_layer(pixels=[-1, 2]), "layers[4].pixels has values from -1 to 2: give whole numbers from 0 to"),
         (with_layer(pixels=[1.5, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
-        (with_layer(pixels=[10**30, 2]), "layers[4].pixels has dtype float64: give whole numbers"),
         (with_layer(pixels=[10**7, 10**7]), "layers span 9999991 x 9999981 pixels, more than 100,000,000"),
         (with_layer(compressedPixels=[1, 1, 0]), "layers[4].compressedPixels has lengths of 0 to 0: give rows of"),
     ],
@@ -112,7 +81,7 @@ def test_what_is_no_map(tmp_path: Path, content: object, message: str) -> None:
         sp.load_map(write_json(tmp_path / "home.json", content))
 
 
-@pytest.mark.parametrize("content", [b'{"a": ', b"", b"[" * 100_000, b"\xff\xfe", b"1" * 5000])
+@pytest.mark.parametrize("content", [b'{"a": ', b"[" * 100_000, b"\xff\xfe"])
 def test_what_is_no_json(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "home.json"
     path.write_bytes(content)
@@ -135,8 +104,6 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert (len(other), other.tx[0].tolist()) == (8, [6.0, 9.0, 1.0])
     with pytest.raises(MeasurementError, match=r"access_point = 'home' names 2 access points of .*: give the BSSID"):
         sp.load_measurements(path, access_point="home")
-    with pytest.raises(MeasurementError, match=r"access_point = 'shop' names 0 access points"):
-        sp.load_measurements(path, access_point="shop")
     with pytest.raises(MeasurementError, match=r"columns = .* is for a CSV and not a recording"):
         sp.load_measurements(path, columns={"rx_x": "x"})
     (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
@@ -152,26 +119,18 @@ def test_coverage_of_rooms(tmp_path: Path) -> None:
     area = coverage.radio.area(-65.0)
     assert area.floor.values.tolist() == ["observed", "all", "bedroom", "kitchen"]
     assert area.area_m2.sel(floor="kitchen", tx="b").item() == pytest.approx(25 * 0.25)
-    kitchen, bedroom = (area.fraction.sel(floor=name).values.tolist() for name in ("kitchen", "bedroom"))
-    assert kitchen[0] > kitchen[1]
-    assert bedroom[0] < bedroom[1]
+    assert area.fraction.sel(floor="kitchen", tx="a") > area.fraction.sel(floor="kitchen", tx="b")
     sp.save_coverage(coverage, tmp_path / "coverage.nc")
     xr.testing.assert_identical(sp.load_coverage(tmp_path / "coverage.nc"), coverage)
-    states = coverage["link_state"].isel(tx=0)
-    assert states.isnull().any()
-    assert states.plot().get_clim()[1] <= sp.LinkState.NLOS
-    plt.close("all")
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"measurements": []}, "has no measurements: let the robot drive while Valeronoi records."),
-        ({"measurements": None}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 9, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
         ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx[0, 0] = nan is not allowed"),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": ["-5"]}]}, "gain_db[0] = nan is not allowed"),
-        ({"map": {}}, "holds no ValetudoMap"),
     ],
 )
 def test_what_is_no_recording(tmp_path: Path, changes: dict[str, Any], message: str) -> None:

@@ -46,8 +46,8 @@ def powers(material: str, rx=RX, tx=TX) -> sp.Measurements:
 
 
 class TestCandidates:
-    @pytest.mark.parametrize("extra_db", [(0.0, 0.0), (7.0, 0.0), (0.0, 3.0), (12.0, 3.0)])
-    def test_one_trace_has_the_gains_of_any_extra_loss(self, extra_db):
+    def test_one_trace_has_the_gains_of_any_extra_loss(self):
+        extra_db = 12.0, 3.0
         simulation = sp.Simulation(FLAT, EVERY_PATH)
         paths = list(simulation.blocks(np.array(TX), RX, lambda *_: None))
         phi = features_of_paths(FLAT, np.array(TX), RX, paths, simulation.resolved, None, material_unknown=True)
@@ -58,9 +58,8 @@ class TestCandidates:
                 power, block.path_rx, block.power * 10.0 ** (-(extra_db[0] * walls + extra_db[1] * reflections) / 10.0)
             )
         assert np.allclose(phi.with_extra_losses(*extra_db).gain_db, path_gain_db(power))
-        assert np.array_equal(phi.with_extra_losses(0.0, 0.0).link_state, phi.link_state)
 
-    @pytest.mark.parametrize("material", COMMON)
+    @pytest.mark.parametrize("material", ["drywall", "concrete"])
     def test_a_candidate_is_near_the_trace_with_each_material(self, material):
         candidates, _ = model_of(None).predict(TX, RX).by_material
         named = model_of(material).predict(TX, RX).gain_mean_db
@@ -68,7 +67,7 @@ class TestCandidates:
         assert min(off_db) < 2.5
         assert candidates[int(np.argmin(off_db))].gain_mean_db.mean() == pytest.approx(named.mean(), abs=2.0)
 
-    @pytest.mark.parametrize("frequency_hz", [0.9e9, 2.4e9, 5.8e9, 28e9, 60e9])
+    @pytest.mark.parametrize("frequency_hz", [0.9e9, 60e9])
     def test_prior(self, frequency_hz):
         found = WallMaterials.at(frequency_hz)
         assert found.prior.sum() == pytest.approx(1.0)
@@ -79,24 +78,6 @@ class TestCandidates:
         np.testing.assert_allclose(several.prior[:16], found.prior * P_SAME)
         assert several.prior.sum() == pytest.approx(1.0)
         assert np.all(several.crossing_db[16:, 0] != several.crossing_db[16:, 1])
-
-    def test_text(self):
-        found = WallMaterials.at(2.4e9)
-        assert found.text(np.eye(16)[0]) == "drywall 1.00"
-        assert found.text(0.6 * np.eye(16)[0] + 0.4 * np.eye(16)[7]) == "drywall .60, concrete .40"
-        assert WallMaterials.at(2.4e9, several=True).text(np.eye(28)[18]) == "drywall 1.00; thick walls concrete 1.00"
-
-    def test_predictions_need_fewer_paths(self):
-        settings, power = sp.TraceSettings(2.4e9, diffraction=False), np.zeros(len(RX))
-        simulation, count = sp.Simulation(FLAT, settings), 0
-        for block in simulation.blocks(np.array(TX), RX, lambda *_: None):
-            np.add.at(power, block.path_rx, block.power)
-            count += len(block.a)
-        every = simulation.links(TX, RX)
-        missing_db = every.gain_db - path_gain_db(power)
-        assert count < 0.8 * len(every.a)
-        assert np.median(missing_db) < 0.1
-        assert missing_db.mean() < 0.2
 
 
 class TestPrediction:
@@ -109,15 +90,12 @@ class TestPrediction:
         assert np.allclose(found.gain_std_db**2, square - mean_db**2 + RESIDUAL_DB**2)
 
     def test_selected_links_keep_their_candidates(self):
-        found = model_of(None).predict([TX, (1.2, 2.0, 1.5)], RX)
-        assert found.by_material[0][3].gain_mean_db.shape == found.gain_mean_db.shape == (2, len(RX))
-        some = model_of(None).predict(TX, RX).take(np.arange(4))
-        assert len(some.by_material[0]) == 16
-        assert some.amplified(3.0).by_material[0][2].gain_mean_db == pytest.approx(
-            some.by_material[0][2].gain_mean_db + 3.0
-        )
-        joined = LinkPrediction.concatenate([some, some])
-        assert joined.by_material[0][1].gain_mean_db.shape == (8,)
+        found = model_of(None).predict([TX, (1.2, 2.0, 1.5)], RX[:6])
+        assert found.by_material[0][3].gain_mean_db.shape == found.gain_mean_db.shape == (2, 6)
+        some = found.take(np.arange(4))
+        joined = LinkPrediction.concatenate([some.amplified(3.0), some])
+        expected = some.by_material[0][1].gain_mean_db
+        assert joined.by_material[0][1].gain_mean_db == pytest.approx(np.concatenate([expected + 3.0, expected]))
 
     def test_a_named_material_has_the_residuals_of_traces(self):
         found = model_of("brick").predict(TX, RX)
@@ -174,11 +152,10 @@ class TestPrediction:
     def test_known_materials(self, partial, settings):
         assert not sp.Simulation(partial, settings).material_unknown
 
-    @pytest.mark.parametrize("material", [None, "brick"])
-    def test_differentiable_links_have_the_same_distribution(self, material):
+    def test_differentiable_links_have_the_same_distribution(self):
         import tensorflow as tf
 
-        model = model_of(material, EVERY_PATH)
+        model = model_of(None, EVERY_PATH)
         links = sp.DifferentiableScene(model).links(TX, RX[:20])
         tx_m, expected = tf.Variable(links.base.tx_m), model.predict(TX, RX[:20])
         with tf.GradientTape() as tape:
@@ -187,11 +164,6 @@ class TestPrediction:
         np.testing.assert_allclose(found.gain_mean_db, expected.gain_mean_db, atol=0.05)
         np.testing.assert_allclose(found.gain_std_db, expected.gain_std_db, atol=0.05)
         assert np.isfinite(tape.gradient(mean_db, tx_m)).all()
-
-    def test_28_ghz_through_walls(self):
-        simulation = sp.Simulation(FLAT, sp.TraceSettings(28e9, refraction=True))
-        assert simulation.material_unknown
-        assert simulation.resolved.scene_settings.material == sp.Material.named("drywall")
 
     def test_unseen_walls_have_the_loss_of_each_candidate(self):
         state = FLAT.state.copy()
@@ -214,7 +186,7 @@ class TestPrediction:
 
 
 class TestMeasurements:
-    @pytest.mark.parametrize(("material", "least"), [("drywall", 0.5), ("brick", 0.5), ("concrete", 0.8)])
+    @pytest.mark.parametrize(("material", "least"), [("drywall", 0.5), ("concrete", 0.8)])
     def test_powers_find_the_material(self, material, least):
         model, measured = model_of(None), powers(material)
         fitted = self.fit(model, measured)
@@ -235,16 +207,6 @@ class TestMeasurements:
         simple = self.fit(drywall, measured.take(given))
         simple_db = simple.update(RX[rest], drywall.predict(TX, RX[rest])).gain_mean_db + simple.offset_db
         assert np.mean(off_db**2) < np.mean((simple_db - measured.gain_db[rest]) ** 2)
-
-    def test_others_are_enough(self):
-        model, tx = model_of(None), (8.8, 2.5, 1.5)
-        rx = RX[RX[:, 0] < 7.0]
-        other = self.fit(model, powers("concrete", rx, tx), tx)
-        nothing = sp.Measurements(TX, np.zeros((0, 3)), np.zeros(0))
-        fitted = self.fit(model, nothing, others=[other])
-        concrete = model.wall_materials.names[:, 0] == "concrete"
-        assert fitted.material_weights[concrete].sum() > model.wall_materials.prior[concrete].sum() + 0.15
-        assert fitted.offset_db == pytest.approx(OFFSET_DB, abs=10.0)
 
     def test_thin_and_thick_walls_have_materials_of_their_own(self):
         state = FLAT.state.copy()

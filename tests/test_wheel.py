@@ -16,7 +16,6 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Folder with the source archive, and the wheel that was built from it."""
     folder = tmp_path_factory.mktemp("dist")
     command = [sys.executable, "-m", "build", "--no-isolation", "--outdir", str(folder), str(ROOT)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
@@ -26,41 +25,28 @@ def dist(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def wheel(dist: Path) -> Path:
-    (path,) = dist.glob("*.whl")
-    return path
+    return next(dist.glob("*.whl"))
 
 
 @pytest.fixture(scope="module")
 def archive(dist: Path) -> Path:
-    (path,) = dist.glob("*.tar.gz")
-    return path
+    return next(dist.glob("*.tar.gz"))
 
 
 @pytest.fixture(scope="module")
-def names(wheel: Path) -> list[str]:
+def names(wheel: Path) -> set[str]:
     with zipfile.ZipFile(wheel) as archive:
-        return archive.namelist()
+        return {*archive.namelist()}
 
 
-def test_package_is_whole(names: list[str]) -> None:
-    sources = {f"sionna_partial/{path.name}" for path in (ROOT / "sionna_partial").glob("*.py")}
-    assert sources | {"sionna_partial/py.typed", "sionna_partial/__init__.pyi"} <= set(names)
-    assert any(name.endswith("licenses/LICENSE") for name in names)
-
-
-@pytest.mark.parametrize("folder", ["predictors", "scenes"])
-def test_data_is_whole(names: list[str], folder: str) -> None:
-    parent = ROOT / ("scenes" if folder == "scenes" else "sionna_partial/predictors")
-    files = {path.relative_to(parent).as_posix() for path in parent.rglob("*") if path.is_file()}
+def test_package_and_data_are_whole_and_nothing_else_is_there(names: set[str]) -> None:
+    files = {file.relative_to(ROOT).as_posix() for file in (ROOT / "sionna_partial").rglob("*") if file.is_file()}
+    files |= {f"sionna_partial/{file.relative_to(ROOT)}" for file in (ROOT / "scenes").rglob("*") if file.is_file()}
     files = {file for file in files if "__pycache__" not in file}
-    assert files
-    assert {f"sionna_partial/{folder}/{file}" for file in files} <= set(names)
-
-
-def test_nothing_else_is_in_it(names: list[str]) -> None:
-    tops = {name.partition("/")[0] for name in names}
-    assert tops == {"sionna_partial", "sionna_partial-0.1.0.dist-info"}
-    assert not [name for name in names if "test" in name or "__pycache__" in name]
+    assert {"sionna_partial/py.typed", "sionna_partial/__init__.pyi"} < files <= names
+    others = {name.partition("/")[2] for name in names - files}
+    assert "licenses/LICENSE" in others
+    assert {name.partition("/")[0] for name in names - files} == {"sionna_partial-0.1.0.dist-info"}
 
 
 def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
@@ -73,7 +59,6 @@ def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
 
 
 def published_in(folder: Path, packages: list[str | Path]) -> tuple[Path, dict[str, str]]:
-    """Install into a new environment; return its Python, and variables that hide the environment of the tests."""
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
     subprocess.run([python, *INSTALL, *packages], check=True, timeout=1800)

@@ -1,7 +1,6 @@
 """Windows around transmitters, against a reckoning with every cell of the map and every cell of the window."""
 
 import numpy as np
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
@@ -12,10 +11,7 @@ from sionna_partial.prediction.unobserved import (
     CELLS_M,
     CHANNELS,
     WINDOW_CELLS,
-    WINDOWS,
-    draw_windows,
     map_windows,
-    transmitters,
 )
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN
@@ -119,27 +115,6 @@ class TestTransmitterWindow:
         np.testing.assert_array_equal(hidden[sure], of_walls[sure] > 1e-5)
         assert sure.mean() > 0.9
 
-    def test_nothing_known_nearby_gives_nothing(self):
-        closet = PartialMap(np.zeros((10, 10), dtype=np.uint8), 0.1)
-        for tx_m in ((HALF_M + 1.1, 0.5), (0.5, -HALF_M - 0.1), (500.0, 500.0)):
-            assert not transmitter_window(closet, np.array(tx_m)).any()
-        assert channel(transmitter_window(closet, np.array([HALF_M + 0.9, 0.5])), "free").sum() > 0.0
-
-    @pytest.mark.parametrize("resolution_m", [0.05, 0.02, 0.11])
-    @pytest.mark.parametrize("origin_m", [(0.0, 0.0), (-12.3456, 7.0625), (-0.025, 4_500_000.0)])
-    def test_the_corner_of_the_grid_does_not_matter(self, resolution_m, origin_m):
-        """Padded or cropped by unknown cells, a map has the same windows to the byte."""
-        state = np.random.default_rng(4).choice([FREE, WALL, UNKNOWN], size=(40, 50), p=[0.8, 0.05, 0.15])
-        state = np.pad(state, 13, constant_values=UNKNOWN)
-        tx_m = np.array([origin_m]) + np.array([21.3, 17.7]) * resolution_m
-        expected = map_windows(PartialMap(state, resolution_m, origin_m), tx_m)
-        for below, above, left, right in np.random.default_rng(5).integers(-13, 14, (12, 4)):
-            grown = np.pad(state, np.maximum([(below, above), (left, right)], 0), constant_values=UNKNOWN)
-            grown = grown[max(-below, 0) : len(grown) - max(-above, 0), max(-left, 0) : grown.shape[1] - max(-right, 0)]
-            corner_m = (origin_m[0] - left * resolution_m, origin_m[1] - below * resolution_m)
-            found = map_windows(PartialMap(grown, resolution_m, corner_m), tx_m)
-            assert found.tobytes() == expected.tobytes()
-
     def test_detours(self):
         """None in the open or off a wall at the transmitter, long out of a closed room, shorter through a door."""
         state, half = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE), WINDOW_CELLS // 2
@@ -189,21 +164,3 @@ class TestScales:
         state[:, 199] = WALL
         hidden = map_windows(PartialMap(state, 0.05), np.array([[10.02, 10.02]]))[0, 1, ..., CHANNELS.index("hidden")]
         assert not hidden[32, 33:40].any()
-
-
-class TestDrawWindows:
-    def test_one_for_every_transmitter_on_every_map(self):
-        maps = tuple(PartialMap(np.full((9, 9), state), 0.5) for state in (FREE, WALL))
-        one, other = (1.0, 2.0, 1.5), (3.1, 2.0, 1.5)
-        tx_m, map_index = np.array([other, one, one, other, (1.0, 2.0, 0.5)]), np.array([0, 1, 0, 0, 0])
-        keys, index = transmitters(map_index, tx_m)
-        windows = draw_windows(maps, keys)
-        assert windows.shape == (3, *WINDOWS)
-        assert windows.dtype == np.uint8
-        assert index.shape == (5,)
-        for number, tx, found in zip(map_index, tx_m, index, strict=True):
-            np.testing.assert_array_equal(windows[found], map_windows(maps[number], tx[None, :2])[0])
-
-    def test_no_links(self):
-        keys, index = transmitters(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-        assert (keys.shape, index.shape, draw_windows((), keys).shape) == ((0, 3), (0,), (0, *WINDOWS))

@@ -153,9 +153,8 @@ class SceneMesh(Shown):
 
     def wall_sizes(self, _walls: Bools) -> tuple[tuple[Material | None, ...], Floats]:
         area = np.abs(self._doubled_normals)
-        steep = np.hypot(*area.T[:2]) > area[:, 2]
-        sizes = np.bincount(self.material, np.linalg.norm(area, axis=1) * steep, len(self.materials))
-        return self.materials, sizes
+        steep_m2 = np.linalg.norm(area, axis=1) * (np.hypot(*area.T[:2]) > area[:, 2])
+        return self.materials, np.bincount(self.material, steep_m2, len(self.materials)).astype(np.float64)
 
     def is_named_at(self, points_m: Floats) -> Bools:
         """Return whether the faces nearest to points (P, 3) [m] on the mesh have a named material."""

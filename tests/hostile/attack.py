@@ -37,20 +37,16 @@ ENDINGS = (*ALLOWED, "wrong", "traceback", "crash", "hang", "memory", "left behi
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a case ended."""
-
     case: Case
     ending: str
     message: str
 
     @property
     def is_defect(self) -> bool:
-        """Whether the package did what it must not do."""
         return self.ending not in ALLOWED
 
 
 def attack(cases: Sequence[Case], *, seconds: float = SECONDS, gigabytes: float = GIGABYTES) -> Iterator[Outcome]:
-    """Run cases one after the other in a worker process, which is replaced when a case takes it down."""
     waiting = list(cases)
     while waiting:
         with tempfile.TemporaryDirectory(prefix="hostile_") as folder:
@@ -64,8 +60,6 @@ def attack(cases: Sequence[Case], *, seconds: float = SECONDS, gigabytes: float 
 
 
 class _Worker:
-    """A process that runs cases in their order, and reports the end of each."""
-
     def __init__(self, folder: Path, cases: Sequence[Case]) -> None:
         self._cases, self._log = cases, folder / "stderr"
         self._reports = folder / "reports"
@@ -85,7 +79,6 @@ class _Worker:
             )
 
     def outcomes(self, seconds: float, gigabytes: float) -> Iterator[Outcome]:
-        """Yield the outcome of each case, until one takes the process down."""
         for reported, case in enumerate(self._cases):
             began_s = busy_s = self._processor_s()
             began_gb = self._resident_gb()
@@ -113,13 +106,11 @@ class _Worker:
             yield Outcome(case, ending, message)
 
     def kill(self) -> None:
-        """End the process and its children."""
         if self._process.poll() is None:
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
     def _processor_s(self) -> float:
-        """Return the processor time of the worker and its children, those that have ended too."""
         return self._family(lambda process: sum(process.cpu_times()[:4]))
 
     def _resident_gb(self) -> float:
@@ -139,23 +130,19 @@ class _Worker:
 
 
 def table(outcomes: Sequence[Outcome]) -> str:
-    """Return a Markdown table of how many cases of each family ended how."""
     counts = {family: Counter[str]() for family in FAMILIES}
     for outcome in outcomes:
         counts[outcome.case.family][outcome.ending] += 1
+    counts["all"] = sum(counts.values(), Counter[str]())
     rows = [
-        f"| {family} | {sum(counts[family].values())} | "
-        + " | ".join(str(counts[family][end]) for end in ENDINGS)
-        + " |"
-        for family in FAMILIES
+        " | ".join(map(str, [family, found.total(), *(found[end] for end in ENDINGS)]))
+        for family, found in counts.items()
     ]
-    total = sum(counts.values(), Counter[str]())
-    rows.append(f"| all | {sum(total.values())} | " + " | ".join(str(total[end]) for end in ENDINGS) + " |")
-    return "\n".join([f"| inputs | cases | {' | '.join(ENDINGS)} |", "|---" * (len(ENDINGS) + 2) + "|", *rows])
+    heads = " | ".join(["inputs", "cases", *ENDINGS])
+    return "\n".join([f"| {heads} |", "|---" * (len(ENDINGS) + 2) + "|", *(f"| {row} |" for row in rows)])
 
 
 def main() -> None:
-    """Run the fixed cases once, in a random order, and then random ones, until the time is up."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--minutes", type=float, default=60.0)
     parser.add_argument("--seed", type=int, default=0)

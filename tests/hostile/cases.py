@@ -14,8 +14,6 @@ CORPUS = Path(__file__).with_name("corpus")
 
 @dataclass(frozen=True)
 class Case:
-    """Python code that a worker runs in an empty folder; it may work, or be refused."""
-
     family: str
     name: str
     code: str
@@ -173,7 +171,6 @@ read({kind!r}, path)
 
 
 def cases_of(family: str, seed: int) -> list[Case]:
-    """Return the cases of a family; those that are random depend on the seed."""
     makers = {
         "settings": _settings,
         "arguments": _arguments,

@@ -38,7 +38,6 @@ class Wrong(Exception):
 
 
 def must_refuse(call: Callable[[], Any]) -> None:
-    """Call, and raise `Wrong` unless it is refused."""
     try:
         result = call()
     except sp.SionnaPartialError:
@@ -47,7 +46,6 @@ def must_refuse(call: Callable[[], Any]) -> None:
 
 
 def python(code: str, *, seconds: float = 900.0, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run Python code in a process of its own, with other environment variables."""
     environment = os.environ | {"PYTHONPATH": str(Path(sp.__file__).parents[1])} | variables
     return subprocess.run(
         [sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=seconds, check=False
@@ -112,7 +110,6 @@ def _processor_s(pid: int) -> float:
 
 
 def room() -> sp.PartialMap:
-    """Return a room of 4 x 3 m, a wall with a door in its middle, the right part partly unknown."""
     state = np.zeros((15, 20), dtype=np.uint8)
     state[[0, -1]] = state[:, [0, -1]] = sp.CellState.WALL
     state[:9, 10] = sp.CellState.WALL
@@ -197,43 +194,36 @@ def _predictor(folder: Path) -> Path:
 
 @functools.cache
 def coverage() -> Any:
-    """Return the coverage of a transmitter in the room."""
     return sp.predict_map(room(), TX, spacing_m=0.5, predictor="paper")
 
 
 @functools.cache
 def two_coverages() -> Any:
-    """Return the coverage of two transmitters in the room."""
     return sp.predict_map(room(), [TX, (2.9, 2.5, 1.5)], spacing_m=0.5, predictor="paper")
 
 
 @functools.cache
 def network() -> Any:
-    """Return the network of these two transmitters."""
     return sp.network_map(two_coverages(), n=10)
 
 
 @functools.cache
 def links() -> sp.TracedLinks:
-    """Return links traced in the room."""
     return sp.trace_links(room(), TX, [(3.1, 2.5, 1.5), (0.9, 2.1, 1.5)])
 
 
 @functools.cache
 def samples() -> sp.ChannelSamples:
-    """Return draws of links in the room."""
     return sp.sample_channels(room(), TX, [(3.1, 2.5, 1.5)], n=3, predictor="paper")
 
 
 def measured() -> sp.Measurements:
-    """Return gains measured on these links."""
     rx_m = links().rx
     return sp.Measurements(np.tile(TX, (len(rx_m), 1)), rx_m, np.full(len(rx_m), -70.0))
 
 
 @functools.cache
 def prediction() -> sp.LinkPrediction:
-    """Return what is predicted of these links."""
     return sp.Predictor.load("paper").predict(sp.link_features(room(), links()))
 
 
@@ -304,15 +294,10 @@ def _drawing(folder: Path) -> Path:
 
 def _bag(name: str, folder: Path) -> Path:
     sys.path.insert(0, str(Path(HERE).parent))
-    from rosbag_files import START_S, messages_of, write_bag
+    from rosbag_files import write_drive
 
     name = {".bag": "drive.bag", ".mcap": "drive_mcap", ".db3": "drive_sqlite3"}[Path(name).suffix]
-    make = messages_of(name)
-    rows: list[tuple[str, float, Any]] = [("/map", 0.0, make.grid([[0, 100, -1]] * 4))]
-    for time_s in (0.0, 1.0, 2.0):
-        rows.append(("/pose", time_s, make.pose_stamped(START_S + time_s, time_s, 1.0, 0.0)))
-        rows.append(("/rssi", time_s, make.power(-60.0)))
-    bag = write_bag(folder / name, rows)
+    bag = write_drive(folder / name)
     return bag if bag.is_file() else next(file for file in bag.iterdir() if file.suffix != ".yaml")
 
 
@@ -362,10 +347,8 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
 
 
 def read(kind: str, path: Path) -> Any:
-    """Read a file of a kind as a user would."""
     return KINDS[kind][1](path)
 
 
 def valid(kind: str, folder: Path) -> Path:
-    """Write a valid file of a kind into a folder."""
     return KINDS[kind][0](folder)

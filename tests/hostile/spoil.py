@@ -7,7 +7,6 @@ from cases import TOKENS
 
 
 def flipped(data: bytes, rng: random.Random, count: int) -> bytes:
-    """Change some bytes."""
     changed = bytearray(data)
     for _ in range(count):
         changed[rng.randrange(len(changed))] = rng.randrange(256)
@@ -15,24 +14,20 @@ def flipped(data: bytes, rng: random.Random, count: int) -> bytes:
 
 
 def without_lines(data: bytes, rng: random.Random) -> bytes:
-    """Leave out a third of the lines."""
     return b"\n".join(line for line in data.split(b"\n") if rng.random() > 0.3)
 
 
 def lines_twice(data: bytes, rng: random.Random) -> bytes:
-    """Write some lines twice."""
     return b"\n".join(line for line in data.split(b"\n") for _ in range(1 + (rng.random() < 0.3)))
 
 
 def shuffled(data: bytes, rng: random.Random) -> bytes:
-    """Mix the lines."""
     lines = data.split(b"\n")
     rng.shuffle(lines)
     return b"\n".join(lines)
 
 
 def with_token(data: bytes, rng: random.Random) -> bytes:
-    """Put another token for a number or a word."""
     tokens = list(re.finditer(rb"-?\d[\d.e+-]*|[A-Za-z_]\w*", data))
     if not tokens:
         return data

@@ -16,13 +16,6 @@ from typing import Any
 
 
 def command(*arguments: object) -> str:
-    """Run the command line in this process; return what it wrote.
-
-    Raises
-    ------
-    Refused
-        If it ended with exit code 2 and one error line.
-    """
     from sionna_partial.cli import app
 
     out, err = io.StringIO(), io.StringIO()
@@ -44,7 +37,6 @@ class Refused(Exception):
 
 
 def run(code: str, folder: Path) -> tuple[str, str]:
-    """Run the code of a case in an empty folder; return how it ended, and its message."""
     import numpy as np
     from inputs import Wrong
 
@@ -64,7 +56,6 @@ def run(code: str, folder: Path) -> tuple[str, str]:
 
 
 def left_behind(folder: Path) -> list[Path]:
-    """Return the hidden and temporary folders that no living process holds."""
     leftovers = ((folder.rglob, ".tmp-*"), (Path(tempfile.gettempdir()).glob, "sionna_partial_*"))
     left = []
     for path in sorted(each for find, pattern in leftovers for each in find(pattern)):
@@ -79,7 +70,6 @@ def left_behind(folder: Path) -> list[Path]:
 
 
 def main() -> None:
-    """Run all cases."""
     signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell ignores it for what runs in the background
     home = Path(sys.argv[1])
     sys.path.insert(0, str(Path(__file__).resolve().parents[2]))

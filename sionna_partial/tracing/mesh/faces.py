@@ -219,7 +219,7 @@ def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) 
     count = np.bincount(plane, minlength=len(first))
     edge_m = np.maximum(np.sqrt(size_m.prod(axis=1) / count), size_m.max(axis=1) / (4 * count))
     edge_m[count == 1] = size_m[count == 1].max(axis=1)
-    columns, rows = (np.floor(size_m / edge_m[:, None]).astype(np.int64) + 1).T
+    columns, rows = np.floor(size_m / edge_m[:, None]).astype(np.int64).T.copy() + 1
     first_bin = np.concatenate([[0], np.cumsum(columns * rows)])
     flat_m = np.take_along_axis(corner_m, axes[plane][:, None], 2)
     start, face = _fill_bins(plane, flat_m, low_m, edge_m, columns, first_bin)

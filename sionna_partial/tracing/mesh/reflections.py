@@ -130,7 +130,7 @@ class MeshReflections:
         *,
         coarse: bool = False,
     ) -> None:
-        ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64)), settings.max_depth
+        ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64, order="C")), settings.max_depth
         if isinstance(rays, int):
             self.name, self._opaque, self._rays = "paths through walls", None, rays
             limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1, coarse=coarse)

@@ -126,7 +126,8 @@ class _Edges(NamedTuple):
         exterior_rad = (np.arctan2(normals[:, 1, 0], -normals[:, 1, 1]) - face_rad) % (2 * np.pi)
         exterior_rad[exterior_rad < _FLAT_RAD] = 2 * np.pi  # the free end of a wall
         material, constants = wall_material[wedges.face[:count] // 2], wedge_constants(exterior_rad)
-        return cls(wedges.edge_m, face_rad, exterior_rad, normals.reshape(-1, 4), constants, material)
+        flat = np.ascontiguousarray(normals.reshape(-1, 4))
+        return cls(wedges.edge_m, face_rad, exterior_rad, flat, constants, material)
 
 
 class _EdgeTask(NamedTuple):

@@ -67,8 +67,8 @@ class Room(NamedTuple):
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
         # Contiguous: numba compiles for each layout.
-        of_walls = material_of_face[: 2 * len(geometry.segments) : 2].copy()
-        return cls(float(geometry.height_m), *flats, tx_m, rx_m, of_walls, of_flats, geometry.top_m, gains)
+        arrays = map(np.ascontiguousarray, (tx_m, rx_m, material_of_face[: 2 * len(geometry.segments) : 2]))
+        return cls(float(geometry.height_m), *flats, *arrays, of_flats, geometry.top_m, gains)
 
 
 class Building(NamedTuple):
@@ -438,7 +438,7 @@ def _lower(kind, face, vertices, same, walls, lids, ends, interior):
     for c in range(len(kind)):
         old_kind[:], old_face[:], old[:] = kind[c], face[c], vertices[c]
         kind[c], face[c], vertices[c] = 0, -1, 0.0
-        here, start, begin, count, d = tx_m, tx_m, 0, 0, 0
+        here, start, begin, count, d = tx_m, tx_m, np.int64(0), 0, 0
         while count >= 0:
             there = old[d] if old_kind[d] > 0 else targets[c]
             count = _add_lids(here, there, lids, kind[c], face[c], vertices[c], count)

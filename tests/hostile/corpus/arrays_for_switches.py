@@ -1,7 +1,0 @@
-must_refuse(lambda: sp.load_map(valid("map.yaml", folder), strict=np.zeros(3)))
-must_refuse(lambda: sp.make_home(1, locked_rooms=np.zeros(3)))
-must_refuse(lambda: sp.make_home(1, kind=["house"]))
-must_refuse(lambda: sp.explore(room(), iter([1, 2])))
-must_refuse(lambda: sp.TraceSettings(frequency_hz=10**5000))
-must_refuse(lambda: sp.map_from_slam(np.zeros((4, 5)), np.ones((4, 5)), 0.1, threshold=None))
-must_refuse(lambda: sp.PartialMap(np.zeros((4, 5), int), 0.1, (0.0, (1.0, 2.0))))

@@ -1,8 +1,0 @@
-masked = np.ma.masked_array(np.zeros((4, 5), int), np.eye(4, 5))
-must_refuse(lambda: sp.map_from_array(masked, 0.1))
-must_refuse(lambda: sp.map_from_array(list(masked), 0.1))
-must_refuse(lambda: sp.map_from_slam(masked, np.ones((4, 5)), 0.1))
-must_refuse(lambda: sp.map_from_array(np.zeros((4, 5), complex), 0.1))
-must_refuse(lambda: sp.map_from_occupancy(np.ma.masked_array(np.zeros((4, 5), np.int8), np.eye(4, 5)), 0.1))
-must_refuse(lambda: sp.trace_links(room(), np.ma.masked_array(TX, [0, 1, 0]), [(3.1, 2.5, 1.5)]))
-must_refuse(lambda: sp.trace_links(room(), np.array(TX) + 0j, [(3.1, 2.5, 1.5)]))
