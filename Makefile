@@ -13,7 +13,7 @@ FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
-.PHONY: help demo test check core kernels-plan kernels-mesh docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test ci check core kernels kernels-plan kernels-mesh suite docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
@@ -21,9 +21,18 @@ help: ## List what can be made
 demo: $(READY) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
 	@$(BIN)/sionna-partial demo --out demo-output
 
-test: $(READY) ## Check style and types, and run the tests
-	@$(MAKE) --no-print-directory -j 2 kernels-plan lint kernels-mesh
-	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile
+test: kernels ## Check style and types, and run the tests
+	@$(MAKE) --no-print-directory suite
+
+ci: kernels ## Check style and types, run the tests, and build the site
+	@$(MAKE) --no-print-directory -j 2 site suite MARKERS="-m 'not slow'"
+	@echo "the site is build/docs/index.html"
+
+kernels: $(READY)
+	@$(MAKE) --no-print-directory -j 3 kernels-plan kernels-mesh lint
+
+suite: $(READY)
+	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder $(MARKERS)
 
 check: $(READY) ## Check style and types, and run the tests of the core, in two minutes
 	@$(MAKE) --no-print-directory -j 2 core lint
@@ -32,7 +41,7 @@ core: $(READY)
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -q $(CORE)
 
 kernels-plan kernels-mesh: kernels-%: $(READY)
-	@$(ONE_THREAD) $(BIN)/python tests/compile_kernels.py $*
+	@$(ONE_THREAD) $(if $(filter mesh,$*),nice) $(BIN)/python tests/compile_kernels.py $*
 
 docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
 	@$(MAKE) --no-print-directory -j 2 site pages
@@ -42,7 +51,7 @@ site: $(READY)
 	@$(ONE_THREAD) $(BIN)/python -m sphinx --quiet --fail-on-warning --keep-going -c docs -d build/doctrees . build/docs
 
 pages: $(READY)
-	@$(ONE_THREAD) $(BIN)/python -m pytest -q -m pages tests/test_readme.py
+	@$(ONE_THREAD) $(BIN)/python -m pytest -q -m ci tests/test_readme.py
 
 hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time and memory
 	@mkdir -p build
@@ -51,7 +60,7 @@ hostile: $(READY) ## Run hostile inputs for an hour, each with limits of time an
 lint: $(READY) ## Check style and types
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
-	@$(BIN)/mypy
+	@nice $(BIN)/mypy
 
 format: $(READY) ## Format the code
 	@$(BIN)/ruff check --fix .
@@ -90,7 +99,7 @@ wheel: $(READY) ## Build the source archive, and the wheel from it (dist/)
 	@$(BIN)/python -m build --no-isolation
 
 wheel-check: $(READY) ## Install source archive and wheel in a new environment, and run the demo there
-	@$(BIN)/python -m pytest -m slow tests/test_wheel.py
+	@$(BIN)/python -m pytest -m 'slow or ci' tests/test_wheel.py
 
 clean: ## Remove what was made, the environment too
 	@rm -rf .venv build dist demo-output .pytest_cache .hypothesis .mypy_cache .ruff_cache

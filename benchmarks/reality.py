@@ -20,12 +20,12 @@ Without given powers (N = 0), their constants are those of the other transmitter
 predictions are Gaussian, with the standard deviation of their own errors for the other transmitters.
 "ours, alone" does without the links of the floor's other transmitters.
 
-With --locate, the position of each transmitter is unknown instead, and estimated from 40 random powers.
+With --locate, the position of each transmitter is unknown instead, and estimated from 40 of its 60 random powers, drawn
+several times; the 12 transmitters of procedural buildings have the same 60 receivers, and other errors in each draw.
 """
 
 import argparse
 import csv
-import itertools
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -38,10 +38,14 @@ from scipy.special import ndtr
 from through_walls import ends
 
 import sionna_partial as sp
-from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial import link_model
+from sionna_partial.checks import no_progress
+from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
+from sionna_partial.coverage.job import CoverageJob, Transmitter, grid_receivers
 from sionna_partial.measurements.assimilation import Assimilation
-from sionna_partial.measurements.localisation import likely_region
+from sionna_partial.measurements.localisation import MOST_POSITIONS, likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
+from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.simulation import clear_of_walls
 
 Floats = NDArray[np.float64]
@@ -61,7 +65,7 @@ BUILDINGS = {
 """Procedural buildings: kind, seed, frequency [Hz], the materials of outer walls, inner walls and core, and the depth
 added to each side of outer walls and core [m].
 """
-OUTER_M, CORE, BUILDING_TRANSMITTERS = 1.0, 0.7, 4
+OUTER_M, CORE, BUILDING_TRANSMITTERS, LOCATE_TRANSMITTERS = 1.0, 0.7, 4, 12
 PROCESS_DB, PROCESS_M, FADING_DB, OFFSET_DB, SENSITIVITY_DBM = 4.0, 4.0, 4.0, (-30.0, 4.0), -125.0
 
 
@@ -80,11 +84,13 @@ def main() -> None:
     parser.add_argument("--only", default="", help="part of the names of the procedural buildings")
     arguments = parser.parse_args()
     scene = sp.SceneSettings(**{} if arguments.material == "unknown" else {"material": arguments.material})
-    leads, spreads = defaultdict(list), {}
+    leads, spreads, located = defaultdict(list), {}, []
     floors = {f"{folder.name}, {arguments.map}": (folder, arguments.map) for folder in arguments.folders}
     buildings = {name: source for name, source in BUILDINGS.items() if arguments.only in name}
+    if arguments.locate:
+        print("| | trials | median error [m] | mean error [m] | truth in the 90 % region |\n|---|---|---|---|---|")
     for name, source in (floors or buildings).items():
-        partial, links, frequency_hz = read_floor(*source) if floors else procedural(*source)
+        partial, links, frequency_hz = read_floor(*source) if floors else procedural(*source, shared=arguments.locate)
         links = dict([*links.items()][: arguments.transmitters])
         if not links:
             print(f"\n{name}: no transmitter with a known position and {POINTS} powers")
@@ -92,7 +98,8 @@ def main() -> None:
         trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
         maps = halves(partial) if arguments.half else [partial]
         if arguments.locate:
-            locate(name, sp.LinkModel(partial, None, trace, scene), links, arguments.draws)
+            located.append(locate(sp.LinkModel(partial, None, trace, scene), links, arguments.draws))
+            print_located(name, located[-1])
             continue
         floors_of_maps = [Floor(each, links, sp.Simulation(each, trace, scene)) for each in maps]
         if arguments.repeats:
@@ -105,6 +112,8 @@ def main() -> None:
         print_table(f"{name}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
         for method, figures in table.items():
             leads[method].append(figures[:2] - table["ours"][:2])
+    if arguments.locate:
+        print_located("all", np.concatenate(located))
     if arguments.locate or arguments.repeats:
         return
     print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
@@ -117,18 +126,29 @@ def main() -> None:
         print(f"| {name} | {stds[0]:.1f} | {stds[1]:.1f} | {both[name]:.1f} | {others:.1f} |")
 
 
-def locate(name: str, model: sp.LinkModel, links: dict[str, Floats], draws: int) -> None:
-    """Print errors of the estimated positions of transmitters, and the fraction of transmitters in the 90 % region."""
-    errors_m, inside = [], []
-    for rows, draw in itertools.product(links.values(), range(draws)):
-        given = rows[np.random.default_rng(draw).permutation(len(rows))[:LOCATE_POINTS]]
-        measured = sp.Measurements((np.nan, np.nan, rows[0, 2]), given[:, 3:6], given[:, 6])
-        found = sp.predict_map(model, measurements=measured, spacing_m=3.0)
-        errors_m.append(np.linalg.norm(found.transmitter_m - rows[0, :3]))
-        cell = tuple(np.abs(found[axis].values - rows[0, at]).argmin() for axis, at in (("tx_y", 1), ("tx_x", 0)))
-        inside.append(likely_region(found.p_transmitter.values)[cell])
-    errors = f"median {np.median(errors_m):.2f} m, mean {np.mean(errors_m):.2f} m"
-    print(f"\n{name}: {errors}, in the 90 % region {np.mean(inside):.2f} of {len(inside)}", flush=True)
+def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
+    """Return error [m] and whether the 90 % region holds the truth (D, 2), of each transmitter and draw."""
+    link_model.KEPT_BLOCKS = POINTS
+    job, found = CoverageJob(model, DEFAULT_HEIGHT_M, 1.0, "indoor", block=MOST_POSITIONS), []
+    nowhere = grid_receivers(model, np.empty((0, 3)), DEFAULT_HEIGHT_M, 1.0)
+    for number, rows in enumerate(links.values()):
+        rows, tx_m = rows[np.random.default_rng(0).permutation(len(rows))[:POINTS]], rows[0, :3]
+        for draw in range(draws):
+            rng = np.random.default_rng([number, draw])
+            power = rows[:, 7] + drawn_errors_db(rows[:, 3:6], rng) if rows.shape[1] > len(COLUMNS) else rows[:, 6]
+            given = rng.permutation(np.flatnonzero(power > SENSITIVITY_DBM))[:LOCATE_POINTS]
+            measured = sp.Measurements((np.nan, np.nan, tx_m[2]), rows[given, 3:6], power[given])
+            posterior = job._located(Transmitter("", None, Antenna(), nowhere, measured), no_progress)
+            probability, apart_m = posterior.probability.ravel(), np.linalg.norm(posterior.points_m - tx_m, axis=1)
+            inside = likely_region(probability)[np.where(probability > 0.0, apart_m, np.inf).argmin()]
+            found.append((np.linalg.norm(posterior.position_m - tx_m), inside))
+    return np.array(found)
+
+
+def print_located(name: str, found: Floats) -> None:
+    """Print a row of the table of `locate`."""
+    errors_m = f"{np.median(found[:, 0]):.2f} | {np.mean(found[:, 0]):.2f}"
+    print(f"| {name} | {len(found)} | {errors_m} | {np.mean(found[:, 1]):.2f} |", flush=True)
 
 
 def print_table(title: str, table: dict[str, Floats]) -> None:
@@ -169,9 +189,18 @@ def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats
 
 
 def procedural(
-    kind: str, seed: int, frequency_hz: float, materials: tuple[str, str, str], thicker_m: float = 0.0
+    kind: str,
+    seed: int,
+    frequency_hz: float,
+    materials: tuple[str, str, str],
+    thicker_m: float = 0.0,
+    *,
+    shared: bool = False,
 ) -> tuple[sp.PartialMap, dict[str, Floats], float]:
-    """Return a building without its materials, with powers that were traced with them, as `read_floor`."""
+    """Return a building without its materials, with powers that were traced with them, as `read_floor`.
+
+    With `shared`, more transmitters have the same receivers.
+    """
     partial, rng = sp.make_home(seed, kind), np.random.default_rng(seed)
     inside = ndimage.binary_fill_holes(partial.state != CellState.UNKNOWN)
     depth_m = ndimage.distance_transform_edt(inside) * partial.resolution_m
@@ -184,12 +213,13 @@ def procedural(
     for number, material in enumerate(materials):
         truth = truth.with_wall_material(material, (partial.state == CellState.WALL) & (zone == number))
     simulation, links = sp.Simulation(truth, sp.TraceSettings(frequency_hz)), {}
-    for number in range(BUILDING_TRANSMITTERS):
+    for number in range(LOCATE_TRANSMITTERS if shared else BUILDING_TRANSMITTERS):
         tx_m, rx_m = ends(partial, 2 * POINTS, 100 * seed + number)
+        rx_m = ends(partial, POINTS, 100 * seed)[1] if shared else rx_m
         errors_db, gain_db = drawn_errors_db(rx_m, rng), simulation.links(tx_m, rx_m).gain_db
         power = gain_db + errors_db
         rows = np.column_stack([np.tile(tx_m, (len(rx_m), 1)), rx_m, power, gain_db])
-        links[f"{number}"] = rows[power > SENSITIVITY_DBM]
+        links[f"{number}"] = rows[shared | (power > SENSITIVITY_DBM)]
     return partial, {tx: rows for tx, rows in links.items() if len(rows) >= POINTS}, frequency_hz
 
 

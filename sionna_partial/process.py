@@ -164,11 +164,12 @@ def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> It
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return numba's decorator with a cache, if necessary in a temporary folder.
 
-    Division by zero gives infinity or NaN as in NumPy: Python's checks take time in every loop.
+    Division by zero gives infinity or NaN as in NumPy: Python's checks take time in every loop. Wrappers for C would
+    only take time to compile.
     """
     import numba
 
-    options = {"error_model": "numpy"} | options
+    options = {"error_model": "numpy", "no_cfunc_wrapper": True} | options
 
     def decorate(function: Callable[..., Any]) -> Any:
         try:

@@ -50,7 +50,7 @@ class Tab:
         assert "exceptionDetails" not in found, found
         return found["result"].get("value")
 
-    def wait(self, code: str, seconds: float = 60.0) -> Any:
+    def wait(self, code: str, seconds: float = 300.0) -> Any:
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             found = self.run(f"(() => {{ try {{ return {code} }} catch {{ return null }} }})()")

@@ -13,8 +13,8 @@ TX_M, RX_M = (2.0, 1.5, 1.5), [(5.0, 3.0, 1.5)]
 
 def plan() -> sp.PartialMap:
     state = np.zeros((40, 70), dtype=np.uint8)
-    state[[0, -1]] = state[:, [0, -1]] = state[:25, 35] = sp.CellState.WALL
-    return sp.map_from_array(state, resolution_m=0.1)
+    state[[0, -1]] = state[:, [0, -1]] = state[:25, 35] = state[20:24, 50:54] = sp.CellState.WALL
+    return sp.map_from_array(state, resolution_m=0.1).with_obstacle_height(0.75)
 
 
 def mesh() -> sp.PartialMap:

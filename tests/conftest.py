@@ -1,5 +1,6 @@
 """What several tests share: the same examples in every run, a process as it was, a full disk, and coverage maps."""
 
+import gc
 import logging
 import os
 import signal
@@ -13,8 +14,23 @@ from hypothesis import settings
 settings.register_profile("repeatable", derandomize=True, deadline=None, print_blob=True)
 settings.load_profile("repeatable")
 
+gc.set_threshold(20_000, 20, 20)  # each collection visits all that TensorFlow and Sionna RT have loaded
+
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell has started the tests in the background
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+SLOWEST_FIRST = (
+    *("readme", "wheel", "app", "llvm", "differentiable", "dataset", "against_stock", "homes", "path_set"),
+    *("docstrings", "train", "evaluate", "predictor_files", "unseen_walls", "calibration", "localisation", "antennas"),
+    *("assimilation", "channels", "export", "link_model", "hostile", "paper_networks", "map_networks", "notebook"),
+    *("crossings", "predictor", "cli", "shipped_predictor", "learning_commands", "coverage", "trace", "home_links"),
+)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the slowest files: the last file of a process would leave the other process idle."""
+    order = {f"test_{name}": place for place, name in enumerate(SLOWEST_FIRST)}
+    items.sort(key=lambda item: order.get(item.path.stem, len(order)))
 
 
 @pytest.fixture

@@ -20,6 +20,10 @@ HOUSE, VACUUM = FOLDER / "house.yaml", FOLDER / "vacuum.json"
 ERRORS = {"range_noise_m": 0.02, "drift_m_per_m": 0.001, "missed_wall_fraction": 0.03, "missed_return_fraction": 0.02}
 
 
+def states(partial: sp.PartialMap, *points: tuple[float, float]) -> list[int]:
+    return partial.state_at(np.array(points)).tolist()
+
+
 def furnished(home: sp.PartialMap, seed: int, pieces: int = 40) -> sp.PartialMap:
     rng, state = np.random.default_rng(seed), home.state.copy()
     for row, column in rng.permutation(np.argwhere(home.state == sp.CellState.FREE))[:pieces]:

@@ -88,9 +88,8 @@ def test_the_only_grid_is_the_map(tmp_path: Path) -> None:
 
 def test_single_files_of_ros_2(tmp_path: Path) -> None:
     rows = [("/map", 0.0, Messages(2).grid(LATE))]
-    (mcap,) = write_bag(tmp_path / "drive_mcap", rows).glob("*.mcap")
-    (db3,) = write_bag(tmp_path / "drive_sqlite3", rows).glob("*.db3")
-    assert load_map(mcap).state.tolist() == load_map(db3).state.tolist() == [[1, 0, 0], [0, 0, 1]]
+    files = [file for name in KINDS[1:] for file in write_bag(tmp_path / name, rows).glob("drive*")]
+    assert [load_map(file).state.tolist() for file in files] == [[[1, 0, 0], [0, 0, 1]]] * 2
 
 
 class TestPoses:
@@ -108,9 +107,7 @@ class TestPoses:
         poses = poses_from_bag(drive, frame="antenna")
         np.testing.assert_allclose(poses.position_m[:, 0], x + 0.3 * np.cos(yaw), atol=1e-6)
         np.testing.assert_allclose(poses.position_m[:, 1], y + 0.3 * np.sin(yaw), atol=1e-6)
-        with pytest.raises(
-            MeasurementError, match=r"no transform leads from 'map' to 'camera'; its frames are antenna"
-        ):
+        with pytest.raises(MeasurementError, match="no transform leads from 'map' to 'camera'; its frames are antenna"):
             poses_from_bag(drive, frame="camera")
 
     def test_odometry_without_a_map(self, tmp_path: Path) -> None:
@@ -223,26 +220,26 @@ def test_other_files(tmp_path: Path) -> None:
 class TestHostileStorage:
     """Storage whose reader would not end, or would read another file."""
 
-    def refused(self, path: Path, message: str) -> None:
-        with pytest.raises(MapError, match=message):
-            map_from_bag(path)
-
     def test_views(self, tmp_path: Path) -> None:
         with closing(sqlite3.connect(tmp_path / "a.db3")) as database:
-            database.executescript(
-                "CREATE TABLE topics (id INTEGER); CREATE VIEW messages AS "
-                "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x FROM n;"
-            )
-        self.refused(tmp_path / "a.db3", "it has views in place of tables")
+            database.execute("CREATE TABLE topics (id INTEGER)")
+            database.execute("CREATE VIEW messages AS SELECT id FROM topics")
+        with pytest.raises(MapError, match="it has views in place of tables"):
+            map_from_bag(tmp_path / "a.db3")
 
     def test_names_that_are_uris(self, tmp_path: Path) -> None:
         (tmp_path / "..%2Fother.db3").touch()
-        self.refused(tmp_path / "..%2Fother.db3", "characters % . # in it: rename it")
+        with pytest.raises(MapError, match=r"characters % . # in it: rename it"):
+            map_from_bag(tmp_path / "..%2Fother.db3")
 
-    def test_huge_chunks_and_arrays(self, tmp_path: Path) -> None:
-        magic, path = b"\x89MCAP0\r\n", tmp_path / "a.mcap"
-        path.write_bytes(magic + struct.pack("<BQ16xQ", 6, 24, 20 * 10**9))
-        self.refused(path, "a chunk of 20,000,000,000 bytes")
-        schema = b"uint8[4000000000] a"
-        path.write_bytes(magic + struct.pack("<BQ", 3, len(schema)) + schema)
-        self.refused(path, "arrays of 4,000,000,000 values")
+    @pytest.mark.parametrize(
+        ("content", "message"),
+        [
+            (struct.pack("<BQ16xQ", 6, 24, 20 * 10**9), "a chunk of 20,000,000,000 bytes"),
+            (struct.pack("<BQ", 3, 19) + b"uint8[4000000000] a", "arrays of 4,000,000,000 values"),
+        ],
+    )
+    def test_huge_chunks_and_arrays(self, tmp_path: Path, content: bytes, message: str) -> None:
+        (tmp_path / "a.mcap").write_bytes(b"\x89MCAP0\r\n" + content)
+        with pytest.raises(MapError, match=message):
+            map_from_bag(tmp_path / "a.mcap")

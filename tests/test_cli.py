@@ -214,7 +214,8 @@ class TestPredict:
         out, options = tmp_path / "out", "--spacing 0.5 --power 15 --threshold -67 --frequency 5.2GHz"
         result = run("predict", tmp_path / "map.yaml", "--tx", *TX, "--out", out, *options.split())
         names = [f"coverage{suffix}" for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml")]
-        *lines, answer = result.stdout.splitlines()
+        walls, *lines, answer = result.stdout.splitlines()
+        assert walls.startswith("walls: drywall ")
         assert lines == [f"wrote {out / name}" for name in names]
         assert {path.name for path in out.iterdir()} == {*names, "coverage.pgm"}
         coverage = sp.load_coverage(out / "coverage.nc")

@@ -115,9 +115,7 @@ class TestValues:
             assert value == 0.0
             assert not np.any(tape.gradient(value, tx_m, unconnected_gradients="zero"))
 
-    @pytest.mark.parametrize(
-        "tx_m", [(2.3, 1.6, 1.4), (1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["in the pillar", "far away", "at a receiver"]
-    )
+    @pytest.mark.parametrize("tx_m", [(1e9, -1e9, 1e9), tuple(RX_M[0])], ids=["far away", "at a receiver"])
     def test_impossible_positions_have_finite_slopes(self, tx_m, links_of):
         links, tx_m = links_of("partial", "map"), tf.Variable(np.array(tx_m))
         with tf.GradientTape(persistent=True) as tape:

@@ -113,12 +113,8 @@ def test_a_callable_is_called() -> None:
     with counting(lambda *call: calls.append(call), "homes") as count:
         count(1, 2, "one")
     assert calls == [(0.5, "half"), (1, 2, "one")]
-
-
-@pytest.mark.parametrize("value", ["yes", 1])
-def test_other_values_are_refused(value: Any) -> None:
-    with pytest.raises(SettingsError, match=r"progress = .* is not allowed: give True, False or a callable"):
-        reporting(value).__enter__()
+    with pytest.raises(SettingsError, match=r"progress = 1 is not allowed: give True, False or a callable"):
+        reporting(1).__enter__()  # type: ignore[arg-type]
 
 
 @pytest.mark.usefixtures("at_once")

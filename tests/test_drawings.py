@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import shapely
 from ezdxf.document import Drawing
+from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -49,10 +50,6 @@ def drawing(units: int = 6, unit_m: float = 1.0, layer: str = "A-WALL") -> Drawi
     space.add_circle((2 * scale, 3 * scale), 0.6 * scale, dxfattribs={"layer": "A-FURN"})
     space.add_text("PLAN", height=scale, dxfattribs={"layer": layer})
     return doc
-
-
-def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
-    return partial.state_at(np.array(points)).tolist()
 
 
 def require_rooms(partial: PartialMap) -> None:
@@ -190,6 +187,17 @@ def test_walls_on_a_layer_without_such_a_name(tmp_path: Path) -> None:
     assert partial.import_report is not None
     assert [(row.name, row.count) for row in partial.import_report.used] == [("Base", 2), ("Wand", 5)]
     assert [(row.name, row.reason) for row in partial.import_report.skipped] == [("Rahmen", "name of no wall")]
+
+
+def test_hardly_any_area(tmp_path: Path) -> None:
+    doc = ezdxf.new(units=6)
+    for corners in ([(0, 0), (1, 0), (1, 1), (0, 1)], [(0, 9), (12, 9), (12, 9.2), (0, 9.2)]):
+        doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    with pytest.warns(MapWarning) as caught:
+        load_map(tmp_path / "plan.dxf")
+    message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
+    assert re.search(message, str(caught[0].message))
 
 
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:

@@ -48,6 +48,8 @@ class TestPlotExploration:
         assert np.array_equal(np.stack(way.get_data(), axis=1), exploration.poses[:, :2])
         robot = last.lines[-1]
         assert (robot.get_xdata()[0], robot.get_ydata()[0]) == tuple(exploration.poses[-1, :2])
+        tip = robot.get_marker().vertices[0]
+        assert np.degrees(np.arctan2(tip[1], tip[0])) % 360 == pytest.approx(exploration.poses[-1, 2])
         (view,) = last.patches
         corners = view.get_xy()
         assert tuple(corners[0]) == tuple(exploration.poses[-1, :2])

@@ -243,17 +243,7 @@ def test_what_is_no_path_is_named(tmp_path: Path, path: object) -> None:
         require_writable(path)  # type: ignore[arg-type]
 
 
-def test_files_appear_together_and_keep_others(tmp_path: Path) -> None:
-    (tmp_path / "a.bin").write_bytes(b"old")
-    (tmp_path / "other").write_bytes(b"kept")
-    with atomic_files(tmp_path) as folder:
-        for name in ("a.bin", "b.bin"):
-            (folder / name).write_bytes(b"new")
-        assert (tmp_path / "a.bin").read_bytes() == b"old"
-    assert tree(tmp_path) == {"a.bin": b"new", "b.bin": b"new", "other": b"kept"}
-
-
-def test_failed_files_leave_what_was(tmp_path: Path) -> None:
+def test_files_appear_together_or_not_at_all(tmp_path: Path) -> None:
     (tmp_path / "a.bin").write_bytes(b"old")
     for target in (tmp_path, tmp_path / "new" / "deep"):
         message = re.escape(f"path = '{target}' could not be written (No space left on device): the disk is full")
@@ -262,6 +252,11 @@ def test_failed_files_leave_what_was(tmp_path: Path) -> None:
             with atomic_write(folder / "b.bin"):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     assert tree(tmp_path) == {"a.bin": b"old"}
+    with atomic_files(tmp_path) as folder:
+        for name in ("a.bin", "b.bin"):
+            (folder / name).write_bytes(b"new")
+        assert (tmp_path / "a.bin").read_bytes() == b"old"
+    assert tree(tmp_path) == {"a.bin": b"new", "b.bin": b"new"}
 
 
 @pytest.mark.parametrize(("name", "message"), [("a.bin", "this path is a folder"), ("pipe", "is a pipe or a device")])

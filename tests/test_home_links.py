@@ -12,7 +12,7 @@ from link_tables import assert_same
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
 from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, write_shard
-from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
@@ -204,6 +204,14 @@ class TestRefused:
         table = home_links(replace(home, state=home.state[:, :column]), "cut", replace(SETTINGS, stages=(0,)))
         assert len(table) > 0
         assert "home 'cut' has free cells at the border of its grid" in caplog.text
+
+    def test_tables(self, table: LinkTable) -> None:
+        with pytest.raises(PredictorError, match="features has no context: give the LinkFeatures of"):
+            replace(table, features=replace(table.features, context=None))
+        with pytest.raises(PredictorError, match=r"gain_db\[1\] = nan"):
+            replace(table, gain_db=np.where(np.arange(len(table)) == 1, np.nan, table.gain_db))
+        with pytest.raises(PredictorError, match=r"parts is empty: give at least one LinkTable\."):
+            LinkTable.concatenate([])
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
-from types import ModuleType
+from types import CodeType, ModuleType
 
 import pytest
 
@@ -20,6 +20,8 @@ from sionna_partial.resources import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "sionna_partial"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 ROOMS = {
     "foundations": (
@@ -155,9 +157,8 @@ def own_imports(module: str) -> set[str]:
 
 
 def declared(kind: str) -> set[str]:
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    extras = project["optional-dependencies"]
-    lines = extras["dev"] if kind == "dev" else sum((extras[name] for name in EXTRAS), project["dependencies"])
+    extras = PROJECT["optional-dependencies"]
+    lines = extras["dev"] if kind == "dev" else sum((extras[name] for name in EXTRAS), PROJECT["dependencies"])
     return {re.split(r"[^\w.-]", line)[0] for line in lines}
 
 
@@ -235,6 +236,17 @@ for name in ("", *typer.main.get_command(app).commands):
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
         assert len(own) <= 56
 
+    def test_a_prediction_runs_few_modules(self) -> None:
+        codes: set[CodeType] = set()
+        predict = sionna_partial.predict_map
+        sys.setprofile(lambda frame, *_: codes.add(frame.f_code))
+        try:
+            predict(ROOT / "scenes/apartment/step050/map.yaml", (2.0, 2.0), spacing_m=2.0)
+        finally:
+            sys.setprofile(None)
+        files = {code.co_filename for code in codes if code.co_name != "<module>"}
+        assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 37
+
 
 class TestPublicNames:
     def test_names_resolve_to_what_they_say(self) -> None:
@@ -251,8 +263,7 @@ class TestPublicNames:
             sionna_partial.teleport  # noqa: B018
 
     def test_version_is_that_of_the_project(self) -> None:
-        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-        assert sionna_partial.__version__ == project["version"]
+        assert sionna_partial.__version__ == PROJECT["version"]
 
 
 class TestDependencies:
@@ -265,19 +276,16 @@ class TestDependencies:
         assert declared("run") == used - COME_WITH.keys() | NOT_IMPORTED.keys()
 
     def test_packages_of_extras_are_known_to_the_error_that_names_them(self) -> None:
-        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-        extras = {name: lines for name, lines in project["optional-dependencies"].items() if name not in ("all", "dev")}
+        extras = {name: lines for name, lines in PROJECT["optional-dependencies"].items() if name not in ("all", "dev")}
         packages = {name: {*re.findall(r"\w+(?=[]>[])", " ".join(lines))} for name, lines in extras.items()}
         assert packages == {name: {*known} for name, known in EXTRAS.items()}
-        assert project["optional-dependencies"]["all"] == [f"sionna-partial[{','.join(sorted(extras))}]"]
+        assert PROJECT["optional-dependencies"]["all"] == [f"sionna-partial[{','.join(sorted(extras))}]"]
 
     def test_what_is_declared_is_locked(self) -> None:
-        lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
-        locked = set(re.findall(r"^([\w.-]+)==", lock, flags=re.MULTILINE))
+        locked = set(re.findall(r"^([\w.-]+)==", LOCK, flags=re.MULTILINE))
         assert declared("run") | declared("dev") <= locked
 
     def test_lock_holds_nothing_of_the_machine_that_made_it(self) -> None:
-        lines = (ROOT / "requirements.lock").read_text(encoding="utf-8").splitlines()
         pinned = re.compile(r"[\w.-]+==\S+( ;.*)? \\|    --hash=sha256:[0-9a-f]{64}( \\)?|\s*#.*|")
-        assert [line for line in lines if not pinned.fullmatch(line)] == []
-        assert not re.search(r"file:/|://|/opt|/work|/tmp", "\n".join(lines))
+        assert [line for line in LOCK.splitlines() if not pinned.fullmatch(line)] == []
+        assert not re.search(r"file:/|://|/opt|/work|/tmp", LOCK)

@@ -14,12 +14,9 @@ from sionna_partial.errors import MapError
 
 pytest.importorskip("ifcopenshell")
 from ifc_building import Building
+from small_maps import states
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
-
-
-def states(partial: sp.PartialMap, *points: tuple[float, float]) -> list[int]:
-    return partial.state_at(np.array(points)).tolist()
 
 
 def material_at(partial: sp.PartialMap, x: float, y: float) -> sp.Material | None:

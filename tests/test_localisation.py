@@ -7,13 +7,17 @@ import numpy as np
 import pytest
 import xarray as xr
 from extruded import drawn
+from scipy.spatial.distance import cdist
 from typer.testing import CliRunner
 
 import sionna_partial as sp
+from sionna_partial.checks import no_progress
 from sionna_partial.cli import app
 from sionna_partial.errors import MeasurementError, PositionError
-from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region
+from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region, locate_transmitter
 from sionna_partial.measurements.measurements import measurements_of
+from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.tracing.simulation import clear_of_walls
 
 HOUSE = drawn(
     """
@@ -82,6 +86,15 @@ class TestCoverage:
         warned = "powers were measured and no path gains" in caplog.text
         assert warned or abs(found.attrs["measured_offset_db"] - offset_db) < 10.0
 
+    def test_powers_through_walls_of_an_unknown_material(self):
+        through_walls = sp.LinkModel(HOUSE, None, sp.TraceSettings(2.4e9))
+        power_db = through_walls.predict(TX, PLACES).gain_mean_db - 30.0
+        found = sp.predict_map(through_walls, measurements=table(gain_db=power_db), **COARSE)
+        assert np.linalg.norm(found.attrs["transmitter_m"] - TX) < 2.0
+        assert float(found.p_transmitter.sum()) == pytest.approx(1.0)
+        assert found.attrs["measured_offset_db"] == pytest.approx(-30.0, abs=10.0)
+        assert "wall_material" in found.attrs
+
     def test_its_height_may_be_known(self):
         found = sp.predict_map(model(), measurements=table(tx=[np.nan, np.nan, 2.0]), **COARSE)
         assert found.attrs["transmitter_m"][2] == 2.0
@@ -138,6 +151,32 @@ def test_moments_and_draws_of_a_posterior():
     positions_m, weights, _ = posterior.draw(10)
     assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
     assert weights.tolist() == [0.1, 0.6, 0.3]
+
+
+def free_space(place_m, points_m):
+    gain_db = free_space_gain_db(np.linalg.norm(points_m - place_m, axis=1), 2.4e9)
+    los = np.array([0.0, 1.0, 0.0])[:, None] + 0.0 * gain_db
+    return sp.LinkPrediction.of_parts(los, np.stack([gain_db] * 3), 0.0 * los), 0.0 * gain_db, np.ones(len(gain_db))
+
+
+@pytest.mark.parametrize("sensitivity_db", [-150.0, -88.0])  # a third is not received
+def test_correlated_errors_of_powers_are_allowed_for(sensitivity_db):
+    hall, found = sp.map_from_array(np.zeros((24, 36), int), resolution_m=0.5), []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        tx_m, rx_m = (rng.uniform([1.0, 1.0, 1.5], [17.0, 11.0, 1.5], (count, 3)) for count in (1, 30))
+        covariance_db2 = 16.0 * np.exp(-cdist(rx_m, rx_m) / 4.0) + 9.0 * np.eye(30)
+        power = free_space(tx_m, rx_m)[0].gain_mean_db + rng.multivariate_normal(np.full(30, -30.0), covariance_db2)
+        measured = sp.Measurements(None, rx_m, power, sensitivity_db=sensitivity_db)
+        clear = functools.partial(clear_of_walls, hall)
+        posterior = locate_transmitter(hall, measured, clear, free_space, no_progress, through_walls_hz=2.4e9)
+        region = likely_region(posterior.probability)
+        cell = np.linalg.norm(posterior.points_m - tx_m, axis=1).argmin()
+        found.append((np.linalg.norm(posterior.position_m - tx_m), region.ravel()[cell], region.mean()))
+    errors_m, inside, area = np.transpose(found)
+    assert np.median(errors_m) < 2.0
+    assert inside.mean() >= 0.8
+    assert area.mean() < 0.25
 
 
 def test_mixtures_have_the_moments_of_their_parts():

@@ -135,13 +135,17 @@ def test_mesh_file(room_file: Path) -> None:
     assert load_map(room_file, up="y").height_range_m == (0.0, 4.0)
 
 
-def test_mesh_in_npz(tmp_path: Path, room_file: Path) -> None:
+def test_mesh_in_npz(tmp_path: Path, room_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for partial in (load_map(room_file), load_map(room_file, observed=OBSERVED[:3], wall_height_m=8.0)):
         save_map(partial, tmp_path / "home.npz")
         assert load_map(tmp_path / "home.npz") == partial
     assert load_map(tmp_path / "home.npz", wall_height_m=4.0).height_range_m == (0.0, 4.0)
     with pytest.raises(OutputError, match=r"home.yaml' cannot hold the map's mesh: choose .npz, or use export_scene"):
         save_map(partial, tmp_path / "home.yaml")
+    monkeypatch.setattr(map_files, "_MESH_BYTES", 500)
+    with pytest.raises(MapError, match=r"home.npz' holds more than 5,000,000 triangles: cut or simplify the mesh"):
+        load_map(tmp_path / "home.npz")
+    monkeypatch.undo()
     with np.load(tmp_path / "home.npz") as content:
         arrays = {key: content[key] for key in content if key != "mesh_vertices_m"}
     (tmp_path / "home.npz").write_bytes(npz_bytes(**arrays))
@@ -230,27 +234,22 @@ def test_occupancy_grid() -> None:
     assert tight.state.tolist() == [[2, 0, 2], [2, 1, 1], [1, 1, 2]]
 
 
-def test_habitat_with_border() -> None:
-    """Row 0 is the largest y; revealed border is wall; nothing else that is hidden is known."""
-    seen = [[0, 1, 1, 0], [0, 1, 1, 0], [0, 0, 1, 0]]
-    partial = map_from_habitat([[0, 2, 2, 2], [0, 2, 1, 1], [0, 0, 2, 2]], seen, 0.1, origin_m=(-1.0, 4.0))
-    assert np.flipud(partial.state).tolist() == [[2, 1, 1, 2], [2, 1, 0, 2], [2, 2, 1, 2]]
+@pytest.mark.parametrize(
+    ("top_down", "seen", "state"),
+    [
+        # Row 0 is the largest y; revealed border is wall; nothing else that is hidden is known.
+        (["0222", "0211", "0022"], ["0110", "0110", "0010"], ["2112", "2102", "2212"]),
+        # Habitat reveals no cell that is not navigable: those beside a revealed navigable one ended the view.
+        (["0000", "0111", "0001"], ["0000", "0110", "0000"], ["2112", "1002", "2112"]),
+        # Start 4, path 7, view point 8 are navigable; a target 6 or box 9 may cover anything.
+        (["4678935"], ["1111111"], ["0200200"]),
+    ],
+)
+def test_habitat(top_down: list[str], seen: list[str], state: list[str]) -> None:
+    cells, revealed, expected = (np.array([[*map(int, row)] for row in rows]) for rows in (top_down, seen, state))
+    partial = map_from_habitat(cells, revealed, 0.1, origin_m=(-1.0, 4.0))
+    assert np.flipud(partial.state).tolist() == expected.tolist()
     assert partial.origin_m == (-1.0, 4.0)
-
-
-def test_habitat_without_border() -> None:
-    """Habitat reveals no cell that is not navigable: those beside a revealed navigable one ended the view."""
-    top_down = np.array([[0, 0, 0, 0], [0, 1, 1, 1], [0, 0, 0, 1]])
-    seen = np.array([[0, 0, 0, 0], [0, 1, 1, 0], [0, 0, 0, 0]], bool)
-    state = np.flipud(map_from_habitat(top_down, seen, 0.1).state)
-    assert state.tolist() == [[2, 1, 1, 2], [1, 0, 0, 2], [2, 1, 1, 2]]
-
-
-def test_habitat_drawings() -> None:
-    """Start 4, path 7, view point 8 and trajectory 10+ are navigable; a target 6 or box 9 may cover anything."""
-    top_down = np.array([[4, 6, 7, 8, 9, 10, 120, 255, 3, 5]], dtype=np.uint8)
-    state = map_from_habitat(top_down, np.ones_like(top_down), 0.1).state
-    assert state.tolist() == [[0, 2, 0, 0, 2, 0, 0, 0, 0, 0]]
 
 
 def test_slam_channels() -> None:

@@ -14,6 +14,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
+from sionna_partial.maps import partial_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
 
@@ -141,6 +142,12 @@ def test_wrong_positions(points: object, message: str) -> None:
 def test_positions_in_other_units(point: tuple[float, float, float]) -> None:
     with pytest.raises(PositionError, match=r"Did you mean metres\? Taken for (milli|centi)metres it is at .* m\.$"):
         PLAN.require_positions("tx", point)
+
+
+def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(partial_map, "MAX_CELLS", 11)
+    with pytest.raises(MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen"):
+        PartialMap(PLAN.state, 0.5)
 
 
 def test_names_of_positions() -> None:

@@ -9,6 +9,7 @@ import pytest
 import trimesh
 from numpy.typing import NDArray
 from pypcd4 import Encoding, PointCloud
+from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -67,10 +68,6 @@ def write(path: Path, points: NDArray) -> Path:
             stream.write(head)
             np.savetxt(stream, columns, fmt="%.4f", delimiter=" " if kind == ".pts" else ",")
     return path
-
-
-def states(partial: PartialMap, *points: tuple[float, float]) -> list[int]:
-    return partial.state_at(np.array(points)).tolist()
 
 
 def require_room(partial: PartialMap) -> None:
@@ -198,6 +195,13 @@ def test_other_files(tmp_path: Path) -> None:
         map_from_points(tmp_path / "room.e57")
     with pytest.raises(MapError, match=r"room.las' cannot be read \(No such file or directory\)"):
         map_from_points(tmp_path / "room.las")
+
+
+def test_compressed_pcd_holds_what_an_uncompressed_one_does(tmp_path: Path) -> None:
+    floor = np.random.default_rng(0).uniform((0.02, 0.02, 0.0), (4.0, 3.0, 0.01), (2000, 3))
+    points = np.concatenate([floor, floor * (1.0, 0.0, 0.0) + (0.0, 2.98, 1.0) + floor[::-1] * (0.0, 0.0, 100.0)])
+    compressed, plain = (load_map(write(tmp_path / name, points)) for name in ("room.pcd", "room_binary.pcd"))
+    assert compressed == plain
 
 
 @pytest.mark.parametrize(

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import numba
+import numpy as np
 import pytest
 
 from sionna_partial import llvm
@@ -127,6 +128,12 @@ def test_compiled_code_is_cached_where_that_can_be(tmp_path: Path, monkeypatch: 
     exec(code, names)
     assert njit(cache=True)(names["half"])(3.0) == 1.5
     assert not config.CACHE_DIR or Path(config.CACHE_DIR).parent == tmp_path
+
+
+def test_integers_of_compiled_callers_share_one_compilation() -> None:
+    inner = njit()(lambda number: number + 1)
+    outer = njit()(lambda narrow: inner(0) + inner(narrow))
+    assert (outer(np.int32(3)), len(inner.signatures)) == (5, 1)
 
 
 def test_cached_code_of_another_version_of_the_package_is_not_used(tmp_path: Path) -> None:

@@ -63,7 +63,7 @@ def write_scans(folder: Path) -> None:
 PAGES_WITH_PYTHON = tuple(page for page in PAGES if blocks(page, "python"))
 
 
-@pytest.mark.pages
+@pytest.mark.ci
 @pytest.mark.parametrize("page", PAGES_WITH_PYTHON, ids=lambda page: page.name)
 def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
     """In a process of their own they read `scenes/`, or a scan of the reader's; each file that they write is there."""

@@ -17,6 +17,7 @@ from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
+from sionna_partial.maps import ros_map
 from sionna_partial.maps.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
@@ -101,7 +102,7 @@ BLACK, WHITE, CLEAR = [0, 0, 0, 255], [255] * 4, [255, 255, 255, 0]
         *(([0, 19, 20, 21, 64, 65, 100, 101], {"mode": "raw", "negate": k}, [0, 0, 0, 2, 2, 1, 1, 2]) for k in (0, 1)),
         # Alpha is a fourth channel in trinary mode: opaque grey 60 has the mean (180 + 255) / 4, transparent white 3/4.
         ([BLACK, [60, 60, 60, 255], WHITE, CLEAR], {}, [WALL, UNKNOWN, FREE, UNKNOWN]),
-        ([BLACK, WHITE, [0, 0, 0, 254], CLEAR], {"mode": "Scale"}, [WALL, FREE, UNKNOWN, UNKNOWN]),
+        ([[60, 60, 60, 255], WHITE, [0, 0, 0, 254], CLEAR], {"mode": "Scale"}, [WALL, FREE, UNKNOWN, UNKNOWN]),
         ([0, 128, 205, 254], {"free_thresh": 0.25}, [WALL, UNKNOWN, FREE, FREE]),  # more would be unknown otherwise
     ],
 )
@@ -315,8 +316,8 @@ def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns:
     assert np.array_equal(partial.state_at(np.stack([x, y], axis=-1)), state)
 
 
-@given(grids, st.floats(-6.28, 6.28), st.integers(0, 2**32 - 1))
-def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float, seed: int) -> None:
+@given(grids, st.floats(-6.28, 6.28))
+def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float) -> None:
     """New cells have the state of the old grid at their centre; only a free one may have become wall."""
     new, cell, (x0, y0) = turn_grid(state, 1.0, (3.0, -2.0, yaw))
     if cell == 1.0:
@@ -359,6 +360,12 @@ def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) ->
     assert not caplog.text
     assert turn_grid(state, 0.1, (0.0, 0.0, 1.01 * limit))[1] == 0.05
     assert "rad: the map is turned onto cells of 0.05 m" in caplog.text
+
+
+def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
+    with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
+        turn_grid(PARTIAL.state, 0.1, (0.0, 1.0, 0.5))
 
 
 REPORTS = Path(__file__).parent / "reports"

@@ -34,12 +34,7 @@ from sionna_partial.datasets.shards import (
 from sionna_partial.errors import PredictorError
 from sionna_partial.settings import DatasetSettings, Material, PredictorSettings
 
-PLAIN = {"shape": [2, 3], "resolution_m": 0.5, "origin_m": [0, 0], "wall_height_m": 3.0, "interior_cells": None}
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}
-
-
-def packed(cells: bytes) -> str:
-    return base64.b64encode(zlib.compress(cells)).decode()
 
 
 @pytest.fixture
@@ -83,12 +78,14 @@ class TestShard:
         assert (tmp_path / "other.parquet").read_bytes() != shard.read_bytes()
 
 
-def rewrite(path: Path, maps: dict[str, object] | None, distance_m: float | None = None) -> None:
+def rewrite(path: Path, distance_m: float | None = None, partial: object = None, **of_home: object) -> None:
+    """Write a shard again with other distances, partial maps, or entries of the complete map."""
     table = pq.read_table(path)
     notes = {**table.schema.metadata}
-    before = json.loads(notes.pop(b"sionna_partial.maps"))
-    if maps is not None:
-        notes[b"sionna_partial.maps"] = json.dumps(before | maps).encode()
+    maps = json.loads(notes[b"sionna_partial.maps"])
+    maps["partial"] = maps["partial"] if partial is None else partial
+    maps["complete"] = {name: home | of_home for name, home in maps["complete"].items()}
+    notes[b"sionna_partial.maps"] = json.dumps(maps).encode()
     if distance_m is not None:
         column = table.column_names.index("distance_m")
         field = table.schema.field("distance_m")
@@ -103,24 +100,19 @@ def flip_a_byte_of_a_column(path: Path) -> None:
     path.write_bytes(content)
 
 
+SEVENS = base64.b64encode(zlib.compress(b"\7" * 15)).decode()
 DAMAGED = "is damaged, or no Parquet file"
 SPOILS: list[tuple[Callable[[Path], object], str]] = [
     (Path.unlink, r"villa\.parquet' cannot be read \(No such file"),
     (lambda path: path.write_bytes(path.read_bytes()[:-20]), f"{DAMAGED} .*: delete"),
     (flip_a_byte_of_a_column, DAMAGED),
     (lambda path: pq.write_table(pa.table({"a": [1]}), path), "is no shard of this version .* build the data"),
-    (lambda path: rewrite(path, {}, distance_m=-1.0), rf"{DAMAGED} \(distance_m\[0\] = -1"),
-    *(
-        (lambda path, maps=maps: rewrite(path, maps), rf"{DAMAGED} \(.*{words}")
-        for maps, words in (
-            (None, "'maps'"),
-            ({"partial": []}, "tuple index out of range"),
-            ({"complete": {"villa": {"cells": "AAAA", **PLAIN}}}, "Error -3"),
-            ({"complete": {"villa": {"cells": packed(b"\0" * 7), **PLAIN}}}, "reshape"),
-            ({"complete": {"villa": {"shape": [20_000, 20_000]}}}, "more than 100,000,000"),
-            ({"complete": {"villa": {"cells": packed(b"\7" * 6), **PLAIN}}}, "state has values 7 to 7"),
-        )
-    ),
+    (lambda path: rewrite(path, distance_m=-1.0), rf"{DAMAGED} \(distance_m\[0\] = -1"),
+    (lambda path: rewrite(path, partial=[]), rf"{DAMAGED} \(.*tuple index out of range"),
+    (lambda path: rewrite(path, cells="AAAA"), rf"{DAMAGED} \(.*Error -3"),
+    (lambda path: rewrite(path, shape=[3, 4]), rf"{DAMAGED} \(.*reshape"),
+    (lambda path: rewrite(path, shape=[20_000, 20_000]), rf"{DAMAGED} \(.*more than 100,000,000"),
+    (lambda path: rewrite(path, cells=SEVENS), rf"{DAMAGED} \(.*state has values 7 to 7"),
 ]
 
 

@@ -97,7 +97,7 @@ class TestWalls:
         assert line_fractions(state, start, end)[:, CellState.WALL] == 0.0
 
 
-@settings(max_examples=1000)
+@settings(max_examples=200)
 @given(grids, cells, cells)
 def test_exact(state, start, end):
     assert shares(state, (start, end))[0] == pytest.approx(exact_fraction(state, start, end), abs=1e-9)

@@ -81,7 +81,7 @@ def test_what_is_no_map(tmp_path: Path, content: object, message: str) -> None:
         sp.load_map(write_json(tmp_path / "home.json", content))
 
 
-@pytest.mark.parametrize("content", [b'{"a": ', b"[" * 100_000, b"\xff\xfe"])
+@pytest.mark.parametrize("content", [b"[" * 100_000, b"\xff\xfe"])
 def test_what_is_no_json(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "home.json"
     path.write_bytes(content)

@@ -89,7 +89,7 @@ def test_demo_runs_from_what_is_published_alone(wheel: Path, archive: Path, tmp_
         assert all((tmp_path / "empty" / line).stat().st_size for line in lines)
 
 
-@pytest.mark.slow
+@pytest.mark.ci
 def test_base_predicts_without_any_extra(wheel: Path, tmp_path: Path) -> None:
     """Install the wheel without extras, in locked versions; predict, and write all formats that need no extra."""
     versions = re.findall(r"^[\w.-]+==[^\s\\]+", LOCK.read_text(encoding="utf-8"), flags=re.MULTILINE)

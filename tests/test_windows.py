@@ -117,22 +117,23 @@ class TestTransmitterWindow:
 
     def test_detours(self):
         """None in the open or off a wall at the transmitter, long out of a closed room, shorter through a door."""
+
+        def detours(state):
+            return channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour")
+
         state, half = np.full((WINDOW_CELLS, WINDOW_CELLS), FREE), WINDOW_CELLS // 2
+        assert not detours(state).any()
         state[half - 1 : half + 1, half - 1 : half + 1] = WALL
-        assert not channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour").any()
+        assert not detours(state).any()
         state[:] = FREE
-        partial = PartialMap(state, CELL_M, (-HALF_M, -HALF_M))
-        open_detour = channel(transmitter_window(partial, TX_M), "detour")
-        assert not open_detour.any()
-        low, high = WINDOW_CELLS // 2 - 8, WINDOW_CELLS // 2 + 8
-        state[low, low : high + 1] = state[high, low : high + 1] = WALL
-        state[low : high + 1, low] = state[low : high + 1, high] = WALL
+        low, high = half - 8, half + 8
+        state[low : high + 1, [low, high]] = state[[low, high], low : high + 1] = WALL
         inside, beyond = np.s_[low + 1 : high, low + 1 : high], np.s_[low + 4 : high - 4, high + 1]
-        shut = channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour")
+        shut = detours(state)
+        state[low + 6 : high - 6, low] = FREE
+        door = detours(state)
         assert not shut[inside].any()
         assert (shut[beyond] == 1.0).all()
-        state[low + 6 : high - 6, low] = FREE
-        door = channel(transmitter_window(PartialMap(state, CELL_M, (-HALF_M, -HALF_M)), TX_M), "detour")
         assert not door[inside].any()
         assert (door[beyond] > 0.0).all()
         assert (door <= shut).all()

@@ -377,8 +377,9 @@ class CoverageJob:
             return self._prior(tx_m, rx_m, transmitter.antenna, at_rx=True)
 
         part = part_of(report, 0.0, LOCATING_FRACTION)
-        through_walls = self.model.simulation.trace_settings.through_walls
-        return locate_transmitter(partial, measured, allowed, predict, part, through_walls=through_walls)
+        settings = self.model.simulation.trace_settings
+        through_walls_hz = settings.frequency_hz if settings.through_walls else None
+        return locate_transmitter(partial, measured, allowed, predict, part, through_walls_hz=through_walls_hz)
 
     def _assimilated(self, tx_m: Floats, measured: Measurements, antenna: Antenna, **options: Any) -> Assimilation:
         prior, antenna_db, _ = self._prior(tx_m, measured.rx, antenna)

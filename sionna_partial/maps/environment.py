@@ -312,7 +312,7 @@ class FloorPlan:
     kind: ClassVar[EnvironmentKind] = "plan"
     is_extruded: ClassVar[bool] = True
     suffixes: ClassVar[tuple[str, ...]] = ".yaml", ".yml", ".npz"
-    receivers_at_once: ClassVar[int] = 8_000
+    receivers_at_once: ClassVar[int] = 20_000
 
     @property
     def height_range_m(self) -> tuple[float, float]:

@@ -130,6 +130,13 @@ KINDS_THROUGH_WALLS = tuple(
 UNKNOWN_FACTOR_STD = 0.3
 """Standard deviation of the factor if candidate materials have their own losses."""
 
+
+def kinds_through_walls(materials: int) -> tuple[Kind, ...]:
+    """Return `KINDS_THROUGH_WALLS` for that number of candidate materials."""
+    unsure = np.array([1.0, UNKNOWN_FACTOR_STD if materials > 1 else 1.0])
+    return tuple(kind._replace(covariance=kind.covariance * np.outer(unsure, unsure)) for kind in KINDS_THROUGH_WALLS)
+
+
 LEAST_WEIGHT = 0.01
 """Smallest probability of a candidate in predictions."""
 
@@ -160,6 +167,13 @@ class Walks:
         """Return the lengths (P, N) of walks to points (N, 3) [m], infinite beyond `longest_m`."""
         straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
         return np.maximum(self._lengths_m[:, self._cell_at(points_m)], straight_m)
+
+    def correlation(self, points_m: Floats, kind: Kind, *, tx_seen: bool) -> Floats:
+        """Return the correlation (P, N) of residuals at points (N, 3) [m]."""
+        walks_m = self.lengths_m(points_m)
+        seen = [tx_seen & (self.partial.state_at(each_m) == CellState.FREE) for each_m in (self.points_m, points_m)]
+        range_m = np.where(seen[0][:, None] | seen[1], kind.seen_range_m, UNSEEN_RANGE_M)
+        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
     @cached_property
     def _step(self) -> int:
@@ -210,13 +224,7 @@ class _Links:
         return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
 
     def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
-        walks_m = self.walks.lengths_m(rx_m)
-        either_seen = self._both_seen(self.walks.points_m)[:, None] | self._both_seen(rx_m)
-        range_m = np.where(either_seen, kind.seen_range_m, UNSEEN_RANGE_M)
-        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
-
-    def _both_seen(self, rx_m: Floats) -> Bools:
-        return self.tx_seen & (self.walks.partial.state_at(rx_m) == CellState.FREE)
+        return self.walks.correlation(rx_m, kind, tx_seen=self.tx_seen)
 
 
 class _Sample(NamedTuple):
@@ -328,7 +336,7 @@ def _hypotheses(
         offset_db, factor = kind.mean
         residual = sample.averaged(above_db - offset_db - (factor - 1.0) * below_db) / scale_db
         design = np.stack([np.ones(len(residual)), sample.averaged(below_db)]) / scale_db
-        correlation = _positive(links.correlation(sample.rx_m, kind))
+        correlation = positive(links.correlation(sample.rx_m, kind))
         for each_db, noise_db in sample.noises_db().items():
             log_p = math.log(p_kind) - 0.5 * (math.log(each_db / LIKELY_NOISE_DB) / NOISE_SPREAD) ** 2
             log_p -= np.log(scale_db[received]).sum()
@@ -354,15 +362,12 @@ class _Compared(NamedTuple):
         materials: Sequence[LinkPrediction],
         others: Sequence[Sequence[tuple[Floats, Floats]]],
     ) -> _Compared:
-        kinds = KINDS_THROUGH_WALLS
-        if len(materials) > 1:
-            unsure = np.array([1.0, UNKNOWN_FACTOR_STD])
-            kinds = tuple(kind._replace(covariance=kind.covariance * unsure * unsure[:, None]) for kind in kinds)
+        kinds = kinds_through_walls(len(materials))
         learnt = [
             [kind.learnt([other[min(k, len(other) - 1)] for other in others]) for kind in kinds]
             for k in range(len(materials))
         ]
-        correlation = _positive(links.correlation(sample.rx_m, kinds[0]))
+        correlation = positive(links.correlation(sample.rx_m, kinds[0]))
         return cls(sample, links, materials, learnt, correlation)
 
     def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
@@ -654,7 +659,7 @@ def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp],
         edge_m *= 1.5
 
 
-def _positive(correlation: Floats) -> Floats:
+def positive(correlation: Floats) -> Floats:
     """Make a correlation (P, P) positive definite: walks are no Euclidean distances."""
     values, vectors = np.linalg.eigh(0.5 * (correlation + correlation.T))
     return (vectors * np.maximum(values, _LEAST_EXPLAINED)) @ vectors.T

@@ -1,11 +1,12 @@
 """Localisation of a transmitter: measured gains -> posterior over positions."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr, logsumexp
 
 from sionna_partial.arrays import Bools, Floats
@@ -13,11 +14,23 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.assimilation import FREE_P_POWERS, LIKELY_NOISE_DB, Walks, grouped
+from sionna_partial.measurements.assimilation import (
+    FREE_P_POWERS,
+    LIKELY_NOISE_DB,
+    Kind,
+    Walks,
+    grouped,
+    kinds_through_walls,
+    positive,
+)
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.wall_materials import FADINGS_DB, OWN_WEIGHT, RESIDUAL_DB, Residuals, log_std_prior
 
-Predict = Callable[[Floats, Floats], tuple[LinkPrediction, Floats, Floats]]
+Links = tuple[LinkPrediction, Floats, Floats]
+
+Predict = Callable[[Floats, Floats], Links]
 """Return the links from a position (3,) to others (N, 3) [m]: prediction without the antenna at the others, its gain
 (N,) [dB], and P(indoor) of the others (N,).
 """
@@ -28,10 +41,13 @@ MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
 """Number of groups of neighbouring measurements; one of each group is traced."""
 
-CORRELATION_M = 3.0
-"""Correlation length of prediction errors along walks [m]; with it the 90 % region holds 90 % of the transmitters of
-procedural homes, unreceived ones included.
+CORRELATION_M, FARTHEST_M = 3.0, 30.0
+"""Correlation length of prediction errors along walks with opaque walls, with which the 90 % region holds 90 % of the
+transmitters of procedural homes, unreceived ones included; and length of the longest walks [m].
 """
+
+BLOCK = 64
+"""Number of positions that are compared at once through walls."""
 
 TRACE_STD_DB, P_ANYTHING, RANGE_DB = 1.0, 0.02, 90.0
 """Standard deviation of a trace through observed space [dB]; probability and range [dB] of outliers."""
@@ -102,40 +118,103 @@ def locate_transmitter(
     predict: Predict,
     report: Progress,
     *,
-    through_walls: bool = False,
+    through_walls_hz: float | None = None,
 ) -> TransmitterPosterior:
     """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
-    By reciprocity, links are predicted from the measured positions to all others that are `allowed`. The
-    log-likelihood is divided by the number of correlated neighbours. Unknown wall materials are compared together
-    with the positions.
+    By reciprocity, links are predicted from the measured positions to all others that are `allowed`. Through walls, at
+    the frequency `through_walls_hz`, residuals are the process of `Assimilation`. With opaque walls, the log-likelihood
+    is divided by the number of correlated neighbours.
     """
     posterior = _grid(partial, measured)
     points_m = posterior.points_m
     received = measured.gain_db > measured.sensitivity_db
-    groups = MOST_GROUPS_THROUGH_WALLS if through_walls else MOST_GROUPS
+    groups = MOST_GROUPS if through_walls_hz is None else MOST_GROUPS_THROUGH_WALLS
     some = measured.take(grouped(measured.rx, received, groups)[0])
     possible = np.flatnonzero(allowed(points_m))
     if not len(possible):
         raise PositionError("a transmitter can be nowhere: no position is away from walls and measurements.")
     partial.require_positions("tx", points_m[possible])
-    log_p, weights, p_indoor = np.zeros(()), np.ones(1), np.zeros(len(possible))
+    links = []
     for index, each_m in enumerate(some.rx):
         report(index / len(some), "comparing positions of the transmitter")
-        prediction, antenna_db, indoor = predict(each_m, points_m[possible])
-        p_indoor += indoor / len(some)
-        materials, weights = prediction.by_material
-        one = some.take(np.array([index]))
-        log_p = log_p + np.stack([_log_likelihood(each, one, antenna_db) for each in materials])
-    walks_m = Walks(partial, some.rx, 10.0 * CORRELATION_M).lengths_m(some.rx)
-    log_p *= len(some) / np.exp(-walks_m / CORRELATION_M).sum()
-    log_p = logsumexp(log_p + np.log(weights)[:, None, None], axis=0)
-    log_p += _log_offset_prior()[:, None] + np.log(np.maximum(p_indoor, OUTDOOR))
+        links.append(predict(each_m, points_m[possible]))
+    if through_walls_hz is None:
+        log_p = _log_independent(partial, some, links)
+    else:
+        log_p = _log_process(partial, some, links, points_m[possible], through_walls_hz)
+    log_p += np.log([[1.0 - FREE_P_POWERS], [FREE_P_POWERS]])
+    log_p += np.log(np.maximum(np.mean([indoor for *_, indoor in links], axis=0), OUTDOOR))
     joint = np.exp(log_p - logsumexp(log_p))
     posterior.probability.ravel()[possible] = joint.sum(axis=0)
     p_powers = np.zeros(posterior.probability.shape)
-    p_powers.ravel()[possible] = joint[OFFSETS_DB != 0.0].sum(axis=0) / np.maximum(joint.sum(axis=0), 1e-300)
+    p_powers.ravel()[possible] = joint[1] / np.maximum(joint.sum(axis=0), 1e-300)
     return replace(posterior, p_powers=p_powers)
+
+
+def _log_independent(partial: PartialMap, measured: Measurements, links: Sequence[Links]) -> Floats:
+    """Return the log-likelihood (2, N) of gains and of powers with opaque walls: residuals are independent."""
+    log_p = np.zeros(())
+    for at, (prediction, antenna_db, _) in enumerate(links):
+        log_p = log_p + _log_likelihood(prediction, measured.take(np.array([at])), antenna_db)
+    walks_m = Walks(partial, measured.rx, FARTHEST_M).lengths_m(measured.rx)
+    log_p *= len(measured) / np.exp(-walks_m / CORRELATION_M).sum()
+    weights = np.where(OFFSETS_DB == 0.0, 0.0, np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2))
+    powers = logsumexp(log_p, axis=0, b=(weights / weights.sum())[:, None])
+    return np.stack([log_p[OFFSETS_DB == 0.0][0], powers])
+
+
+def _log_process(
+    partial: PartialMap, measured: Measurements, links: Sequence[Links], points_m: Floats, frequency_hz: float
+) -> Floats:
+    """Return the log-likelihood (2, N) of gains and of powers through walls: residuals are a Gaussian process."""
+    materials, weights = zip(*(prediction.by_material for prediction, *_ in links), strict=True)
+    mean_db, std_db = (
+        np.array([[getattr(each, name) for each in of_link] for of_link in materials]).transpose(2, 1, 0)
+        for name in ("gain_mean_db", "gain_std_db")
+    )
+    levels_db = [measured.take(np.array([at])).of_paths(antenna_db)[0] for at, (_, antenna_db, _) in enumerate(links)]
+    above_db = np.transpose(levels_db)[:, None] - mean_db
+    below_db = mean_db - free_space_gain_db(cdist(points_m, measured.rx), frequency_hz)[:, None]
+    received = measured.of_paths(0.0)[1]
+    noise_db = 0.0 if measured.std_db is None else float(np.sqrt(np.mean(measured.std_db**2)))
+    walks, seen = Walks(partial, measured.rx, FARTHEST_M), partial.state_at(points_m) == CellState.FREE
+    kinds = kinds_through_walls(len(materials[0]))
+    log_p = np.empty((len(kinds), len(points_m)))
+    for tx_seen in (True, False):
+        correlation = positive(walks.correlation(measured.rx, kinds[0], tx_seen=tx_seen))
+        at = np.flatnonzero(seen == tx_seen)
+        for some in (at[first : first + BLOCK] for first in range(0, len(at), BLOCK)):
+            residuals_db = above_db[some], below_db[some], std_db[some]
+            for number, kind in enumerate(kinds):
+                of_material = _log_evidence(kind, correlation, received, *residuals_db, noise_db)
+                log_p[number, some] = logsumexp(of_material + np.log(weights[0]), axis=1)
+    return log_p
+
+
+def _log_evidence(
+    kind: Kind,
+    correlation: Floats,
+    received: Bools,
+    above_db: Floats,
+    below_db: Floats,
+    std_db: Floats,
+    noise_db: float,
+) -> Floats:
+    """Return the log-evidence (N, K) of N positions and K materials; residuals are (N, K, P) [dB].
+
+    Residuals of links that were not received are independent, given the mean of the others.
+    """
+    count = received.sum()
+    above, below, std = (each[..., received].reshape(-1, count) for each in (above_db, below_db, std_db))
+    correlation, covariance = correlation[np.ix_(received, received)], kind.covariance[None]
+    residuals = Residuals(correlation, np.ones(count), above, below, std, covariance)
+    log_p = OWN_WEIGHT * residuals.log_evidence(np.hypot(FADINGS_DB, noise_db)) + log_std_prior()
+    prior_count = RESIDUAL_DB**2 / kind.covariance[0, 0]
+    offset_db = above_db[..., received].sum(axis=-1, keepdims=True) / (count + prior_count)
+    bounds = log_ndtr((above_db - offset_db)[..., ~received] / np.hypot(std_db[..., ~received], RESIDUAL_DB))
+    of_rows: Floats = logsumexp(log_p, axis=(1, 2)).reshape(above_db.shape[:2])
+    return of_rows + OWN_WEIGHT * bounds.sum(axis=-1)
 
 
 def _grid(partial: PartialMap, measured: Measurements) -> TransmitterPosterior:
@@ -165,8 +244,3 @@ def _log_likelihood(prediction: LinkPrediction, measured: Measurements, antenna_
     with np.errstate(divide="ignore"):
         expected = logsumexp(log_density + np.log(probabilities), axis=1)
     return np.logaddexp(math.log1p(-P_ANYTHING) + expected, np.log(P_ANYTHING * anything))
-
-
-def _log_offset_prior() -> Floats:
-    weight = np.where(OFFSETS_DB == 0.0, 0.0, np.exp(-0.5 * (OFFSETS_DB / OFFSET_STD_DB) ** 2))
-    return np.log(FREE_P_POWERS * weight / weight.sum() + (1.0 - FREE_P_POWERS) * (OFFSETS_DB == 0.0))

@@ -145,20 +145,21 @@ class Residuals(NamedTuple):
         values, vectors = np.linalg.eigh(self.correlation * root[:, None] * root)
         values = np.maximum(values, 1e-6)
         rows_db = np.stack([self.residual_db, np.ones_like(self.below_db), self.below_db], axis=1) * root
-        found = np.empty((len(rows_db), len(STDS_DB), len(noises_db)))
+        found, prior = np.empty((len(rows_db), len(STDS_DB), len(noises_db))), np.linalg.inv(self.covariance)
         for s, process_db in enumerate(STDS_DB):
             scale_db = np.hypot(self.std_db, process_db)
             rows = (rows_db / scale_db[:, None]) @ vectors
             relative = noises_db**2 * (scale_db**-2.0).sum(axis=1)[:, None] / max(len(root), 1)
             spectrum = values + relative[..., None]
             products = rows[:, :, None] * rows[:, None]
-            gram = (1.0 / spectrum) @ products.reshape(len(rows), 9, -1).swapaxes(1, 2)
+            gram = (1.0 / spectrum) @ products.reshape(len(rows), 9, len(root)).swapaxes(1, 2)
             gram = gram.reshape(*spectrum.shape[:2], 3, 3)
-            common = np.linalg.inv(self.covariance)[:, None] + gram[..., 1:, 1:]
-            shift = gram[..., 1:, 0]
-            square = gram[..., 0, 0] - (shift * np.linalg.solve(common, shift[..., None])[..., 0]).sum(axis=-1)
-            volume = np.log(spectrum).sum(axis=-1) + np.linalg.slogdet(self.covariance[:, None] @ common)[1]
-            found[:, s] = -0.5 * (square + volume) - np.log(scale_db).sum(axis=1)[:, None]
+            offset, factor = (prior[:, at, at, None] + gram[..., at + 1, at + 1] for at in (0, 1))
+            both, (first, second) = prior[:, 0, 1, None] + gram[..., 1, 2], np.moveaxis(gram[..., 1:, 0], -1, 0)
+            determinant = offset * factor - both**2
+            explained = (factor * first**2 - 2.0 * both * first * second + offset * second**2) / determinant
+            volume = np.log(spectrum).sum(axis=-1) + np.log(determinant) - np.linalg.slogdet(prior)[1][:, None]
+            found[:, s] = -0.5 * (gram[..., 0, 0] - explained + volume) - np.log(scale_db).sum(axis=1)[:, None]
         return found
 
 

@@ -39,8 +39,8 @@ COSINES = 2048
 _ANGLES, _MARGIN = 1024, 1.01
 """Steps of the table of largest coefficients, and factor that enlarges them."""
 
-_CANCELLED = 0.02
-"""Fraction of the terms of a diffraction that single precision may leave where they cancel."""
+_CANCELLED, _ROUGH = 0.02, 0.05
+"""Fractions of the terms of a diffraction that single precision, and a rough bound, may leave where they cancel."""
 
 _STEPS, _ASYMPTOTIC = 128, 3.0
 """Entries of the table of the UTD transition function per unit, and the start of its asymptotic series."""
@@ -254,8 +254,8 @@ def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
     by_0 = utd_term(transition, terms, 0, boundary) - utd_term(transition, terms, 3, boundary)
     by_n = utd_term(transition, terms, 1, boundary) - utd_term(transition, terms, 2, boundary)
     size_0, size_n = _size(by_0), _size(by_n)
-    own_0, mixed_0, other_0 = _at_face(faces, material, cosine_0, sine, slope)
-    own_n, mixed_n, other_n = _at_face(faces, material, cosine_n, sine, slope)
+    own_0, mixed_0, other_0 = at_face(faces, material, cosine_0, sine, slope)
+    own_n, mixed_n, other_n = at_face(faces, material, cosine_n, sine, slope)
     kept = _size(own_0 * by_0 + own_n * by_n) + _CANCELLED * (_size(own_0) * size_0 + _size(own_n) * size_n)
     vertical, horizontal, pure = field
     mixed, other = mixed_0 * size_0 + mixed_n * size_n, other_0 * size_0 + other_n * size_n
@@ -264,16 +264,23 @@ def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
 
 @njit(cache=True)
 def most_at_edge(terms, boundary, face_0, face_n):
-    """Return a rough bound of a diffracted field, from the largest reflections of both faces."""
-    size = 0.0
-    for k, other, face in ((0, 3, face_0), (1, 2, face_n)):
-        first, second = terms[k, 0], terms[other, 0]
-        here, there = boundary * terms[k, 1], boundary * terms[other, 1]
-        if min(here, there) > _ASYMPTOTIC:
-            size += face * (abs(first - second) + abs(first) / (here * here) + abs(second) / (there * there))
-        else:
-            size += face * (abs(first) * min(1.0, 2.0 * here) + abs(second) * min(1.0, 2.0 * there))
-    return size
+    """Return a rough bound of a field diffracted in the plan, from the coefficients of both faces as of `at_face`."""
+    by_0, near_0, sum_0 = _rough_terms(terms, 0, 3, boundary)
+    by_n, near_n, sum_n = _rough_terms(terms, 1, 2, boundary)
+    if near_0 or near_n:
+        return _size(face_0) * abs(by_0) + _size(face_n) * abs(by_n)
+    return _size(face_0 * by_0 + face_n * by_n) + _ROUGH * (_size(face_0) * sum_0 + _size(face_n) * sum_n)
+
+
+@njit(cache=True)
+def _rough_terms(terms, k, other, boundary):
+    """Return the difference of two terms without phases, whether a shadow boundary is near, and their sum."""
+    first, second = terms[k, 0], terms[other, 0]
+    here, there = boundary * terms[k, 1], boundary * terms[other, 1]
+    size = abs(first) + abs(second)
+    if min(here, there) > 2.0 * _ASYMPTOTIC:
+        return first - second, False, size
+    return abs(first) * min(1.0, 2.0 * here) + abs(second) * min(1.0, 2.0 * there), True, size
 
 
 @njit(cache=True)
@@ -295,7 +302,7 @@ def _te_part(along, sine, slope):
 
 
 @njit(cache=True)
-def _at_face(faces, material, cosine, sine, slope):
+def at_face(faces, material, cosine, sine, slope):
     """Return the coefficient of a vertical field at a face of a wedge, and magnitudes of the others.
 
     To Sionna RT, a face in the shadow (negative cosine) is a perfect mirror.

@@ -17,7 +17,7 @@ from sionna_partial.arrays import Floats, Indices
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import part_of
-from sionna_partial.process import njit
+from sionna_partial.process import in_order, njit
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
@@ -54,9 +54,8 @@ class Listed(NamedTuple):
     unlisted: Floats | float = 0.0
     at_once: int = _WRITTEN_AT_ONCE
 
-    def blocks(self, rows: Indices) -> Iterator[Candidates]:
-        for start in range(0, len(rows), self.at_once):
-            yield self.write(rows[start : start + self.at_once])
+    def parts(self, rows: Indices) -> Iterator[Indices]:
+        return (rows[start : start + self.at_once] for start in range(0, len(rows), self.at_once))
 
 
 class Kind(Protocol):
@@ -112,10 +111,17 @@ class Selection:
         return LEVELS - (first - start[:-1])
 
     def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
-        for number, (name, part, level) in enumerate(self.parts, start=1):
-            rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
-            for candidates in part.blocks(rows):
-                yield Block(candidates, low + (high - low) * number / len(self.parts), f"verifying {name}")
+        def chosen() -> Iterator[tuple[int, Indices]]:
+            for number, (_, part, level) in enumerate(self.parts):
+                rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
+                yield from ((number, some) for some in part.parts(rows))
+
+        def written(item: tuple[int, Indices]) -> Block:
+            number, rows = item
+            name, part, _ = self.parts[number]
+            return Block(part.write(rows), low + (high - low) * (number + 1) / len(self.parts), f"verifying {name}")
+
+        yield from in_order(written, chosen())
 
 
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:
@@ -140,7 +146,7 @@ def rounds(
     """
     low = 0.6 if through_walls else 1.0
     if tolerance_db == 0.0:
-        yield lambda _: _every_block(opaque, receivers, low)
+        yield lambda _: _listed_blocks(opaque, low, lambda part, _: np.arange(len(part.rx)), np.zeros(receivers))
     else:
         selection = Selection.of(opaque, receivers, tolerance_db, part_of(report, 0.0, 0.4 * low))
         nothing = np.zeros(receivers, np.int64)
@@ -149,20 +155,16 @@ def rounds(
         yield lambda found: selection.blocks(first, selection.needed(found, tolerance_db), 0.9 * low, low)
     for number, kind in enumerate(through_walls, start=1):
         high = low + (1.0 - low) * number / len(through_walls)
-        yield partial(_strongest_blocks, kind, tolerance_db, high)
+        yield partial(_listed_blocks, [kind], high, partial(strongest, tolerance_db=tolerance_db))
 
 
-def _every_block(kinds: Sequence[Kind], receivers: int, high: float) -> Iterator[Block]:
+def _listed_blocks(
+    kinds: Sequence[Kind], high: float, chosen: Callable[[Listed, Floats], Indices], found: Floats
+) -> Iterator[Block]:
     for number, kind in enumerate(kinds):
-        for part in kind.listed(np.zeros(receivers)):
-            for candidates in part.blocks(np.arange(len(part.rx))):
-                yield Block(candidates, high * (number + part.done) / len(kinds), f"verifying {kind.name}")
-
-
-def _strongest_blocks(kind: Kind, tolerance_db: float, high: float, found: Floats) -> Iterator[Block]:
-    for part in kind.listed(found):
-        for candidates in part.blocks(strongest(part, found, tolerance_db)):
-            yield Block(candidates, high, f"verifying {kind.name}")
+        for part in kind.listed(found):
+            for rows in part.parts(chosen(part, found)):
+                yield Block(part.write(rows), high * (number + part.done) / len(kinds), f"verifying {kind.name}")
 
 
 def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:

@@ -8,6 +8,8 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
+from inputs import KINDS
+
 CORPUS = Path(__file__).with_name("corpus")
 """Python files of what once went wrong; each raises `Wrong` when it does again."""
 
@@ -141,13 +143,6 @@ SPOILS = (
     "bytes(len(data))",
 )
 """Expressions of the bytes `data` of a valid file and a random generator `rng`."""
-
-KINDS = (
-    *("cloud.las", "cloud.laz", "cloud.pcd", "cloud.xyz", "plan.dxf", "drive.bag", "drive.mcap", "drive.db3"),
-    *("map.yaml", "map.pgm", "map.npz", "mesh.ply", "mesh.obj", "scene.xml", "scene folder", "measurements.csv"),
-    *("antenna.msi", "vacuum.json", "vacuum.vwm", "plan.png"),
-    *("predictor.keras", "predictor.json", "coverage.nc", "channels.nc", "dataset.parquet", "dataset.json"),
-)
 
 STOPPED = COMMANDS | {"dataset": "OUT --homes 2", "train": "LINKS --out OUT --networks paper --test-fraction 0"}
 """Subcommands that get a signal in the middle of what they do, and are then called again."""

@@ -40,6 +40,7 @@ from sionna_partial.tracing.plan.room import (
 from sionna_partial.tracing.power import (
     Materials,
     at_edge,
+    at_face,
     at_flats,
     at_wall,
     gain_at_azimuth,
@@ -64,8 +65,11 @@ _NEAR_M = 1e-3
 _ASIDE_M = 1e-3
 """Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
-_NEGLIGIBLE = 3e-6
+_NEGLIGIBLE = 3e-5
 """Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
+
+_EXPECTED, _HALF_DEGREE = 0.5, 0.0044
+"""Expected power of unlisted paths, relative to their rough bounds, and sine of half of half a degree."""
 
 _FLAT_RAD = 1e-3
 """Smallest angle between walls and a straight line at an edge [rad]."""
@@ -131,13 +135,20 @@ class _Edges(NamedTuple):
 
 
 class _EdgeTask(NamedTuple):
-    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path."""
+    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
+
+    `most`, `faces` and `power` are as in `_most_of_arrivals` and `_diffracted_power`; paths rise `highest_m` at most.
+    """
 
     tree: BeamTree
     pairs: NDArray[np.int32]
     group: Indices
     edges: _Edges
     arrivals: _Arrivals
+    most: Floats
+    faces: NDArray[np.complex128]
+    power: Floats
+    highest_m: float
     building: Building
     reflections: int
 
@@ -146,7 +157,8 @@ class _Pair(NamedTuple):
     """Numbers of a pair of a beam from an edge and a receiver, of the edge, and of the receiver.
 
     `left` is the number of further reflections allowed, `after` the number of walls that reflect after the edge,
-    `onward_m` this leg's length, `departure` its direction as in `wedge_angle`; `utd` and `material` as in `_Edges`.
+    `onward_m` this leg's length, `azimuth_rad` and `angle_rad` its direction, from x and from the 0-face; `utd` and
+    `material` as in `_Edges`.
     """
 
     number: np.int32
@@ -155,7 +167,9 @@ class _Pair(NamedTuple):
     left: np.int64
     after: np.int64
     onward_m: float
-    departure: tuple[float, float, float, float]
+    azimuth_rad: float
+    angle_rad: float
+    exterior_rad: float
     utd: tuple[float, float, float, float, float]
     material: tuple[np.int64, np.int64]
 
@@ -235,16 +249,21 @@ class DiffractionCandidates(_EdgeCandidates):
         receivers, walls = bin_points(room.rx_m[:, :2]), np.array([self._walls_a_side])
         tree_and_pairs = trace_beams(self._building, bin_points(edges.position_m), room.tx_m[None, :2], walls)
         arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
-        reached = np.flatnonzero(np.diff(arrivals.start))
-        groups = [reached[first : first + _EDGES_AT_ONCE] for first in range(0, len(reached), _EDGES_AT_ONCE)]
+        materials, heights = self._building.materials, _heights(room, self._reflections + 1)
+        reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
+        if not len(reached):
+            return
+        most, faces = _most_of_arrivals(materials, arrivals, edges.material, highest_m)
+        bounds = most, faces, _diffracted_power(edges, arrivals, most, faces, materials.wavelength_m), highest_m
+        fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[reached])
+        onward = np.minimum(self._walls_a_side, self._reflections - fewest)
+        groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
         def of_group(number: int) -> Listed:
-            group = groups[number]
-            fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[group])
-            onward = np.minimum(self._walls_a_side, self._reflections - fewest)
-            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], onward)
-            task = _EdgeTask(tree, pairs, group, edges, arrivals, self._building, self._reflections)
-            pair, joined, bound, unlisted = _list_joined(task, _NEGLIGIBLE * found, trail_of(plan))
+            group, more = reached[groups[number]], onward[groups[number]]
+            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], more)
+            task = _EdgeTask(tree, pairs, group, edges, arrivals, *bounds, self._building, self._reflections)
+            pair, joined, bound, unlisted = _list_joined(task, heights, negligible, trail_of(plan))
             write = partial(self._written, task, pair, joined)
             return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
 
@@ -388,7 +407,7 @@ def _media(building):
     return tables, materials.largest, building.room.flat_material, materials.wavelength_m
 
 
-@njit(cache=True)
+@njit(cache=True, forceinline=True)
 def _strength(media, arrived, face, after, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
@@ -409,36 +428,37 @@ def _strength(media, arrived, face, after, terms, path):
 
 
 @njit(cache=True, nogil=True)
-def _list_joined(task, negligible, trail):
+def _list_joined(task, heights, negligible, trail):
     """Join paths to edges and from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
 
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
     references at every access, on all cores.
     """
-    tree, pairs, group, edges, arrivals, building, reflections = task
+    tree, pairs, group, edges, arrivals, most, faces, power, highest, building, reflections = task
     room, size, unlisted = building.room, reflections + 1, np.zeros(len(building.room.rx_m))
     out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
-    material, cosine, heights = np.empty(size, np.int64), np.empty(size), _heights(room, size)
-    scratch, media = (material, cosine, np.empty((4, 3))), _media(building)
+    material, cosine, media = np.empty(size, np.int64), np.empty(size), _media(building)
+    scratch = material, cosine, np.empty((4, 3)), np.empty(2 * size)
     pieces_m, of_piece, walls, bounce = building.plan.pieces_m, building.material, trail.walls, trail.bounce
-    most = _most_of_arrivals(building.materials.largest, arrivals, edges.material, heights.max())
+    position_m, face_rad, exterior_rad, normals, _, own = edges
     for i in range(len(pairs)):
         root = node = pairs[i, 0]
         while tree.parent[root] >= 0:
             root = tree.parent[root]
         edge, rx = group[root // 4], pairs[i, 1]
-        origin, target, exterior = edges.position_m[edge], room.rx_m[rx], edges.exterior_rad[edge]
+        origin, target, exterior = position_m[edge], room.rx_m[rx], exterior_rad[edge]
         after, onward = unfold(tree, node, pieces_m, target, walls, bounce)
         x, y = (bounce[0, 0], bounce[0, 1]) if after > 0 else (target[0], target[1])
         x, y = x - origin[0], y - origin[1]
-        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(edges.normals[edge], x, y)[1]:
+        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(normals[edge], x, y)[1]:
             continue
         for k in range(after):
             material[k], cosine[k] = of_piece[walls[k]], bounce[k, 3]
-        departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
-        face, utd = (edges.material[edge, 0], edges.material[edge, 1]), _constants(edges, edge)
-        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, departure, utd, face)
-        out, rough = _list_pair(media, room, arrivals, most, pair, heights[rx], scratch, negligible[rx], out)
+        directions = np.arctan2(y, x), _angle_rad(face_rad[edge], exterior, x, y), exterior
+        face, utd = (own[edge, 0], own[edge, 1]), _constants(edges, edge)
+        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, *directions, utd, face)
+        bounds = most, faces, power, heights[rx], highest, negligible[rx]
+        out, rough = _list_pair(media, room, arrivals, pair, bounds, scratch, out)
         unlisted[rx] += rough
     listed, joined, bound, used = out
     return listed[:used].copy(), joined[:used].copy(), bound[:used].copy(), unlisted
@@ -454,35 +474,41 @@ def _heights(room, size):
     return heights
 
 
-@njit(cache=True)
-def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, out):
-    """Add all paths of a pair; return the unlisted power.
-
-    Paths with a rough bound below `negligible`, which takes `most`, are not listed.
-    """
-    (_, largest, _, wavelength), (material, cosine, terms) = media, scratch
+@njit(cache=True, forceinline=True)
+def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
+    """Add the paths of a pair; return the unlisted power: of paths with a rough bound below `negligible`."""
+    (_, largest, flat, wavelength), (material, cosine, terms, weight) = media, scratch
+    most, at_faces, power, heights, highest, negligible = bounds
     before, before_cosine, lit, lengths = arrivals.material, arrivals.cosine, arrivals.lit, arrivals.length_m
     reflections, angle, faces = arrivals.reflections, arrivals.angle, arrivals.faces
     toward, gain = arrivals.toward, arrivals.gain
     directed, onward, after = len(room.gains.table) > 1, pair.onward_m, (material, cosine, pair.after)
-    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, heights.max())
     pairs, joined, bound, used = out
-    unlisted, size = 0.0, len(heights)
-    for j in range(arrivals.start[pair.edge], arrivals.start[pair.edge + 1]):
+    unlisted, size, first, last = 0.0, len(heights), arrivals.start[pair.edge], arrivals.start[pair.edge + 1]
+    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, highest)
+    azimuth, departure, is_weak = int(np.degrees(pair.azimuth_rad) + 360.5) % 360, (0.0, 0.0, 0.0, 0.0), True
+    for j in range(first, last):
         left, length = pair.left - reflections[j], lengths[j]
         if left < 0:
             continue
-        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), pair.departure, terms)
-        spread, reach = _spread(wavelength, length, onward)
-        amplitude = most_after * most[j, 0] * most_at_edge(terms, np.sqrt(reach), most[j, 1], most[j, 2])
-        rough = (2 * left + 1) * amplitude**2 * spread / (length + onward) * gain[j]
+        rough = most_after**2 * power[j, azimuth] / (onward * (length + onward))
         if rough < negligible:
-            unlisted += rough
+            unlisted += _EXPECTED * rough
             continue
+        if is_weak:
+            departure, is_weak = wedge_angle(pair.angle_rad, pair.exterior_rad), False
+            _weigh_variants(largest, flat, heights, lengths[last - 1] + onward, weight)
+        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), departure, terms)
+        spread, reach = _spread(wavelength, length, onward)
+        amplitude = most_after * most[j] * most_at_edge(terms, np.sqrt(reach), at_faces[j, 0], at_faces[j, 1])
+        rough = amplitude**2 * spread / (length + onward) * gain[j]
         face = pair.material[0] if lit[j] else pair.material[1], faces[j, 0], faces[j, 1]
         for variant in range(2 * left + 2):
             height = heights[variant]
             if height < 0.0:
+                continue
+            if rough * weight[variant] < negligible:
+                unlisted += _EXPECTED * rough * weight[variant]
                 continue
             total = np.sqrt((length + onward) ** 2 + height**2)
             sine = (length + onward) / total
@@ -498,6 +524,15 @@ def _list_pair(media, room, arrivals, most, pair, heights, scratch, negligible, 
     return (pairs, joined, bound, used), unlisted
 
 
+@njit(cache=True, forceinline=True)
+def _weigh_variants(largest, flat, heights, length, weight):
+    """Write the largest powers of variants relative to a path in the plan."""
+    for variant in range(len(heights)):
+        height = max(heights[variant], 0.0)
+        total = np.sqrt(length * length + height * height)
+        weight[variant] = at_flats(largest, flat, height / total, variant // 2, (1.0, 0.0, 0.0)) ** 2 * length / total
+
+
 @njit(cache=True)
 def _constants(edges, edge):
     return edges.utd[edge, 0], edges.utd[edge, 1], edges.utd[edge, 2], edges.utd[edge, 3], edges.utd[edge, 4]
@@ -511,18 +546,40 @@ def _spread(wavelength, length, onward):
 
 
 @njit(cache=True)
-def _most_of_arrivals(largest, arrivals, material, highest):
-    most, one = np.empty((len(arrivals.lit), 3)), np.int64(1)
+def _most_of_arrivals(materials, arrivals, material, highest):
+    """Return bounds (J,) of the fields of arrivals, and the coefficients (J, 2) of both faces of the edge."""
+    most, faces = np.empty(len(arrivals.lit)), np.empty((len(arrivals.lit), 2), np.complex128)
     for edge in range(len(arrivals.start) - 1):
         for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
-            length, own = arrivals.length_m[j], material[edge] if arrivals.lit[j] else material[edge, 1:]
-            most[j, 0] = _most_at_walls(
-                largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
+            length, own = arrivals.length_m[j], material[edge, 0] if arrivals.lit[j] else material[edge, 1]
+            most[j] = _most_at_walls(
+                materials.largest, arrivals.material[j], arrivals.cosine[j], arrivals.reflections[j], length, highest
             )
             for k in range(2):
-                face = arrivals.faces[j, k : k + 1]
-                most[j, 1 + k] = _most_at_walls(largest, own, face, one, length, highest) if face[0] >= 0.0 else 1.0
-    return most
+                faces[j, k] = at_face(materials.reflection, own, arrivals.faces[j, k], 1.0, 0.0)[0]
+    return most, faces
+
+
+@njit(cache=True)
+def _diffracted_power(edges, arrivals, most, faces, wavelength):
+    """Return bounds (J, 360) of the power of arrivals by azimuth after the edge, to be divided by s and s + length."""
+    power, terms = np.zeros((len(most), 360)), np.empty((4, 3))
+    for edge in range(len(arrivals.start) - 1):
+        exterior, utd = edges.exterior_rad[edge], _constants(edges, edge)
+        for azimuth in range(360 if arrivals.start[edge] < arrivals.start[edge + 1] else 0):
+            x, y = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
+            departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
+            for j in range(arrivals.start[edge], arrivals.start[edge + 1]):
+                angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
+                utd_terms(utd, angle, departure, terms)
+                for k in range(4):  # the largest term within half a degree
+                    near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
+                    terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
+                spread, reach = _spread(wavelength, arrivals.length_m[j], 1.0)
+                boundary = np.sqrt(reach * (1.0 + arrivals.length_m[j]))
+                size = most[j] * most_at_edge(terms, boundary, faces[j, 0], faces[j, 1])
+                power[j, azimuth] = size**2 * spread * arrivals.gain[j]
+    return power
 
 
 @njit(cache=True)

@@ -145,11 +145,14 @@ class SpecularCandidates:
     def listed(self, found: Floats, *, pairs_at_once: int = _LISTED_AT_ONCE) -> Iterator[Listed]:
         room, plan, depth = self._building.room, self._building.plan, self._building.limits.depth
         tree, pairs = trace_beams(self._building, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
-        for start in range(0, len(pairs), pairs_at_once):
+
+        def of_pairs(start: int) -> Listed:
             some = pairs[start : start + pairs_at_once]
             pair, variant, bound = _list_variants(tree, some, self._building, trail_of(plan))
             write = partial(self._written, tree, some, pair, variant)
-            yield Listed(some[pair, 1], bound, write, (start + len(some)) / len(pairs))
+            return Listed(some[pair, 1], bound, write, (start + len(some)) / len(pairs))
+
+        yield from in_order(of_pairs, range(0, len(pairs), pairs_at_once))
 
     def _written(
         self, tree: BeamTree, pairs: NDArray[np.int32], pair: Indices, variant: NDArray[np.int8], rows: Indices

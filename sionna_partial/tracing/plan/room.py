@@ -67,8 +67,9 @@ class Room(NamedTuple):
         flats = geometry.floor_face >= 0, geometry.ceiling_face >= 0
         of_flats = int(material_of_face[geometry.floor_face]) if flats[0] else 0
         # Contiguous: numba compiles for each layout.
-        arrays = map(np.ascontiguousarray, (tx_m, rx_m, material_of_face[: 2 * len(geometry.segments) : 2]))
-        return cls(float(geometry.height_m), *flats, *arrays, of_flats, geometry.top_m, gains)
+        of_walls = np.ascontiguousarray(material_of_face[: 2 * len(geometry.segments) : 2])
+        ends_m = np.ascontiguousarray(tx_m), np.ascontiguousarray(rx_m)
+        return cls(float(geometry.height_m), *flats, *ends_m, of_walls, of_flats, geometry.top_m, gains)
 
 
 class Building(NamedTuple):
