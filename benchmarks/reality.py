@@ -60,8 +60,11 @@ BUILDINGS = {
     "office, outer concrete, inner brick": ("office", 3, 5.2e9, ("concrete", "brick", "brick")),
     "floor, glass, plasterboard, concrete core": ("floor", 2, 1.9e9, ("glass", "drywall", "concrete")),
     "house of drywall": ("house", 12, 5.2e9, ("drywall", "drywall", "drywall")),
+    "office, thick outer walls and core of concrete": ("office", 5, 2.4e9, ("concrete", "drywall", "concrete"), 0.1),
 }
-"""Procedural buildings: kind, seed, frequency [Hz], and the materials of outer walls, inner walls and core."""
+"""Procedural buildings: kind, seed, frequency [Hz], the materials of outer walls, inner walls and core, and the depth
+added to each side of outer walls and core [m].
+"""
 OUTER_M, CORE, BUILDING_TRANSMITTERS, LOCATE_TRANSMITTERS = 1.0, 0.7, 4, 12
 PROCESS_DB, PROCESS_M, FADING_DB, OFFSET_DB, SENSITIVITY_DBM = 4.0, 4.0, 4.0, (-30.0, 4.0), -125.0
 
@@ -186,7 +189,13 @@ def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats
 
 
 def procedural(
-    kind: str, seed: int, frequency_hz: float, materials: tuple[str, str, str], *, shared: bool = False
+    kind: str,
+    seed: int,
+    frequency_hz: float,
+    materials: tuple[str, str, str],
+    thicker_m: float = 0.0,
+    *,
+    shared: bool = False,
 ) -> tuple[sp.PartialMap, dict[str, Floats], float]:
     """Return a building without its materials, with powers that were traced with them, as `read_floor`.
 
@@ -195,7 +204,12 @@ def procedural(
     partial, rng = sp.make_home(seed, kind), np.random.default_rng(seed)
     inside = ndimage.binary_fill_holes(partial.state != CellState.UNKNOWN)
     depth_m = ndimage.distance_transform_edt(inside) * partial.resolution_m
-    zone, truth = np.digitize(depth_m, [OUTER_M, CORE * depth_m.max()]), partial
+    zone = np.digitize(depth_m, [OUTER_M, CORE * depth_m.max()])
+    if thicker_m:
+        walls = (partial.state == CellState.WALL) & (zone != 1)
+        walls = ndimage.binary_dilation(walls, iterations=round(thicker_m / partial.resolution_m))
+        partial = replace(partial, state=np.where(walls, np.uint8(CellState.WALL), partial.state))
+    truth = partial
     for number, material in enumerate(materials):
         truth = truth.with_wall_material(material, (partial.state == CellState.WALL) & (zone == number))
     simulation, links = sp.Simulation(truth, sp.TraceSettings(frequency_hz)), {}

@@ -65,7 +65,7 @@ from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.process import njit
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
-from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.links import unnamed_counts
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathSet
 from sionna_partial.tracing.simulation import Simulation
 
@@ -415,12 +415,10 @@ class DifferentiableLinks:
     def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
         extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
         if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
-            materials = WallMaterials.at(float(self.base.frequency_hz))
-            counted = ~self._scene.partial.at_named_walls(paths.vertices_m)
-            walls, reflections = (
-                np.count_nonzero((paths.interactions == kind) & counted, axis=1) for kind in (REFRACTION, REFLECTION)
-            )
-            extra_db = np.outer(materials.crossing_db, walls) + np.outer(materials.reflection_db, reflections)
+            partial = self._scene.partial
+            materials = WallMaterials.at(float(self.base.frequency_hz), several=bool(partial.thick_walls.any()))
+            thin, thick, reflections = unnamed_counts(paths.interactions, partial.wall_classes(paths.vertices_m))
+            extra_db = np.outer(materials.reflection_db, reflections) + materials.crossing_db @ [thin, thick]
             prior = materials.prior
         gains_db = tf.stack([_gain_db(self._sum(power * kept, paths.path_rx)) for kept in 10.0 ** (-extra_db / 10.0)])
         mean_db = tf.tensordot(prior, gains_db, 1)

@@ -276,7 +276,8 @@ class LinkModel:
     @property
     def wall_materials(self) -> WallMaterials:
         """The candidates for an unknown material of walls."""
-        return WallMaterials.at(self.simulation.trace_settings.frequency_hz)
+        several = bool(self.partial.thick_walls.any())
+        return WallMaterials.at(self.simulation.trace_settings.frequency_hz, several=several)
 
     def links(
         self,

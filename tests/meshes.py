@@ -1,9 +1,13 @@
 """Meshes that several tests use."""
 
+from dataclasses import replace
+
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
+import sionna_partial as sp
+from sionna_partial.files import temporary_folder
 from sionna_partial.maps.environment import SceneMesh, merged_mesh
 
 OBSERVED = [(0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0)]
@@ -24,6 +28,17 @@ def room() -> trimesh.Scene:
 def scene_mesh(*solids: trimesh.Trimesh) -> SceneMesh:
     whole = trimesh.util.concatenate(solids)
     return merged_mesh(np.array(whole.vertices), whole.faces, np.zeros(len(whole.faces), np.intp), (None,))
+
+
+def meshed(plan: sp.PartialMap, *named: sp.Material) -> sp.PartialMap:
+    """Return a plan with the mesh of its scene, whose faces have a name if they are of the given materials."""
+    with temporary_folder() as folder:
+        sp.export_scene(plan, folder / "scene")
+        (folder / "scene" / "map.yaml").unlink()
+        mesh = sp.load_map(folder / "scene" / "scene.xml").mesh
+    assert mesh is not None
+    mesh = replace(mesh, materials=tuple(each if each in named else None for each in mesh.materials))
+    return replace(plan, wall_material=None, wall_materials=(), mesh=mesh)
 
 
 def surface_m2(mesh: SceneMesh) -> float:

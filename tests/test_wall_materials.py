@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from meshes import meshed
+from test_crossings import EVERY, rooms
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction.features import features_of_paths
 from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.wall_materials import COMMON, RESIDUAL_DB, WallMaterials
+from sionna_partial.prediction.wall_materials import COMMON, P_SAME, RESIDUAL_DB, WallMaterials
 from sionna_partial.tracing.links import path_gain_db
 
 WIFI = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False)
@@ -26,6 +28,8 @@ def flat() -> sp.PartialMap:
 
 
 FLAT = flat()
+CONCRETE = sp.Material.named("concrete")
+PARTLY_CONCRETE = FLAT.with_wall_material(CONCRETE, [(2.3, -1.0), (2.7, -1.0), (2.7, 9.0), (2.3, 9.0)])
 RNG = np.random.default_rng(5)
 RX = np.column_stack([RNG.uniform(2.7, 9.4, 120), RNG.uniform(0.4, 3.0, 120), np.full(120, 1.4)])
 RX = RX[FLAT.radios_can_stand(RX)]
@@ -68,8 +72,12 @@ class TestCandidates:
         found = WallMaterials.at(frequency_hz)
         assert found.prior.sum() == pytest.approx(1.0)
         assert len(found.prior) == len(found.crossing_db) == len(found.names) == 16
-        assert {*found.names} <= {*COMMON}
+        assert {*found.names.ravel()} <= {*COMMON}
         assert found.crossing_db.min() + found.traced_db > 0.0
+        several = WallMaterials.at(frequency_hz, several=True)
+        np.testing.assert_allclose(several.prior[:16], found.prior * P_SAME)
+        assert several.prior.sum() == pytest.approx(1.0)
+        assert np.all(several.crossing_db[16:, 0] != several.crossing_db[16:, 1])
 
 
 class TestPrediction:
@@ -96,12 +104,12 @@ class TestPrediction:
         assert np.all(part.gain_std_db == 0.0)
         assert np.all(model_of("brick", replace(WIFI, refraction=False)).predict(TX, RX).gain_std_db == 0.0)
 
-    def test_known_walls_keep_their_material(self):
+    @pytest.mark.parametrize("converted", [lambda partial: partial, lambda partial: meshed(partial, CONCRETE)])
+    def test_known_walls_keep_their_material(self, converted):
         """The wall at x = 2.5 m is of concrete, and all others unknown: only they lose more under a candidate."""
         near = RX[RX[:, 0] < 4.7]
-        concrete = [(2.3, -1.0), (2.7, -1.0), (2.7, 9.0), (2.3, 9.0)]
         settings = replace(EVERY_PATH, max_depth=0)
-        model = model_of(None, settings, FLAT.with_wall_material("concrete", concrete))
+        model = model_of(None, settings, converted(PARTLY_CONCRETE))
         parts, _ = model.predict(TX, near).by_material
         named = model_of("concrete", settings).predict(TX, near)
         assert len(parts) == 16
@@ -110,8 +118,27 @@ class TestPrediction:
         traced_db = model.features(TX, far).gain_db
         lost_db = traced_db - np.array([part.gain_mean_db for part in model.predict(TX, far).by_material[0]])
         walls = (far[:, 0] > 5.0).astype(int) + (far[:, 0] > 7.4)
-        expected_db = model.wall_materials.crossing_db[:, None] * walls
+        expected_db = model.wall_materials.crossing_db[:, :1] * walls
         assert np.allclose(lost_db[:, traced_db > -120.0], expected_db[:, traced_db > -120.0], atol=0.5)
+
+    def test_meshes_and_plans_have_the_same_candidates(self):
+        """One wall is of concrete, and others are thin or thick."""
+        state = rooms().state.copy()
+        state[:, 60:62] = sp.CellState.WALL
+        plan = replace(rooms(), state=state)
+        plan = plan.with_wall_material(CONCRETE, [(0.9, 2.9), (1.3, 2.9), (1.3, 6.1), (0.9, 6.1)])
+        mesh, settings = meshed(plan, CONCRETE), replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1)
+        rx, gains_db = [(2.51, 7.23, 1.3), (5.3, 6.04, 1.5), (1.93, 3.81, 1.7)], []
+        for partial in (plan, mesh):
+            parts, _ = model_of(None, settings, partial).predict((-0.52, 4.13, 1.5), rx).by_material
+            gains_db.append([part.gain_mean_db for part in parts])
+        np.testing.assert_allclose(*gains_db, atol=0.3)
+        assert len(gains_db[0]) == 28
+        assert mesh.unnamed_walls == pytest.approx(plan.unnamed_walls, abs=0.1)
+        coverage = sp.predict_map(model_of(None, settings, mesh), (-0.52, 4.13, 1.5), spacing_m=2.0, progress=False)
+        assert coverage.attrs["wall_material"] == "drywall .36, brick .36, concrete .28"
+        named = replace(mesh, mesh=replace(mesh.mesh, materials=(CONCRETE,) * len(mesh.mesh.materials)))
+        assert not sp.Simulation(named, WIFI).material_unknown
 
     def test_known_materials(self):
         brick = sp.Material.named("brick")
@@ -160,7 +187,7 @@ class TestMeasurements:
     def test_powers_find_the_material(self, material, least):
         model, measured = model_of(None), powers(material)
         fitted = self.fit(model, measured)
-        names = np.array(model.wall_materials.names)
+        names = model.wall_materials.names[:, 0]
         found = {name: fitted.material_weights[names == name].sum() for name in COMMON}
         assert max(found, key=found.get) == material, found
         assert found[material] > least
@@ -177,6 +204,18 @@ class TestMeasurements:
         simple = self.fit(drywall, measured.take(given))
         simple_db = simple.update(RX[rest], drywall.predict(TX, RX[rest])).gain_mean_db + simple.offset_db
         assert np.mean(off_db**2) < np.mean((simple_db - measured.gain_db[rest]) ** 2)
+
+    def test_thin_and_thick_walls_have_materials_of_their_own(self):
+        state = FLAT.state.copy()
+        state[:, [24, 72]] = sp.CellState.FREE
+        partial = sp.PartialMap(state, 0.1)
+        model, rx = model_of(None, partial=partial), RX[partial.radios_can_stand(RX)]
+        truth = partial.with_wall_material(CONCRETE, partial.thick_walls)
+        gain_db = model_of("drywall", partial=truth).predict(TX, rx).gain_mean_db
+        fitted = self.fit(model, sp.Measurements(TX, rx, gain_db + OFFSET_DB))
+        text = model.wall_materials.text(fitted.material_weights)
+        assert text.startswith("drywall")
+        assert "; thick walls concrete" in text
 
     def test_maps_say_what_the_walls_are(self):
         model, options = model_of(None), {"spacing_m": 1.0, "progress": False}

@@ -203,7 +203,7 @@ def predict_map(
         report(1.0, "done")
     coverage = maps[0] if names is None else join_transmitters(maps, names)
     if model.simulation.material_unknown:
-        coverage.attrs |= model.wall_materials.attributes(np.mean(weights, axis=0))
+        coverage.attrs |= model.wall_materials.attributes(np.mean(weights, axis=0), model.partial.unnamed_walls)
     return coverage
 
 

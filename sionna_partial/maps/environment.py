@@ -7,9 +7,11 @@ Another kind, such as voxels, needs a class like these, a writer in `scene.write
 import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, fields, replace
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, read_only
@@ -34,6 +36,9 @@ FLAT_M = 0.1
 
 DEGENERATE_M = 1e-6
 """Triangles lower than this over their longest edge are dropped [m]."""
+
+NEAR_FACE_M = 1e-3
+"""Distance from the bounds of a face up to which points may be on it [m]."""
 
 EnvironmentKind = Literal["plan", "mesh"]
 
@@ -145,6 +150,39 @@ class SceneMesh(Shown):
     def scene_materials(self, default: Material) -> dict[str, Material]:
         used = np.unique(self.material).tolist()
         return {f"material{index}": self.materials[index] or default for index in used}
+
+    def wall_sizes(self, _walls: Bools) -> tuple[tuple[Material | None, ...], Floats]:
+        area = np.abs(self._doubled_normals)
+        steep_m2 = np.linalg.norm(area, axis=1) * (np.hypot(*area.T[:2]) > area[:, 2])
+        return self.materials, np.bincount(self.material, steep_m2, len(self.materials)).astype(np.float64)
+
+    def is_named_at(self, points_m: Floats) -> Bools:
+        """Return whether the faces nearest to points (P, 3) [m] on the mesh have a named material."""
+        point, face = self._bounds.query(shapely.points(points_m[:, :2]))
+        normal = self._doubled_normals[face]
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        corners, along = self.corners_m[face], np.roll(self.corners_m[face], -1, axis=1) - self.corners_m[face]
+        there = points_m[point, None] - corners
+        inwards = np.cross(normal[:, None], along)
+        inside_m = ((there * inwards).sum(axis=2) / np.linalg.norm(along, axis=2)).min(axis=1)
+        away_m = np.abs((there[:, 0] * normal).sum(axis=1)) + np.maximum(-inside_m, 0.0)
+        order = np.lexsort((away_m, point))
+        point, first = np.unique(point[order], return_index=True)
+        is_named, named = np.array([material is not None for material in self.materials]), np.zeros(len(points_m), bool)
+        named[point] = is_named[self.material[face[order[first]]]]
+        return named
+
+    @property
+    def _doubled_normals(self) -> Floats:
+        """Normals (F, 3) as long as twice the areas [m²]."""
+        a, b, c = np.moveaxis(self.corners_m, 1, 0)
+        normals: Floats = np.cross(b - a, c - a)
+        return normals
+
+    @cached_property
+    def _bounds(self) -> shapely.STRtree:
+        flat = self.corners_m[..., :2]
+        return shapely.STRtree(shapely.box(*(flat.min(axis=1) - NEAR_FACE_M).T, *(flat.max(axis=1) + NEAR_FACE_M).T))
 
     def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
         named = tuple(materials.get(f"material{index}", old) for index, old in enumerate(self.materials))
@@ -289,6 +327,12 @@ class FloorPlan:
         """Return used materials by their names in the scene."""
         used = [0] if self.wall_material is None else np.unique(np.append(self.wall_material, 0)).tolist()
         return {f"material{index or ''}": (default, *self.wall_materials)[index] for index in used}
+
+    def wall_sizes(self, walls: Bools) -> tuple[tuple[Material | None, ...], Floats]:
+        """Return materials of walls, None for unnamed ones, and their number of wall cells (ny, nx) or area."""
+        cells = 0 if self.wall_material is None else self.wall_material
+        counts = np.bincount(np.broadcast_to(cells, walls.shape)[walls], minlength=1 + len(self.wall_materials))
+        return (None, *self.wall_materials), counts.astype(np.float64)
 
     def with_materials(self, materials: dict[str, Material]) -> dict[str, Any]:
         """Return the fields of a map with other materials, by names in the scene."""

@@ -21,7 +21,7 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.wall_cells import wall_cells
+from sionna_partial.maps.wall_cells import thick_walls, wall_cells
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -331,27 +331,54 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         """Range noise from the thickness of rough walls: 0 (exact) to 1."""
         return wall_cells(self.state, self.resolution_m).noise
 
+    @cached_property
+    def wall_fractions(self) -> dict[Material | None, float]:
+        """Fractions of the walls by their named material; None for the others."""
+        materials, sizes = self.environment.wall_sizes(self.state == CellState.WALL)
+        fractions = sizes / sizes.sum() if sizes.any() else np.ones(1)
+        of_material: dict[Material | None, float] = {}
+        for material, fraction in zip(materials, fractions.tolist(), strict=False):
+            of_material[material] = of_material.get(material, 0.0) + fraction
+        return {material: fraction for material, fraction in of_material.items() if fraction > 0.0}
+
     @property
-    def unnamed_walls(self) -> float:
-        """Fraction of the wall cells whose material the map does not name."""
+    def _unnamed_cells(self) -> Bools:
         walls = self.state == CellState.WALL
-        if self.wall_material is None or self.material is not None or not walls.any():
-            return float(self.material is None)
-        return float((self.wall_material[walls] == 0).mean())
+        return walls if self.wall_material is None else walls & (self.wall_material == 0)
 
     @cached_property
-    def _near_named_walls(self) -> Bools:
-        """Cells (ny, nx) within `OUTLINE_M` of walls, whose nearest wall has a named material."""
-        if self.wall_material is None:
-            return np.zeros(self.shape, dtype=bool)
-        away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
-        return (self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)
+    def thick_walls(self) -> Bools:
+        """Result of the function `thick_walls` for walls without a named material."""
+        return thick_walls(self.state == CellState.WALL, self._unnamed_cells, self.resolution_m)
 
-    def at_named_walls(self, points_m: NDArray[np.floating]) -> Bools:
-        """Return whether points (..., 3) [m] on outlines, or NaN, are on named walls."""
+    @cached_property
+    def unnamed_walls(self) -> Floats:
+        """Fractions (2,) of the walls that are thin or thick, and whose material the map does not name."""
+        thick = self.thick_walls.sum() / max(1, self._unnamed_cells.sum())
+        fraction = self.wall_fractions.get(None, 0.0) if self.material is None else 0.0
+        return fraction * np.array([1.0 - thick, thick])
+
+    @cached_property
+    def _nearest_classes(self) -> NDArray[np.uint8]:
+        """Result of `wall_classes` for the nearest wall of each cell; named walls are at most `OUTLINE_M` away."""
+        away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
+        classes = (1 + self.thick_walls[row, column]).astype(np.uint8)
+        if self.wall_material is not None:
+            classes[(self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)] = 0
+        return classes
+
+    def wall_classes(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
+        """Return the walls at points (..., 3) [m], or NaN: 0 with a named material, 1 thin or 2 thick without."""
+        if self.wall_fractions.keys() == {None} and not self.thick_walls.any():
+            return np.ones(points_m.shape[:-1], dtype=np.uint8)
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
         column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)
-        return self._near_named_walls[row, column]
+        classes = self._nearest_classes[row, column]
+        if self.mesh is not None and self.wall_fractions.keys() != {None}:
+            named = np.isfinite(points_m).all(axis=-1)
+            named[named] = self.mesh.is_named_at(points_m[named])
+            classes[named] = 0
+        return classes
 
     @cached_property
     def uniform_cells(self) -> NDArray[np.int32]:

@@ -47,6 +47,9 @@ _MIN_FACES = 1000
 _DEPTH_M = 0.0125
 """Depth of the wall cells behind faces at which the noise is 1 - 1/e [m]."""
 
+THICK_M, THICK_FRACTIONS = 0.15, (0.1, 0.9)
+"""Thickness of thick walls [m], and fractions of their length between which thickness distinguishes walls."""
+
 LEAST_NOISE = 0.05
 """Noise up to which a map counts as exact, as of cells cut out of meshes."""
 
@@ -106,6 +109,23 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     unseen[label[seen]] = False
     thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
     return CleanWalls(thinned, peeled, noise, roughness)
+
+
+def thick_walls(walls: Bools, counted: Bools, resolution_m: float) -> Bools:
+    """Return the cells (ny, nx) of thick walls if some of the `counted` wall cells are thin, and others thick."""
+    thickness, (low, high) = np.minimum(*_run_lengths(walls)), THICK_FRACTIONS
+    thick, length = counted & (thickness * resolution_m > THICK_M - 1e-6), 1.0 / np.maximum(thickness, 1)
+    fraction = length.sum(where=thick) / max(1.0, length.sum(where=counted))
+    return thick & (low < fraction < high)
+
+
+def _run_lengths(wall: Bools) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return width and height of the runs through every cell, at most 255."""
+    width, height = np.zeros((2, *wall.shape), dtype=np.uint8)
+    for length, cells in ((width, wall), (height.T, wall.T)):
+        _, start, end = row_runs(cells)
+        length[cells] = np.repeat(np.minimum(end - start, 255), end - start)
+    return width, height
 
 
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
@@ -277,10 +297,7 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
     facing = ndimage.binary_dilation(free, structure=_SQUARE)
     kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
-    width, height = np.zeros((2, *wall.shape), dtype=np.uint8)  # of the runs through every cell, at most 255
-    for length, cells in ((width, wall), (height.T, wall.T)):
-        _, start, end = row_runs(cells)
-        length[cells] = np.repeat(np.minimum(end - start, 255), end - start)
+    width, height = _run_lengths(wall)
     thinned = np.pad(wall, 1)
     for removable in (~kept & ~facing, ~kept):
         for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):

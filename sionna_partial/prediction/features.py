@@ -226,15 +226,12 @@ class IndirectPaths:
 
 
 def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> float:
-    """Return the mean loss of the known wall cells [dB]; `MOST_LOSS_DB` if no path is traced through walls."""
+    """Return the mean loss of the known walls [dB]; `MOST_LOSS_DB` if no path is traced through walls."""
     if not trace_settings.through_walls:
         return MOST_LOSS_DB
-    materials = scene_settings.traced_material, *partial.wall_materials
-    cells = np.zeros(partial.shape, np.uint8) if partial.wall_material is None else partial.wall_material
-    count = np.bincount(cells[partial.state == CellState.WALL], minlength=len(materials)).astype(float)
-    weights = count / count.sum() if count.any() else np.eye(len(materials))[0]
-    used, frequency_hz = np.flatnonzero(weights), trace_settings.frequency_hz
-    return float(sum(weights[k] * wall_loss_db(materials[k], frequency_hz) for k in used))
+    default, frequency_hz = scene_settings.traced_material, trace_settings.frequency_hz
+    fractions = partial.wall_fractions.items()
+    return sum(fraction * wall_loss_db(material or default, frequency_hz) for material, fraction in fractions)
 
 
 def path_unobserved_m(
@@ -356,8 +353,8 @@ class LinkFeatures(Shown):
         Walls and space around the links in flat order; unused by the paper's predictor.
     frequency_hz : float, optional
         Carrier frequency of the trace [Hz]; by default the predictor's.
-    path_power : (N, C + 1, R + 1) float64 array, optional
-        Power by crossings of and reflections at walls of unknown material.
+    path_power : (N, C + 1, ..., R + 1) float64 array, optional
+        Power by crossings of walls of unknown material, of one class or two, and reflections at them (`LinkSums`).
 
     Raises
     ------
@@ -417,23 +414,28 @@ class LinkFeatures(Shown):
         path_power = None if self.path_power is None else self.path_power[index]
         return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz, path_power=path_power)
 
-    def with_extra_losses(self, crossing_db: float, reflection_db: float, fraction: float = 1.0) -> "LinkFeatures":
-        """Return the features with additional losses per crossing and reflection [dB].
+    def with_extra_losses(
+        self, crossing_db: ArrayLike, reflection_db: float, fractions: ArrayLike = (1.0, 0.0)
+    ) -> "LinkFeatures":
+        """Return the features with additional losses per crossing of a thin or thick wall and per reflection [dB].
 
-        `fraction` of the walls of the map have an unknown material.
+        `fractions` (2,) are from `PartialMap.unnamed_walls`.
         """
         assert self.path_power is not None
-        walls, reflections = (np.arange(count) for count in self.path_power.shape[1:])
-        extra_db = crossing_db * walls[:, None] + reflection_db * reflections
-        gain_db = path_gain_db(np.tensordot(self.path_power, 10.0 ** (-extra_db / 10.0)))
+        power, sizes = self.path_power, self.path_power.shape[1:]
+        losses_db = [*np.broadcast_to(crossing_db, 2)[: len(sizes) - 1], reflection_db]
+        for loss_db, size in zip(reversed(losses_db), reversed(sizes), strict=True):
+            power = power @ 10.0 ** (-loss_db * np.arange(size) / 10.0)
+        gain_db = path_gain_db(power)
         states = np.where(gain_db > GAIN_FLOOR_DB, self.link_state, LinkState.OUTAGE)
         context = self.context
         if context is not None:
-            straight_db = context.straight_gain_db - crossing_db * context.straight_walls
+            change_db = float(np.dot(np.broadcast_to(crossing_db, 2), fractions))
+            straight_db = context.straight_gain_db - change_db / np.sum(fractions) * context.straight_walls
             context = replace(
                 context,
                 straight_gain_db=np.maximum(straight_db, GAIN_FLOOR_DB),
-                wall_loss_db=context.wall_loss_db + fraction * crossing_db,
+                wall_loss_db=context.wall_loss_db + change_db,
             )
         return replace(self, gain_db=gain_db, link_state=states, context=context)
 
@@ -567,12 +569,12 @@ def features_of_paths(
 
     `blocks` are from `Simulation.blocks`. Without `windows` there is no context.
     """
-    limits = (settings[0].max_walls, settings[0].max_depth) if material_unknown else ()
+    classes = 1 + bool(partial.thick_walls.any()) if material_unknown else 0
+    limits = (settings[0].max_walls,) * classes + (settings[0].max_depth,) * material_unknown
     sums = LinkSums(1, len(rx_m), *limits)
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
-    some_named = material_unknown and partial.wall_material is not None
     for paths in blocks:
-        sums.add(paths, ~partial.at_named_walls(paths.vertices_m) if some_named else True)
+        sums.add(paths, partial.wall_classes(paths.vertices_m) if material_unknown else None)
         if windows is not None:
             indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()

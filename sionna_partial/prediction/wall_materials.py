@@ -12,6 +12,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.prediction.features import LinkFeatures
@@ -29,6 +30,9 @@ SCATTER = math.log(1.7)
 
 CROSSINGS, LARGEST_DB, REFLECTIONS_DB = 8, (21.0, 40.0), (0.0, 3.0)
 """Number of candidate wall losses, limits of the largest, and extra losses of a reflection [dB]."""
+
+P_SAME, EVERY = 0.7, 2
+"""Prior probability that thin and thick walls are of one material, and step of the losses that they have otherwise."""
 
 BELOW = 1.3
 """Ratio of the smallest mean loss of a common material to the smallest candidate."""
@@ -60,12 +64,14 @@ class WallMaterials:
 
     Parameters
     ----------
-    crossing_db, reflection_db : (K,) float64 arrays
-        Losses per crossing and per reflection beyond drywall [dB].
+    crossing_db : (K, 2) float64 array
+        Losses per crossing of thin and thick walls beyond drywall [dB]; equal unless the map has both.
+    reflection_db : (K,) float64 array
+        Loss per reflection beyond drywall [dB].
     prior : (K,) float64 array
         Probability of each candidate.
-    names : tuple of K str
-        The `COMMON` material with the nearest loss on a logarithmic scale.
+    names : (K, 2) str array
+        The `COMMON` materials with the nearest loss on a logarithmic scale.
     traced_db : float
         Loss of a crossed wall of drywall [dB].
     """
@@ -73,35 +79,47 @@ class WallMaterials:
     crossing_db: Floats
     reflection_db: Floats
     prior: Floats
-    names: tuple[str, ...]
+    names: NDArray[np.str_]
     traced_db: float
 
     @classmethod
     @lru_cache(maxsize=16)
-    def at(cls, frequency_hz: float) -> "WallMaterials":
+    def at(cls, frequency_hz: float, *, several: bool = False) -> "WallMaterials":
         covered_hz = min(max(frequency_hz, MODELS_HZ[0]), MODELS_HZ[1])
         mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], covered_hz) for name in COMMON])
         losses_db = np.geomspace(mean_db.min() / BELOW, np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
         apart = np.log(losses_db[:, None] / mean_db)
         density = np.exp(-0.5 * (apart / SCATTER) ** 2)
-        joint = np.tile(density / density.sum(axis=0) * [*COMMON.values()], (len(REFLECTIONS_DB), 1))
-        prior = joint.sum(axis=1) / len(REFLECTIONS_DB)
+        of_loss = density / density.sum(axis=0) @ [*COMMON.values()]
+        prior, level = np.tile(of_loss / len(REFLECTIONS_DB), len(REFLECTIONS_DB)), np.arange(CROSSINGS)
+        pairs, reflection_db = np.tile(level, (2, len(REFLECTIONS_DB))), np.repeat(REFLECTIONS_DB, CROSSINGS)
+        if several:
+            of_few = of_loss.reshape(-1, EVERY).sum(axis=1)
+            differ = np.array(np.nonzero(~np.eye(len(of_few), dtype=bool)))
+            of_pair = of_few[differ].prod(axis=0)
+            prior = np.append(P_SAME * prior, (1.0 - P_SAME) * of_pair / of_pair.sum())
+            pairs = np.append(pairs, level[EVERY - 1 :: EVERY][differ], axis=1)
+            reflection_db = np.append(reflection_db, np.full(len(of_pair), np.mean(REFLECTIONS_DB)))
         traced_db = wall_loss_db(DRYWALL, frequency_hz)
-        crossing_db, reflection_db = np.meshgrid(losses_db - traced_db, REFLECTIONS_DB)
-        names = tuple([*COMMON][at] for at in np.tile(np.abs(apart).argmin(axis=1), len(REFLECTIONS_DB)))
-        return cls(crossing_db.ravel(), reflection_db.ravel(), prior, names, traced_db)
+        names = np.array([*COMMON])[np.abs(apart).argmin(axis=1)]
+        return cls((losses_db - traced_db)[pairs.T], reflection_db, prior, names[pairs.T], traced_db)
 
-    def under(self, phi: LinkFeatures, fraction: float = 1.0) -> list[LinkFeatures]:
-        pairs = zip(self.crossing_db.tolist(), self.reflection_db.tolist(), strict=True)
-        return [phi.with_extra_losses(*pair, fraction) for pair in pairs]
+    def under(self, phi: LinkFeatures, fractions: Floats) -> list[LinkFeatures]:
+        pairs = zip(self.crossing_db, self.reflection_db.tolist(), strict=True)
+        return [phi.with_extra_losses(*pair, fractions) for pair in pairs]
 
-    def attributes(self, weights: Floats) -> dict[str, str | float]:
-        return {"wall_material": self.text(weights), "wall_loss_db": float(weights @ self.crossing_db) + self.traced_db}
+    def attributes(self, weights: Floats, fractions: Floats) -> dict[str, str | float]:
+        mean_db = float(weights @ self.crossing_db @ fractions / fractions.sum())
+        return {"wall_material": self.text(weights), "wall_loss_db": mean_db + self.traced_db}
 
     def text(self, weights: Floats) -> str:
-        sums = {name: float(weights @ [name == near for near in self.names]) for name in COMMON}
-        shown = sorted(((round(p, 2), name) for name, p in sums.items()), reverse=True)
-        return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)
+        thin, thick = (_probabilities(weights, names) for names in self.names.T)
+        return thin if thin == thick else f"{thin}; thick walls {thick}"
+
+
+def _probabilities(weights: Floats, names: NDArray[np.str_]) -> str:
+    shown = sorted(((round(float(weights[names == name].sum()), 2), name) for name in COMMON), reverse=True)
+    return ", ".join(f"{name} {p:.2f}".replace(" 0.", " .") for p, name in shown if p > 0.0)
 
 
 class Residuals(NamedTuple):

@@ -58,9 +58,6 @@ class Lid(NamedTuple):
     material: int
 
 
-_NO_MATERIAL = Material(itu="vacuum")
-
-
 @dataclass(frozen=True)
 class SceneGeometry:
     """Walls, floor and ceiling of a map in its local frame: the origin is the lower-left corner of the grid, on z = 0.
@@ -149,10 +146,7 @@ def scene_settings_of(partial: PartialMap, settings: SceneSettings | None) -> Sc
 
 def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
     """Return whether some walls have no material in settings and map."""
-    if partial.mesh is None:
-        return settings.material is None and partial.unnamed_walls > 0.0
-    named = partial.environment.known_materials(_NO_MATERIAL) != {_NO_MATERIAL}
-    return settings.material is None and partial.material is None and not named
+    return settings.material is None and bool(partial.unnamed_walls.any())
 
 
 def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw: int = 0) -> SceneGeometry:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, States, read_only
+from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
 from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
@@ -426,27 +426,26 @@ _VARIABLES = {
 class LinkSums:
     """Power of links (T, N) and line of sight, added up over blocks of paths.
 
-    `path_power` (T N, C + 1, R + 1) is by walls crossed and reflections; the last entries include larger numbers.
+    `path_power` (T N, ...) is by walls crossed, of one class or two, and reflections, up to the numbers `most`; the
+    last entries include larger numbers.
     """
 
-    def __init__(self, transmitters: int, receivers: int, walls: int = 0, reflections: int = 0) -> None:
+    def __init__(self, transmitters: int, receivers: int, *most: int) -> None:
         self._shape = transmitters, receivers
-        self.path_power = np.zeros((transmitters * receivers, walls + 1, reflections + 1))
+        self.path_power = np.zeros((transmitters * receivers, *(count + 1 for count in most)))
         self._is_direct = np.zeros(transmitters * receivers, dtype=bool)
 
     @property
     def power(self) -> Floats:
         """Power of each link (T N,)."""
-        power: Floats = self.path_power.sum(axis=(1, 2))
+        power: Floats = self.path_power.sum(axis=tuple(range(1, self.path_power.ndim)))
         return power
 
-    def add(self, paths: SolvedPaths, counted: Bools | bool = True) -> None:
-        """Add paths; walls and reflections count where `counted` (P, D) is True."""
-        link = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx
-        counts = (
-            np.minimum(np.count_nonzero((paths.interactions == kind) & counted, axis=1), most - 1)
-            for kind, most in zip((REFRACTION, REFLECTION), self.path_power.shape[1:], strict=True)
-        )
+    def add(self, paths: SolvedPaths, classes: NDArray[np.uint8] | None = None) -> None:
+        """Add paths; `classes` (P, D) are from `PartialMap.wall_classes`."""
+        link, sizes = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx, self.path_power.shape[1:]
+        counted = () if classes is None else unnamed_counts(paths.interactions, classes, len(sizes) - 1)
+        counts = (np.minimum(count, size - 1) for count, size in zip(counted, sizes, strict=True))
         np.add.at(self.path_power, (link, *counts), paths.power)
         self._is_direct[link[paths.is_direct]] = True
 
@@ -456,6 +455,12 @@ class LinkSums:
         link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
         link_state[self._is_direct] = LinkState.LOS
         return link_state.reshape(self._shape), gain_db.reshape(self._shape)
+
+
+def unnamed_counts(interactions: NDArray[np.uint8], classes: NDArray[np.uint8], walls: int = 2) -> list[Indices]:
+    """Count the crossings of walls of each class and the reflections (P,) at walls of unnamed materials."""
+    at = [(interactions == REFRACTION) & (classes == number) for number in range(1, walls + 1)]
+    return [np.count_nonzero(mask, axis=1) for mask in (*at, (interactions == REFLECTION) & (classes > 0))]
 
 
 def path_gain_db(power: Floats) -> Floats:
