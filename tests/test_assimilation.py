@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.errors import MeasurementError, PositionError
-from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation, _positive
+from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation, positive
 
 HOUSE = drawn(
     """
@@ -226,7 +226,7 @@ def test_through_walls_the_variance_is_of_process_offset_factor_and_fading_toget
     free_db = [links.free_space_db(points_m) for points_m in (measured_at, rx)]
     given, new = (np.stack([np.ones(len(each)), -95.0 - each]) for each in free_db)
     across = fit.kind.trace_std_db**2 * links.correlation(rx, fit.kind) + given.T @ fit.kind.covariance @ new
-    among = fit.kind.trace_std_db**2 * _positive(links.correlation(measured_at, fit.kind))
+    among = fit.kind.trace_std_db**2 * positive(links.correlation(measured_at, fit.kind))
     among = among + given.T @ fit.kind.covariance @ given
     explained = (across * np.linalg.solve(among + fit.noise_db**2 * np.eye(6), across)).sum(axis=0)
     total = fit.kind.trace_std_db**2 + (new * (fit.kind.covariance @ new)).sum(axis=0) + fit.fading_db**2

@@ -86,7 +86,9 @@ class TestMaps:
             expected = 100.0 * (1.0 - float(p_above.sel(x=x, y=y, method="nearest")))
             at_transmitter = bool(np.isnan(expected))  # where the nearest receiver counts
             assert at_transmitter or heard[-1].cost[row, column] == pytest.approx(expected, abs=0.51)
-        assert {0, 100} <= {*heard[-1].cost.ravel().tolist()}
+        costs = heard[-1].cost[heard[-1].cost >= 0]
+        assert costs.min() < 20
+        assert costs.max() == 100
 
     def test_update(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard()
