@@ -19,7 +19,6 @@ from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import (
@@ -148,13 +147,8 @@ class LinkModel:
 
     @property
     def predictor_of_map(self) -> AnyPredictor | None:
-        """The predictor; None on a complete map without range noise."""
-        return None if self.partial.is_complete and self._trusts_trace else self.predictor
-
-    @property
-    def _trusts_trace(self) -> bool:
-        """Return whether the trace of complete links is certain."""
-        return self.simulation.trace_settings.through_walls or self.partial.wall_noise <= LEAST_NOISE
+        """The predictor; None on a complete map."""
+        return None if self.partial.is_complete else self.predictor
 
     def update(self, partial: PartialMap) -> None:
         """Replace the map; settings, networks and kernels are kept.
@@ -264,7 +258,6 @@ class LinkModel:
     ) -> list[LinkPrediction]:
         """Predict links under each candidate; networks use the traced features."""
         traces = [LinkPrediction.of_trace(phi) for phi in features]
-        complete = complete & self._trusts_trace
         if complete.all():
             return traces
         if isinstance(self.predictor, MeanLosses):

@@ -103,7 +103,7 @@ def test_powers_are_averaged_over_geometries(tmp_path: Path) -> None:
     [
         (1.0, True, sp.TraceSettings(), simulation.GEOMETRIES),
         (0.0, True, sp.TraceSettings(), 1),
-        (1.0, False, sp.TraceSettings(), simulation.GEOMETRIES),
+        (1.0, False, sp.TraceSettings(), 1),
         (1.0, True, sp.TraceSettings(refraction=True), 1),
     ],
 )

@@ -66,9 +66,9 @@ class LinkContext(Shown):
     tx_seen, rx_seen : (N,) bool arrays
         True in observed cells.
     complete : (N,) bool array
-        The map is complete and one end is observed: without range noise, the trace is the truth.
+        The map is complete and one end is observed: the trace is the truth.
     nearly_complete : (N,) bool array
-        So is the link, or the map is nearly complete and both ends are observed: the trace is close to the truth.
+        The map is nearly complete and both ends are observed: the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
@@ -132,9 +132,9 @@ class LinkContext(Shown):
             ends = tx_m[here], rx_m[here]
             tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
             complete[here] = is_enclosed(partial, *ends)
-            nearly[here] = complete[here] | (tx_seen[here] & rx_seen[here] & partial.is_nearly_complete)
+            nearly[here] = tx_seen[here] & rx_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
-            wall_noise[here] = partial.wall_noise
+            wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
             seen = unobserved_distance_m[here] == 0.0
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
         found = (tx_seen, rx_seen, complete, nearly, walled_m, wall_noise, possible)

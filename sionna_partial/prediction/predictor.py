@@ -21,7 +21,6 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.features import (
     LinkFeatures,
     context_of,
@@ -333,8 +332,7 @@ class Predictor(Shown):
     the unobserved distance, 1 before `fit_indoor`.
 
     With `PredictorSettings.networks` other than "paper", further networks predict links whose features have a context;
-    on a complete map without range noise the trace is the prediction. The paper's networks predict features without a
-    context.
+    on a complete map the trace is the prediction. The paper's networks predict features without a context.
 
     Parameters
     ----------
@@ -514,8 +512,7 @@ class Predictor(Shown):
         if context.nearly_complete.any() and not self.settings.through_walls:
             traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
             prediction = prediction.where(context.nearly_complete, traced)
-        certain = context.complete & (self.settings.through_walls | (context.wall_noise <= LEAST_NOISE))
-        return prediction.where(certain, LinkPrediction.of_trace(features))
+        return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Return the probability that each receiver is indoors; 1 before `fit_indoor`."""
