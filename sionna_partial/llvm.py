@@ -96,10 +96,7 @@ def _loaded_library() -> LlvmLibrary:
 
 
 def _started_library() -> Path | None:
-    """Return the library that Dr.Jit runs on already; raise a BackendError if it cannot compile path kernels.
-
-    A path that the user has set, and that Dr.Jit could not load, is left to the checks of paths.
-    """
+    """Return the library that Dr.Jit runs on already; raise a BackendError if it cannot compile path kernels."""
     order, major = list(sys.modules), sys.modules["drjit"].detail.llvm_version()[0]
     found = f"LLVM {major}" if major > 0 else "no LLVM"
     if "tensorflow" in order and order.index("tensorflow") < order.index("drjit"):

@@ -167,9 +167,8 @@ class ArrayPaths:
     def _longer_m(self, rows: slice) -> Floats:
         """Return the extra length (P, A_rx, A_tx) [m] of paths between antennas over the centres.
 
-        A path of reflections is a straight line from the image of the transmitter. At a vertical edge the point of
-        diffraction follows both ends: the path is straight in the unfolded half planes. Other edges and diffuse
-        reflections keep their points.
+        Reflected paths are straight from the image of the transmitter, paths over vertical edges in the unfolded half
+        planes. Other edges and diffuse reflections keep their points.
         """
         unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
         rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
@@ -533,8 +532,7 @@ def _factors(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Return factors of receive (P, M, B) and transmit beams (P, M, C): power is the sum of products over M.
 
-    Pattern k of the receiver excites a beam by u_k at the receiver and v_k at the transmitter. The power
-    |sum_k u_k v_k|^2 has the terms |u_k|^2 |v_k|^2, and for two patterns 2 Re(u_1 u_2* v_1 v_2*).
+    The power |sum_k u_k v_k|^2 over patterns k has the terms |u_k|^2 |v_k|^2 and, for two, 2 Re(u_1 u_2* v_1 v_2*).
     """
     gains, rx, tx = arrays.plane_waves(rows)
     received = np.stack([rx @ each.T for each in at_rx.swapaxes(0, 1)], axis=1)

@@ -259,8 +259,7 @@ def _covered(areas: list[shapely.Geometry], empty: PartialMap) -> Bools:
 def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) -> Material | None:
     """Return the material of a wall, with the thickness of its layers.
 
-    It is the usual one of the type if named, else the one with the thickest layers of a known name. Drywall keeps its
-    thickness: its constants are of a whole wall with its cavity.
+    Types name it, else the thickest layers of a known name. Drywall is a whole wall with its cavity.
     """
     from ifcopenshell.util.element import get_material
 

@@ -592,8 +592,7 @@ def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None
 def _keep_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
     """Keep transparent pixels and the shade 205 unknown, in place.
 
-    With a free_thresh above 0.196 (older nav2 wrote 0.25), or an alpha channel, 205 reads as free. It stays unknown
-    where reading it as free would lose more cells than would be unknown.
+    With a free_thresh above 0.196 (older nav2 wrote 0.25), or an alpha channel, 205 would read as free.
     """
     shade, warned = 255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, []
     lost = (pixels.level == shade * pixels.per_shade + pixels.opaque) & (state == CellState.FREE)

@@ -39,7 +39,7 @@ Plans have less than 0.001 (0.01 where tilted); lidars with range noise have 0.0
 """
 
 _STRAY = (0.002, 0.01), (0.0, 0.5)
-"""Fractions of stray cells, and their noise. Maps without range noise have none, maps with 1 cm 0.01 to 0.1."""
+"""Fractions of stray cells, and their noise. Range noise of 1 cm leaves 0.01 to 0.1."""
 
 _MIN_FACES = 1000
 """Number of faces below which a few stray cells are no evidence of noise."""
@@ -131,8 +131,7 @@ def _run_lengths(wall: Bools) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Return the cells of a deep wall that no ray meets: at inner corners, and behind outer ones.
 
-    Both touch a FREE cell only by a corner. Behind an outer corner or a step of a tilted face, another FREE cell is
-    beside a face. Walls without FREE cells within `DEEP_CELLS` are deep.
+    Both touch a FREE cell only by a corner. Walls without FREE cells within `DEEP_CELLS` are deep.
     """
     inner, behind = np.zeros((2, *wall.shape), dtype=bool)
     ahead = np.arange(DEEP_CELLS)
@@ -162,10 +161,7 @@ def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
 
 
 def _stray_cells(state: States) -> float:
-    """Return the fraction of straight faces, seen from one side, behind which a single wall cell is.
-
-    Rays end in the first wall cell of an exact map.
-    """
+    """Return the fraction of straight faces, seen from one side, behind which a single wall cell is."""
     faces = stray = 0
     for turns in _TURNS:
         turned = np.pad(np.rot90(state, turns), 2, constant_values=CellState.UNKNOWN)

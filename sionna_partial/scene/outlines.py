@@ -207,8 +207,8 @@ def _indexed(ends: NDArray[np.int64]) -> _Graph:
 def _chains(graph: _Graph) -> list[NDArray[np.int64]]:
     """Split a graph into chains of points (n,) that contain every edge once.
 
-    A chain passes points with two edges, and junctions with another edge in about the same direction. Loops start and
-    end at the point farthest from their centre.
+    A chain passes junctions with another edge in about the same direction. Loops start at the point farthest from their
+    centre.
     """
     beside: list[list[int]] = [[] for _ in range(len(graph.points))]
     for a, b in graph.edges.tolist():

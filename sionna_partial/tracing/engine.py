@@ -94,8 +94,7 @@ def set_antennas(scene: Any, polarisations: int) -> None:
 class _IncoherentScene:
     """A Mitsuba scene that traces every ray for itself.
 
-    `ImageMethod` declares its rays coherent. For Embree, neighbours in a packet then decide whether a wall is hit: one
-    path in 600 was lost, and which ones depended on the other receivers.
+    `ImageMethod` declares its rays coherent: in Embree, neighbours in a packet then decide whether a wall is hit.
     """
 
     def __init__(self, scene: Any) -> None:
@@ -156,8 +155,7 @@ class _Verification:
 def _end_at_targets(buffer: Any, targets: Any) -> None:
     """Put the receiver where a path has no more interactions.
 
-    `ImageMethod` leaves images of the edge there, and `FieldCalculator` 2.2 takes the first for a point after the edge:
-    paths with fewer interactions than others in their buffer came out longer, and some dB weaker.
+    `ImageMethod` leaves images of the edge there, which `FieldCalculator` 2.2 takes for points after the edge.
     """
     import drjit as dr
     import mitsuba as mi

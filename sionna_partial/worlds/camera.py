@@ -179,8 +179,8 @@ def _ray_angles(heading_deg: float, view_deg: float, range_cells: float, apart_d
 class _Rays(NamedTuple):
     """Rays of one picture: start, believed minus true position, and angles [radian].
 
-    `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall [cells],
-    `turn` is the heading error [radian], `grazing` the sine of the smallest angle to a face with a reading.
+    `noise` is NaN without a reading, `range_cells` and `cleared_cells` limit readings and rays without a wall,
+    `grazing` is the sine of the smallest angle to a face with a reading.
     """
 
     start: tuple[float, float]
@@ -196,8 +196,7 @@ class _Rays(NamedTuple):
 class _Walk(NamedTuple):
     """A ray in one of its cells, and where it enters and leaves the cell [cells].
 
-    A ray through a corner crosses one of the two cells beside it, so that it never passes between two walls. Its part
-    of each cell is at least 1e-9 cells long, so that a distance belongs to one cell.
+    At a corner it crosses one of the two cells beside it. Parts are at least 1e-9 cells long.
     """
 
     row: int

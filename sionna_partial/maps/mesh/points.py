@@ -395,7 +395,7 @@ def _floor_and_ceiling(
 ) -> tuple[float, float | None]:
     """Return the heights of the floor below a band, by default the lowest, and of the ceiling, if any [m].
 
-    Each is the mean height of the points in its two fullest layers, since noise spreads a surface over two.
+    Both are the mean height of points in their two fullest layers.
     """
     first = int(layer.min())
     pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # pairs[k] counts the layers k and k + 1

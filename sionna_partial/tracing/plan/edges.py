@@ -411,9 +411,8 @@ def _media(building):
 def _strength(media, arrived, face, after, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
-    `arrived` and `after` are materials, cosines and number of reflections, `face` the edge's material and the cosines
-    of incidence at its faces, `path` sqrt(2 k L), the horizontal and vertical parts of the direction, and the number of
-    reflections at floor and ceiling.
+    `arrived` and `after` are materials, cosines and number of reflections, `face` is as in `_Pair`, `path` sqrt(2 k L),
+    the horizontal and vertical parts of the direction, and the reflections at floor and ceiling.
     """
     (tables, largest, flat, _), (boundary, sine, slope, bounces) = media, path
     material, cosine, j, count = arrived
@@ -549,7 +548,7 @@ def _spread(wavelength, length, onward):
 def _bounds_of_arrivals(edges, arrivals, materials, highest):
     """Return bounds (J,) of the fields of arrivals, coefficients (J, 2) of the edge's faces, and bounds (J, 360).
 
-    The last are for the power after the edge by azimuth, to be divided by the length from there and the total length.
+    The last are powers by azimuth, to be divided by the length after the edge and the total length.
     """
     most, faces = np.empty(len(arrivals.lit)), np.empty((len(arrivals.lit), 2), np.complex128)
     power, terms = np.empty((len(most), 360)), np.empty((4, 3))

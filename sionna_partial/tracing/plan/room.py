@@ -295,7 +295,7 @@ def _faces_on(plan, leg, dx, dy, length, trail):
 def _crossed_at(piece, ax, ay, dx, dy, length):
     """Return the fraction of a leg at which it crosses a piece of a wall, or -1.
 
-    A point on the leg's line counts as left of it, so that a line through a shared corner crosses one of its walls.
+    Points on the leg's line count as left of it.
     """
     px, py, qx, qy = piece[0, 0], piece[0, 1], piece[1, 0], piece[1, 1]
     side_p, side_q = dx * (py - ay) - dy * (px - ax), dx * (qy - ay) - dy * (qx - ax)
