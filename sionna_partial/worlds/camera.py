@@ -196,7 +196,7 @@ class _Rays(NamedTuple):
 class _Walk(NamedTuple):
     """A ray in one of its cells, and where it enters and leaves the cell [cells].
 
-    At a corner it crosses one of the two cells beside it. Parts are at least 1e-9 cells long.
+    At a corner it crosses one of the two cells beside it.
     """
 
     row: int
