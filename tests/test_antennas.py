@@ -214,6 +214,7 @@ def test_radiated_power(caplog: pytest.LogCaptureFixture) -> None:
     assert sp.Antenna().averaged(28e9) == sp.Antenna()
 
 
+@pytest.mark.usefixtures("command_line")
 def test_the_commands_take_antennas(tmp_path: Path) -> None:
     (tmp_path / "made.msi").write_text(MSI, encoding="ascii")
     sp.save_map(_room(), tmp_path / "room.npz")

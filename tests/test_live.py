@@ -179,6 +179,7 @@ class TestTransmitters:
             assert line in caplog.text
 
 
+@pytest.mark.usefixtures("command_line")
 def test_the_files_for_nav2_name_what_is_published() -> None:
     nav2 = Path(__file__).parents[1] / "examples" / "nav2"
     costmap = yaml.safe_load((nav2 / "nav2_params.yaml").read_text("utf-8"))["global_costmap"]["global_costmap"]

@@ -96,7 +96,9 @@ def _prepare(
     """Predict radio coverage from a robot's partial map."""
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "3")
     os.environ["MPLBACKEND"] = "agg"  # pictures are files, whatever the variable was
-    logging.getLogger("sionna_partial").addHandler(_WarningLine(logging.WARNING))
+    logger = logging.getLogger("sionna_partial")
+    if not any(isinstance(handler, _WarningLine) for handler in logger.handlers):
+        logger.addHandler(_WarningLine(logging.WARNING))
     warnings.showwarning = lambda message, *_, **__: typer.echo(
         f"warning: {opt.in_options(one_line(str(message)))}", err=True
     )
