@@ -44,7 +44,7 @@ class Listed(NamedTuple):
 
     `rx` (C,) are receivers, `bound` (C,) upper bounds of the power, infinite for the direct path, which every link
     needs. `write` returns the candidates of some rows (K,), `at_once` together. `done` is the fraction of this kind's
-    work that ends here, `unlisted` (N,) or 0 the sum of the bounds of negligible candidates.
+    work that ends here, `unlisted` (N,) or 0 the expected power of negligible candidates.
     """
 
     rx: NDArray[np.integer]
