@@ -283,6 +283,23 @@ def test_outlines_are_in_the_middle_of_noisy_walls(before: float, behind: float,
     assert shapely.distance(lines, shapely.points(shapely.segmentize(walls, 1.0).coords)).mean() < 0.25
 
 
+@pytest.mark.parametrize("angle_deg", [0, 7, 20, 45])
+@pytest.mark.parametrize("thickness", [1.5, 4.0])
+def test_wall_noise_is_of_cells_that_stick_out_of_straight_walls(angle_deg: float, thickness: float) -> None:
+    """Walls of plans may be deep and tilted, without noise, also where a doorway leads to the unknown."""
+    rng, angle = np.random.default_rng(1), np.radians(angle_deg)
+    y, x = np.mgrid[:300, :300] - 149.7
+    across = np.maximum(abs(x * np.cos(angle) + y * np.sin(angle)), abs(y * np.cos(angle) - x * np.sin(angle))) - 90.0
+    state = np.select([across < 0.0, across < thickness], [CellState.FREE, CellState.WALL], CellState.UNKNOWN)
+    state[(abs(x) < 8) & (state == CellState.WALL)] = CellState.FREE
+    found = []
+    for fraction in (0.0, 0.03, 0.1):
+        noisy = (across >= -1.0) & (across < thickness + 1.0) & (rng.random(state.shape) < fraction)
+        found.append(PartialMap(np.where(noisy, CellState.WALL, state).astype(np.uint8), 0.05).wall_noise)
+    assert found[0] == 0.0
+    assert min(found[1:]) > 0.2
+
+
 def test_niche_of_a_clean_wall_stays() -> None:
     wall = np.zeros((12, 70), dtype=bool)
     wall[2:7, 5:65] = True

@@ -21,7 +21,7 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.wall_cells import thick_walls, wall_cells
+from sionna_partial.maps.wall_cells import thick_walls, wall_noise
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -328,8 +328,8 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_noise(self) -> float:
-        """Range noise from the thickness of rough walls: 0 (exact) to 1."""
-        return wall_cells(self.state, self.resolution_m).noise
+        """Range noise from the depth of uneven walls: 0 (exact; always where the map is complete) to 1."""
+        return 0.0 if self.is_complete else wall_noise(self.state, self.resolution_m)
 
     @cached_property
     def wall_fractions(self) -> dict[Material | None, float]:

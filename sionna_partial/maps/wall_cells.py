@@ -33,19 +33,16 @@ _POST_CELLS = 3
 _ROUGH, _DEEP = 0.05, 0.3
 """Levelled cells, and wall cells behind faces, per cell of a face, from which `CleanWalls.roughness` is 1."""
 
-_RAGGED = 0.006, 0.012
-"""Fractions of ragged edges from which depth is a sign of noise, in part and in full.
-Plans have less than 0.001 (0.01 where tilted); lidars with range noise have 0.007 to 0.1.
+_FACE_CELLS = 5
+"""Length of the faces on which a cell that sticks out is a sign of range noise [cells]."""
+
+_UNEVEN = 0.004, 0.007
+"""Fractions of uneven faces from which depth is range noise, in part and in full. Plans have less than 0.005, maps
+with range noise 0.006 to 0.1.
 """
 
-_STRAY = (0.002, 0.01), (0.0, 0.5)
-"""Fractions of stray cells, and their noise. Range noise of 1 cm leaves 0.01 to 0.1."""
-
-_MIN_FACES = 1000
-"""Number of faces below which a few stray cells are no evidence of noise."""
-
-_DEPTH_M = 0.0125
-"""Depth of the wall cells behind faces at which the noise is 1 - 1/e [m]."""
+_DEPTH_M = 0.014
+"""Depth of the wall cells behind faces at which the square of the noise is 1 - 1/e [m]."""
 
 THICK_M, THICK_FRACTIONS = 0.15, (0.1, 0.9)
 """Thickness of thick walls [m], and fractions of their length between which thickness distinguishes walls."""
@@ -73,14 +70,12 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) for outlines.
 
-    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `noise` is 0 for
-    exact walls, up to 1 where range noise made them thick and rough. `roughness`, 0 to 1, counts ragged cells of
-    thick walls.
+    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `roughness`, 0 to
+    1, counts ragged cells of thick walls.
     """
 
     cells: Bools
     peeled: Bools
-    noise: float
     roughness: float
 
 
@@ -97,7 +92,6 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     wall |= _hidden_corners(wall, free)[0]
     longest = int(bridge_gap_m / resolution_m + 1e-6)
     filled = _unknown_gaps(wall, free, longest)
-    noise = max(_noise(wall | filled, free, resolution_m), float(np.interp(_stray_cells(state), *_STRAY)))
     wall, free, roughness = _levelled(wall | filled, free)
     more = _unknown_gaps(wall, free, longest)
     wall, filled = wall | more, filled | more
@@ -108,7 +102,7 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
     unseen[label[seen]] = False
     thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
-    return CleanWalls(thinned, peeled, noise, roughness)
+    return CleanWalls(thinned, peeled, roughness)
 
 
 def thick_walls(walls: Bools, counted: Bools, resolution_m: float) -> Bools:
@@ -149,48 +143,55 @@ def _hidden_corners(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     return inner, behind & ~inner
 
 
-def _noise(wall: Bools, free: Bools, resolution_m: float) -> float:
-    """Return the noise of `CleanWalls`.
+def wall_noise(state: States, resolution_m: float) -> float:
+    """Return the range noise of a map with states (ny, nx): 0 (exact) to 1.
 
-    Exact rays mark one layer of cells, noisy ones several with rough faces. Walls of plans are thick, but smooth.
+    Exact rays mark one layer of wall cells, noisy ones several, which vary along a wall. Walls of plans are deep, but
+    their faces are lattice lines.
     """
-    facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    wall = state == CellState.WALL
+    facing = wall & ndimage.binary_dilation(state == CellState.FREE, structure=_SQUARE)
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
-    ragged = np.interp(ragged_edges(wall), _RAGGED, (0.0, 1.0))
-    return float(ragged * -math.expm1(-depth_m / _DEPTH_M)) if depth_m > 0.0 else 0.0
+    depth = math.sqrt(-math.expm1(-depth_m / _DEPTH_M))
+    return depth * float(np.interp(_uneven_faces(state), _UNEVEN, (0.0, 1.0))) if depth > 0.0 else 0.0
 
 
-def _stray_cells(state: States) -> float:
-    """Return the fraction of straight faces, seen from one side, behind which a single wall cell is."""
-    faces = stray = 0
+def _uneven_faces(state: States) -> float:
+    """Return the fraction of faces where the middle cell of a lattice line sticks out, in front or behind."""
+    count = uneven = 0
     for turns in _TURNS:
-        turned = np.pad(np.rot90(state, turns), 2, constant_values=CellState.UNKNOWN)
-        free, wall, unknown = (turned == kind for kind in (CellState.FREE, CellState.WALL, CellState.UNKNOWN))
-        face = free[:, :-3] & wall[:, 1:-2]
-        face[1:-1] &= face[:-2] & face[2:]
-        behind = wall[:, 2:-1] & unknown[:, 3:]
-        alone = np.zeros_like(behind)
-        alone[1:-1] = unknown[:-2, 2:-1] & unknown[2:, 2:-1]
-        faces += int((face & (unknown[:, 2:-1] | wall[:, 2:-1])).sum())
-        stray += int((face & behind & alone).sum())
-    return stray / max(_MIN_FACES, faces)
+        front, back = _seen_faces(np.rot90(state, turns))
+        count += front.shape[1]
+        behind, before = (_is_line(line) & _sticks_out(other) for line, other in ((front, back), (back, -front)))
+        uneven += int((behind | before).sum())
+    return uneven / max(1, count)
 
 
-def ragged_edges(wall: Bools) -> float:
-    """Return the fraction of edges of walls that are shifted by one cell between two edges in line.
+def _seen_faces(state: States) -> tuple[Indices, Indices]:
+    """Return first and end columns (_FACE_CELLS, N) of walls in adjacent rows, between FREE and UNKNOWN cells."""
+    state = np.pad(state, ((1, _FACE_CELLS), (2, 2)), constant_values=CellState.UNKNOWN)
+    row, start, end = row_runs(state == CellState.WALL)
+    seen = (state[row, start - 1] == CellState.FREE) & (state[row, end] == CellState.UNKNOWN)
+    row, start, end = row[seen], start[seen], end[seen]
+    number = np.full(state.shape, -1, dtype=np.int32)
+    number[row, start] = np.arange(len(row))
+    chain = [np.arange(len(row))]
+    for ahead in range(1, _FACE_CELLS):
+        column = start[chain[-1]]
+        following = np.max([number[row + ahead, column + aside] for aside in (-1, 0, 1)], axis=0)
+        row, chain = row[following >= 0], [cells[following >= 0] for cells in (*chain, following)]
+    faces = np.array(chain)
+    return start[faces], end[faces]
 
-    Straight walls, at any tilt, have such edges only at their ends.
-    """
-    edges = ragged = 0
-    for turns in _TURNS:
-        turned = np.pad(np.rot90(wall, turns), 1)
-        edge = turned[:, :-1] & ~turned[:, 1:]
-        shifted = np.zeros_like(edge)
-        shifted[:, 1:] |= edge[:, :-1]
-        shifted[:, :-1] |= edge[:, 1:]
-        edges += int(edge.sum())
-        ragged += int((edge[:-2] & edge[2:] & ~edge[1:-1] & shifted[1:-1]).sum())
-    return ragged / max(1, edges)
+
+def _is_line(columns: Indices) -> Bools:
+    steps = np.diff(columns, axis=0)
+    return (abs(steps) <= 2).all(axis=0) & ~((steps > 0).any(axis=0) & (steps < 0).any(axis=0))
+
+
+def _sticks_out(columns: Indices) -> Bools:
+    first, before, middle, after, last = columns
+    return _is_line(np.array([first, before, after, last])) & (2 * middle - before - after == 2)
 
 
 def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:

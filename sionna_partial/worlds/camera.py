@@ -97,10 +97,10 @@ class Camera:
         """The map of the robot; a vacuum robot thins its walls."""
         if self._sensor.is_exact or self._sensor.fusion != "vacuum":
             return self.seen
-        wall = self.seen == _WALL
-        kept = wall & wall_cells(self.seen, self._cell_m).cells
+        thinned = wall_cells(self.seen, self._cell_m, bridge_gap_m=0.0).cells
         beside = ndimage.binary_dilation(self.seen == _FREE)
-        return np.where(wall & ~kept, np.where(beside, _FREE, _UNKNOWN), self.seen).astype(np.uint8)
+        without = np.where(self.seen == _WALL, np.where(beside, _FREE, _UNKNOWN), self.seen)
+        return np.where(thinned, _WALL, without).astype(np.uint8)
 
     def look(self, x: float, y: float, heading_deg: float, shift: tuple[float, float], under: Indices) -> None:
         """Add a picture taken at x, y, with the believed position `shift` from there.
