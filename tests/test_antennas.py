@@ -101,9 +101,8 @@ def test_no_gain_exceeds_its_bound() -> None:
     for direction, gain in zip(zip(x, y, z, strict=True), (np.abs(field) ** 2).sum(axis=1), strict=True):
         assert gain <= 1.001 * gain_towards(gains, *direction) + 1e-9
         assert gain_towards(gains, *direction) <= gain_at_azimuth(gains, *direction[:2])
-    first, second = (np.cos(3.0), np.sin(3.0)), (np.cos(-2.5), np.sin(-2.5))
     within = [gain_at_azimuth(gains, np.cos(angle), np.sin(angle)) for angle in np.linspace(3.0, 2 * np.pi - 2.5, 99)]
-    assert gain_between(gains, first, second) == pytest.approx(max(within))
+    assert gain_between(gains.by_azimuth, np.degrees(3.0), np.degrees(-2.5)) == pytest.approx(max(within))
 
 
 def test_a_warm_model_keeps_antennas_apart() -> None:

@@ -155,15 +155,13 @@ def gain_at_azimuth(gains, x, y):
 
 
 @njit(cache=True)
-def gain_between(gains, first, second):
-    """Return the largest gain between two horizontal directions, counterclockwise, less than half a turn apart."""
-    if len(gains.by_azimuth) == 1:
-        return 1.0
-    start = math.degrees(math.atan2(first[1], first[0]))
-    turn = (math.degrees(math.atan2(second[1], second[0])) - start) % 360.0
-    most = 0.0
-    for step in range(int(turn) + 2):
-        most = max(most, gains.by_azimuth[int(start + min(step, turn) + 720.5) % 360])
+def gain_between(by_azimuth, first_deg, second_deg):
+    """Return the largest gain between two azimuths, counterclockwise."""
+    if len(by_azimuth) == 1:
+        return by_azimuth[0]
+    turn_deg, most = (second_deg - first_deg) % 360.0, 0.0
+    for step in range(int(turn_deg) + 2):
+        most = max(most, by_azimuth[int(first_deg + min(step, turn_deg) + 720.5) % 360])
     return most
 
 

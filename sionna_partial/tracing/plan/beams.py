@@ -31,7 +31,6 @@ from sionna_partial.tracing.plan.clipping import (
     clip_cells,
     clip_nearest,
     cone_of,
-    corners_of,
     entries_in,
     move_to,
     reflect,
@@ -49,6 +48,9 @@ _BEAMS_AT_ONCE = 256
 
 _CELL_M = 1.0
 """Edge of the cells of receivers [m]."""
+
+_FAR_M = 1e6
+"""Half of the edge of a cell that contains all receivers [m]."""
 
 _ROOT_ANGLE_RAD = 0.1234567
 """Direction of the first root beam [rad]: no wall of a lattice map is parallel to it."""
@@ -89,13 +91,39 @@ class Needed(NamedTuple):
     grid: Floats
 
 
+class Sources(NamedTuple):
+    """S sources of beams between opaque walls, and the power that their receivers need.
+
+    `more` (S,) are the largest numbers of reflections. A path of length s after k reflections by perfect mirrors has at
+    most the power `power` (S, K, A) / (s (s + `before_m` (S,))), by degrees of azimuth at the source, or A = 1. Weaker
+    pairs than receivers need are left out, and their expected power is added to `unlisted` (N,).
+    """
+
+    position_m: Floats
+    more: NDArray[np.int64]
+    power: Floats
+    before_m: Floats
+    needed: Needed
+    unlisted: Floats
+
+    @classmethod
+    def equal(cls, position_m: Floats, more: int, receivers: int) -> "Sources":
+        """Return sources of which every path is needed."""
+        count, nothing = len(position_m), np.zeros(receivers)
+        needed = Needed(
+            nothing, nothing, nothing, nothing, np.zeros((1, 1)), np.array([-_FAR_M, -_FAR_M, 2.0 * _FAR_M, 1])
+        )
+        return cls(position_m, np.full(count, more), np.ones((count, more + 1, 1)), np.zeros(count), needed, nothing)
+
+
 class Beams(NamedTuple):
-    """M beams of one number of reflections.
+    """M beams of one number of `reflections`.
 
     `parent` and `piece` (M,) are as in `BeamTree`, -1 for the roots. `window` (M, 6) are the image of the transmitter
     and the ends of the window [m]. `left` (M, 2) bounds the power after reflections and after walls, `crossed` (M,) is
-    the smallest number of walls, `more` (M,) the largest number of further reflections, `sequence` (M,) numbers the
-    sequences of lines.
+    the smallest number of walls, `more` (M,) the largest number of further reflections, `origin` (M,) the number of the
+    source, `sequence` (M,) numbers the sequences of lines. A path with the azimuth a at its end leaves the source at
+    the azimuth `turn_rad` (M,) + a, or - a after an odd number of reflections.
     """
 
     parent: NDArray[np.int32]
@@ -104,7 +132,10 @@ class Beams(NamedTuple):
     left: Floats
     crossed: NDArray[np.int32]
     more: NDArray[np.int32]
+    origin: NDArray[np.int64]
+    turn_rad: Floats
     sequence: NDArray[np.int64]
+    reflections: int
 
     @classmethod
     def first(cls, sources_m: Floats, more: NDArray[np.integer], power: float) -> "Beams":
@@ -115,7 +146,8 @@ class Beams(NamedTuple):
         count = len(windows_m)
         none, left = np.full(count, -1, np.int32), np.tile([power, 1.0], (count, 1))
         crossed, reflections = np.zeros(count, np.int32), np.repeat(more, 4).astype(np.int32)
-        return cls(none, none, windows_m, left, crossed, reflections, np.arange(count) // 4)
+        origin = np.arange(count) // 4
+        return cls(none, none, windows_m, left, crossed, reflections, origin, np.zeros(count), origin, 0)
 
 
 class Task(NamedTuple):
@@ -123,8 +155,8 @@ class Task(NamedTuple):
 
     receivers: PointBins
     building: Building
-    needed: Needed
     most_transmitted: float
+    sources: Sources
 
 
 class _Beam(NamedTuple):
@@ -166,17 +198,14 @@ def needed_of(power: Floats, room: Room, wavelength_m: float) -> Needed:
     return Needed(power, *far, cells, np.array([*low, _CELL_M, cells.shape[1]]))
 
 
-def trace_beams(
-    building: Building, receivers: PointBins, sources_m: Floats, max_depth: NDArray[np.int64]
-) -> tuple[BeamTree, NDArray[np.int32]]:
-    """Find every sequence of opaque walls from sources (E, 2) with largest depths (E,) to receivers.
+def trace_beams(building: Building, receivers: PointBins, sources: Sources) -> tuple[BeamTree, NDArray[np.int32]]:
+    """Find every sequence of opaque walls from sources that receivers need.
 
     Return beams and pairs (K, 2) of beam and receiver, ordered by sequence and then receiver; a receiver has each
     sequence of wall lines once.
     """
-    nothing, beams = np.zeros(0), Beams.first(sources_m, max_depth, 1.0)
-    needed = Needed(np.zeros(len(receivers.order)), nothing, nothing, nothing, np.zeros((1, 1)), np.zeros(4))
-    tree, task, pairs = BeamTree.of(beams), Task(receivers, building, needed, 1.0), []
+    beams = Beams.first(sources.position_m, sources.more, 1.0)
+    tree, task, pairs = BeamTree.of(beams), Task(receivers, building, 1.0, sources), []
     while len(beams.parent):
         beams, pair, _ = follow(tree, beams, task)
         tree = tree.extended(beams)
@@ -185,7 +214,10 @@ def trace_beams(
 
 
 def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.int32], Floats]:
-    """Reflect the last beams of a tree; return the new ones, pairs as in `trace_beams`, and bounds (K,) after walls."""
+    """Reflect the last beams of a tree; return the new ones, pairs as in `trace_beams`, and bounds (K,) of their power.
+
+    Through walls, the bounds are fractions left after walls.
+    """
     building, count, before = task.building, len(beams.parent), len(tree.parent) - len(beams.parent)
     at_once = _BEAMS_AT_ONCE if building.limits.walls else max(1, count)
 
@@ -196,18 +228,22 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
     found = in_order(followed, starts) if len(starts) > 1 else map(followed, starts)
     children, pair, through = zip((nothing, np.zeros((0, 2), np.int32), np.zeros(0)), *found, strict=True)
     columns = [np.concatenate(column) for column in zip(*children, strict=True)]
-    line, lines = building.plan.line[columns[1]], int(building.plan.line.max(initial=0)) + 1
-    _, sequence = np.unique(beams.sequence[columns[0] - before] * lines + line, return_inverse=True)
+    above, line, lines = columns[0] - before, building.plan.line[columns[1]], int(building.plan.line.max(initial=0)) + 1
+    _, sequence = np.unique(beams.sequence[above] * lines + line, return_inverse=True)
+    along = building.plan.pieces_m[columns[1], 1] - building.plan.pieces_m[columns[1], 0]
+    twice = 2.0 * (-1.0) ** beams.reflections * np.arctan2(along[:, 1], along[:, 0])
+    turn_rad = (beams.turn_rad[above] + twice) % (2.0 * math.pi)
     pairs, receivers = np.concatenate(pair), max(1, len(task.receivers.order))
     _, once = np.unique(beams.sequence[pairs[:, 0] - before] * receivers + pairs[:, 1], return_index=True)
-    return Beams(*[*columns, sequence]), pairs[once], np.concatenate(through)[once]
+    columns += [beams.origin[above], turn_rad, sequence]
+    return Beams(*columns, beams.reflections + 1), pairs[once], np.concatenate(through)[once]
 
 
 @njit(cache=True, nogil=True)
 def _follow_beams(beams, before, first, stop, task):
     layers, building = _layers_of(task.building.plan), task.building
     plan, opaque, room, receivers = building.plan, building.limits.walls == 0, building.room, task.receivers
-    pieces_m, low, scratch = plan.pieces_m, plan.low, layers.clipped
+    pieces_m, low, scratch, sources = plan.pieces_m, plan.low, layers.clipped, task.sources
     parent, piece = np.empty(64, np.int32), np.empty(64, np.int32)
     window, left = np.empty((64, 6)), np.empty((64, 2))
     crossed, more = np.empty(64, np.int32), np.empty(64, np.int32)
@@ -222,10 +258,9 @@ def _follow_beams(beams, before, first, stop, task):
         walls = _clip_walls(plan, beam.window, own, opaque, layers)
         if opaque:
             span, wall, windows = _look(walls, plan.line, low, layers, span, wall)
-            for i in range(windows):
-                if wall[i, 0] < 0 or not low[scratch.wall[wall[i, 0]]]:
-                    corner = corners_of(beam.window, own >= 0, span[i])
-                    pair, through, used = add_points(corner, before + k, receivers, pair, through, used)
+            view, strength = (span, wall, windows, scratch.wall, low), _strength_of(beams, k, sources)
+            pairs = pair, through, used
+            pair, through, used = add_points(beam.window, before + k, view, receivers, strength, pairs)
         else:
             span, wall, windows = _lay(beam, walls, task, layers, (span, wall, np.int64(0)))
             if own >= 0:
@@ -238,11 +273,13 @@ def _follow_beams(beams, before, first, stop, task):
             ends = (part[0], part[1], part[2], part[3]) if opaque else _piece_of(layers, c, part)
             if c < 0 or not reflect(beam.window, ends, pieces_m[scratch.wall[c]], new):
                 continue
-            reflected, behind = (1.0, 1.0) if opaque else (part[2], part[3])
-            if own < 0 and not opaque:
-                x, y = beam.window[0], beam.window[1]
-                sides = (new[4] - x, new[5] - y), (new[2] - x, new[3] - y)
-                reflected *= gain_between(room.gains, *sides) / room.gains.largest
+            reflected, behind = (beam.reflected, 1.0) if opaque else (part[2], part[3])
+            if opaque:
+                reflected *= _most_reflected(new, sources.before_m[beams.origin[k]], scratch.wall[c], building)
+                if further == 1 and not _is_last_needed(beams, k, new, reflected, sources):
+                    continue
+            elif own < 0:
+                reflected *= gain_between(room.gains.by_azimuth, *_sides(beams, k, new)) / room.gains.largest
             if not (opaque or _is_needed(_Beam(new, reflected, behind, wall[i, 1], further - 1), task)):
                 continue
             parent[count], piece[count], crossed[count] = before + k, scratch.wall[c], wall[i, 1]
@@ -250,6 +287,41 @@ def _follow_beams(beams, before, first, stop, task):
             count += 1
     children = parent[:count], piece[:count], window[:count], left[:count], crossed[:count], more[:count]
     return children, pair[:used], through[:used]
+
+
+@njit(cache=True)
+def _strength_of(beams, k, sources):
+    """Return all that decides the power of a beam at receivers, as for `add_points`."""
+    source, sign = beams.origin[k], 1.0 if beams.reflections % 2 == 0 else -1.0
+    arrays = sources.power[source, beams.reflections], sources.needed.power, sources.unlisted
+    return arrays, (beams.left[k, 0], sources.before_m[source], sign, beams.turn_rad[k]), beams.piece[k] >= 0
+
+
+@njit(cache=True)
+def _sides(beams, k, window):
+    """Return the azimuths at the source [degrees] between which a window is seen by a beam, counterclockwise."""
+    x, y, sign = beams.window[k, 0], beams.window[k, 1], 1.0 if beams.reflections % 2 == 0 else -1.0
+    first = np.degrees(sign * np.arctan2(window[5] - y, window[4] - x) + beams.turn_rad[k])
+    second = np.degrees(sign * np.arctan2(window[3] - y, window[2] - x) + beams.turn_rad[k])
+    return (first, second) if sign > 0.0 else (second, first)
+
+
+@njit(cache=True)
+def _is_last_needed(beams, k, window, reflected, sources):
+    source = beams.origin[k]
+    most = gain_between(sources.power[source, beams.reflections + 1], *_sides(beams, k, window))
+    before_m = sources.before_m[source]
+    return _reaches(window, _window_distance(window), reflected * most, before_m, sources.needed)
+
+
+@njit(cache=True)
+def _most_reflected(window, before_m, piece, building):
+    """Return the largest fraction of power that the window of a new beam reflects."""
+    ax, ay, bx, by = window[2] - window[0], window[3] - window[1], window[4] - window[0], window[5] - window[1]
+    far, length = max(np.hypot(ax, ay), np.hypot(bx, by)), before_m + _window_distance(window)
+    cosine = (ax * by - ay * bx) / (np.hypot(ax - bx, ay - by) * far)
+    flat = length / np.hypot(length, 2.0 * building.room.height_m)
+    return building.materials.most_reflected[building.material[piece], int(cosine * flat * COSINES)]
 
 
 @njit(cache=True)
@@ -405,7 +477,7 @@ def _lay_one(beam, i, active, task, layers, windows):
         layers.wall[i, j], layers.left[i, j], layers.crossed[i, j] = c, 0.0, crossed
         layers.depth[i] = j + 1
         total = beam.reflected * left * (task.most_transmitted if crossed == 0 else 1.0)
-        if not matters(total * discount, near, task.needed):
+        if not matters(total * discount, near, task.sources.needed):
             break
         rays = (x_0, y_0, cos_0, before_0, r_0), (x_1, y_1, cos_1, before_1, r_1)
         inside = may_be_same and are_in_wall(interior, beam.window[0], beam.window[1], rays)
@@ -413,7 +485,7 @@ def _lay_one(beam, i, active, task, layers, windows):
         if beam.more > 0 and not ((inside and j > 0) or _is_solid(pieces, solid, beam.window, piece)):
             flat = near / np.hypot(near, 2.0 * task.building.room.height_m)
             part = most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
-            if matters(part * total * next_discount, near, task.needed):
+            if matters(part * total * next_discount, near, task.sources.needed):
                 new = t0, t1, part * beam.reflected, left, crossed
                 windows = _extend(layers, plan_line, of_piece, c, new, windows)
         if inside and j == 0 and not low[piece]:
@@ -475,11 +547,11 @@ def _is_needed(beam, task):
     order = limits.reflections - beam.more
     total = beam.reflected * beam.left * (task.most_transmitted if beam.crossed == 0 else 1.0)
     near = max(_window_distance(beam.window), 1e-6)
-    if not matters(total * discount_after(limits, order), near, task.needed):
+    if not matters(total * discount_after(limits, order), near, task.sources.needed):
         return False
-    if beam.more > 0 and matters(total * discount_after(limits, order + 1), near, task.needed):
+    if beam.more > 0 and matters(total * discount_after(limits, order + 1), near, task.sources.needed):
         return True
-    return _reaches(beam.window, near, total * discount_after(limits, order), task.needed)
+    return _reaches(beam.window, near, total * discount_after(limits, order), 0.0, task.sources.needed)
 
 
 @njit(cache=True)
@@ -493,7 +565,7 @@ def _window_distance(beam):
 
 
 @njit(cache=True)
-def _reaches(beam, near, left, needed):
+def _reaches(beam, near, left, before_m, needed):
     """Return whether a beam would matter to any receiver behind its window without walls."""
     x0, y0, edge, (rows, columns) = needed.grid[0], needed.grid[1], needed.grid[2], needed.cells.shape
     corner = cone_of(beam, True, needed.grid, rows)
@@ -507,7 +579,7 @@ def _reaches(beam, near, left, needed):
         for column in range(first, last + 1):
             x, y = x0 + (column + 0.5) * edge - beam[0], y0 + (row + 0.5) * edge - beam[1]
             length = max(near, np.hypot(x, y) - 0.7072 * edge)
-            if left >= needed.cells[row, column] * length * length:
+            if left >= needed.cells[row, column] * length * (length + before_m):
                 return True
     return False
 
@@ -519,9 +591,9 @@ def _add_pairs(beam, number, count, task, layers, pairs):
     ax, ay, bx, by = window[2] - window[0], window[3] - window[1], window[4] - window[0], window[5] - window[1]
     area, first, second, width = ax * by - ay * bx, np.hypot(ax, ay), np.hypot(bx, by), np.hypot(ax - bx, ay - by)
     corner = cone_of(window, True, receivers.grid, (len(receivers.start) - 1) // int(receivers.grid[3]))
-    from_row, to_row = rows_in(corner, receivers)
+    from_row, to_row = rows_in(corner, receivers.start, receivers.grid)
     for row in range(from_row, to_row):
-        begin, end = entries_in(corner, receivers, row)
+        begin, end = entries_in(corner, receivers.start, receivers.grid, row)
         for i in range(begin, end):
             ex, ey = receivers.points_m[i, 0] - window[0], receivers.points_m[i, 1] - window[1]
             alpha, beta = (ex * by - ey * bx) / area, (ax * ey - ay * ex) / area
@@ -531,7 +603,7 @@ def _add_pairs(beam, number, count, task, layers, pairs):
             if r <= 0.0 or (r - 1.0) * area < -TOLERANCE_M * width:  # r may be 0 where the image is close to its wall
                 continue
             rx = receivers.order[i]
-            least = task.needed.power[rx] * (ex * ex + ey * ey) / beam.reflected
+            least = task.sources.needed.power[rx] * (ex * ex + ey * ey) / beam.reflected
             if beam.left < least:
                 continue
             t, aside = beta / r, TOLERANCE_M / (r * width)

@@ -18,6 +18,9 @@ _STRIP_CELLS = 6.0
 _FAR_M = 1e6
 """Length at which beams that hit nothing are cut off [m], fixed: no receiver depends on others."""
 
+EXPECTED = 0.5
+"""Expected power of unlisted paths, relative to their rough bounds."""
+
 THINNEST = 1e-12
 """Smallest part of a beam's width between two edges."""
 
@@ -45,13 +48,13 @@ def scratch_of(plan):
 
 
 @njit(cache=True)
-def _clip(beam, wall, reflected):
+def _clip(beam, pieces_m, wall, reflected):
     """Return the part of a wall in a beam, beyond its window: (t0, w0, t1, w1) with w = 1 / r; t0 >= t1 if none."""
     ax, ay = beam[2] - beam[0], beam[3] - beam[1]
     bx, by = beam[4] - beam[0], beam[5] - beam[1]
     area = ax * by - ay * bx
-    px, py = wall[0, 0] - beam[0], wall[0, 1] - beam[1]
-    qx, qy = wall[1, 0] - beam[0], wall[1, 1] - beam[1]
+    px, py = pieces_m[wall, 0, 0] - beam[0], pieces_m[wall, 0, 1] - beam[1]
+    qx, qy = pieces_m[wall, 1, 0] - beam[0], pieces_m[wall, 1, 1] - beam[1]
     alpha0, beta0 = (px * by - py * bx) / area, (ax * py - ay * px) / area
     alpha1, beta1 = (qx * by - qy * bx) / area, (ax * qy - ay * qx) / area
     nearest = 1.0 + 1e-9 if reflected else 1e-9
@@ -110,48 +113,48 @@ def _leaves(corner, low, high, axis, first, second):
 
 @njit(cache=True)
 def clip_cells(plan, beam, own, corner, count, scratch):
-    visit = scratch.visit[-1]
-    first, last = rows_in(corner, plan.cells)
+    pieces_m, lines, start, grid, piece = plan.pieces_m, plan.line, plan.cells.start, plan.cells.grid, plan.cells.piece
+    found, wall_of, order, visited, visit = scratch.found, scratch.wall, scratch.order, scratch.visit, scratch.visit[-1]
+    first, last = rows_in(corner, start, grid)
     for row in range(first, last):
-        begin, end = entries_in(corner, plan.cells, row)
+        begin, end = entries_in(corner, start, grid, row)
         for entry in range(begin, end):
-            wall = plan.cells.piece[entry]
-            if scratch.visit[wall] == visit:
+            wall = piece[entry]
+            if visited[wall] == visit:
                 continue
-            scratch.visit[wall] = visit
-            if own >= 0 and plan.line[wall] == plan.line[own]:
+            visited[wall] = visit
+            if own >= 0 and lines[wall] == lines[own]:
                 continue
-            t0, w0, t1, w1 = _clip(beam, plan.pieces_m[wall], own >= 0)
+            t0, w0, t1, w1 = _clip(beam, pieces_m, wall, own >= 0)
             if t1 - t0 > 1e-12:
-                scratch.found[count, 0], scratch.found[count, 1] = t0, w0
-                scratch.found[count, 2], scratch.found[count, 3] = t1, w1
-                scratch.wall[count] = wall
+                found[count, 0], found[count, 1], found[count, 2], found[count, 3] = t0, w0, t1, w1
+                wall_of[count] = wall
                 k = count
-                while k > 0 and scratch.found[scratch.order[k - 1], 0] > t0:
-                    scratch.order[k] = scratch.order[k - 1]
+                while k > 0 and found[order[k - 1], 0] > t0:
+                    order[k] = order[k - 1]
                     k -= 1
-                scratch.order[k] = count
+                order[k] = count
                 count += 1
     return count
 
 
 @njit(cache=True)
-def rows_in(corner, bins):
-    y0, edge, rows = bins.grid[1], bins.grid[2], (len(bins.start) - 1) // int(bins.grid[3])
+def rows_in(corner, start, grid):
+    y0, edge, rows = grid[1], grid[2], (len(start) - 1) // int(grid[3])
     low = min(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) - TOLERANCE_M
     high = max(corner[0, 1], corner[1, 1], corner[2, 1], corner[3, 1]) + TOLERANCE_M
     return max(0, int(np.floor((low - y0) / edge))), min(rows, int(np.floor((high - y0) / edge)) + 1)
 
 
 @njit(cache=True)
-def entries_in(corner, bins, row):
-    x0, y0, edge, columns = bins.grid[0], bins.grid[1], bins.grid[2], int(bins.grid[3])
+def entries_in(corner, start, grid, row):
+    x0, y0, edge, columns = grid[0], grid[1], grid[2], int(grid[3])
     left, right = span_in_strip(corner, y0 + row * edge - TOLERANCE_M, y0 + (row + 1) * edge + TOLERANCE_M)
     if left > right:
         return 0, 0
-    start = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
-    stop = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
-    return (bins.start[row * columns + start], bins.start[row * columns + stop + 1]) if start <= stop else (0, 0)
+    first = max(0, int(np.floor((left - TOLERANCE_M - x0) / edge)))
+    last = min(columns - 1, int(np.floor((right + TOLERANCE_M - x0) / edge)))
+    return (start[row * columns + first], start[row * columns + last + 1]) if first <= last else (0, 0)
 
 
 @njit(cache=True)
@@ -240,51 +243,64 @@ def cone_of(beam, reflected, grid, rows):
 
 
 @njit(cache=True)
-def corners_of(beam, reflected, piece):
-    """Return the corners (4, 2) of a beam between its window and one piece of its view, cut off far away."""
+def _write_corners(beam, reflected, span, window, corner):
+    """Write the corners (4, 2) of a beam between its window and one window of its view, cut off far away."""
     sx, sy = beam[0], beam[1]
-    corner = np.empty((4, 2))
     for k in range(2):
-        t, w = piece[2 * k], piece[2 * k + 1]
+        t, w = span[window, 2 * k], span[window, 2 * k + 1]
         dx = (1.0 - t) * (beam[2] - sx) + t * (beam[4] - sx)
         dy = (1.0 - t) * (beam[3] - sy) + t * (beam[5] - sy)
-        far = _FAR_M / np.hypot(dx, dy)
+        far = _FAR_M / np.sqrt(dx * dx + dy * dy)
         r_far = 1.0 / w if w * far > 1.0 else far
         r_near = 1.0 if reflected else 0.0
         corner[k, 0], corner[k, 1] = sx + r_near * dx, sy + r_near * dy
         corner[3 - k, 0], corner[3 - k, 1] = sx + r_far * dx, sy + r_far * dy
-    return corner
 
 
 @njit(cache=True)
-def _inward_edges(corner):
-    """Return unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
-    normal, offset = np.empty((4, 2)), np.empty(4)
+def _write_inward(corner, inward):
+    """Write unit inward normals and offsets of a clockwise quadrilateral; an edge of no length bounds nothing."""
     for k in range(4):
-        normal[k, 0], normal[k, 1], offset[k] = 0.0, 0.0, -1.0
+        inward[k, 0], inward[k, 1], inward[k, 2] = 0.0, 0.0, -1.0
         dx, dy = corner[(k + 1) % 4, 0] - corner[k, 0], corner[(k + 1) % 4, 1] - corner[k, 1]
-        length = np.hypot(dx, dy)
+        length = np.sqrt(dx * dx + dy * dy)
         if length > 0.0:
-            normal[k, 0], normal[k, 1] = dy / length, -dx / length
-            offset[k] = normal[k, 0] * corner[k, 0] + normal[k, 1] * corner[k, 1]
-    return normal, offset
+            inward[k, 0], inward[k, 1] = dy / length, -dx / length
+            inward[k, 2] = inward[k, 0] * corner[k, 0] + inward[k, 1] * corner[k, 1]
 
 
 @njit(cache=True)
-def add_points(corner, number, receivers, pair, through, used):
-    points, (normal, offset) = receivers.points_m, _inward_edges(corner)
-    first, last = rows_in(corner, receivers)
-    for row in range(first, last):
-        begin, end = entries_in(corner, receivers, row)
-        for i in range(begin, end):
-            inside = True
-            for k in range(4):
-                side = normal[k, 0] * points[i, 0] + normal[k, 1] * points[i, 1] - offset[k]
-                if side < -TOLERANCE_M:
-                    inside = False
-                    break
-            if inside:
-                pair, through = grow(pair, used + 1), grow(through, used + 1)
-                pair[used, 0], pair[used, 1], through[used] = number, receivers.order[i], 1.0
+def add_points(beam, number, view, receivers, strength, pairs):
+    """Pair a beam with the receivers that see it at high walls, and need it.
+
+    `view` are the windows, their walls and their number, and `strength` is from `beams._strength_of`.
+    """
+    (span, wall, windows, walls, low), (points, order, start, grid) = view, receivers
+    (by_azimuth, needed, unlisted), (reflected, before_m, sign, turn_rad), is_reflected = strength
+    (pair, through, used), azimuths, corner, inward = pairs, len(by_azimuth), np.empty((4, 2)), np.empty((4, 3))
+    for window in range(windows):
+        if wall[window, 0] >= 0 and low[walls[wall[window, 0]]]:
+            continue
+        _write_corners(beam, is_reflected, span, window, corner)
+        _write_inward(corner, inward)
+        first, last = rows_in(corner, start, grid)
+        for row in range(first, last):
+            begin, end = entries_in(corner, start, grid, row)
+            for i in range(begin, end):
+                x, y, k = points[i, 0], points[i, 1], 0
+                while k < 4 and inward[k, 0] * x + inward[k, 1] * y - inward[k, 2] >= -TOLERANCE_M:
+                    k += 1
+                if k < 4:
+                    continue
+                rx, dx, dy = order[i], x - beam[0], y - beam[1]
+                length, azimuth_rad = np.sqrt(dx * dx + dy * dy), sign * np.arctan2(dy, dx) + turn_rad
+                power = reflected * by_azimuth[int(np.degrees(azimuth_rad) + 360.5) % azimuths]
+                power /= length * (length + before_m)
+                if power < needed[rx]:
+                    unlisted[rx] += EXPECTED * power
+                    continue
+                if used == len(pair):
+                    pair, through = grow(pair, used + 1), grow(through, used + 1)
+                pair[used, 0], pair[used, 1], through[used] = number, rx, power
                 used += 1
     return pair, through, used

@@ -20,7 +20,8 @@ from sionna_partial.scene.outlines import bin_points, grow
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION
 from sionna_partial.tracing.paths import Candidates, Wedges
-from sionna_partial.tracing.plan.beams import BeamTree, trace_beams
+from sionna_partial.tracing.plan.beams import BeamTree, Sources, needed_of, trace_beams
+from sionna_partial.tracing.plan.clipping import EXPECTED
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, unfold
 from sionna_partial.tracing.plan.room import (
     Building,
@@ -65,11 +66,14 @@ _NEAR_M = 1e-3
 _ASIDE_M = 1e-3
 """Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
-_NEGLIGIBLE = 3e-5
+_NEGLIGIBLE = 1e-4
 """Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
 
-_EXPECTED, _HALF_DEGREE = 0.5, 0.0044
-"""Expected power of unlisted paths, relative to their rough bounds, and sine of half of half a degree."""
+_UNSEEN = 1e-18
+"""Power of a path below which no gain, at least -150 dB, shows it."""
+
+_HALF_DEGREE = 0.0044
+"""Sine of half of half a degree."""
 
 _FLAT_RAD = 1e-3
 """Smallest angle between walls and a straight line at an edge [rad]."""
@@ -134,44 +138,33 @@ class _Edges(NamedTuple):
         return cls(wedges.edge_m, face_rad, exterior_rad, flat, constants, material)
 
 
-class _EdgeTask(NamedTuple):
-    """Beams from a group of edges, their pairs with receivers, and the largest number of reflections of a path.
+class _Departures(NamedTuple):
+    """K paths from edges to receivers.
 
-    `most`, `faces` and `power` are from `_bounds_of_arrivals`; paths rise `highest_m` at most.
+    `edge` and `rx` (K,) are their ends, `reflections` (K,) their number, too large where a leg is too short or inside
+    the wedge, `length_m` (K,) the length in the plan. `material` and `cosine` (K, R) are as in `_Arrivals`, `most` (K,)
+    bounds the field after these walls, `azimuth_deg` and `angle` (K, 4) are the direction at the edge, from x in whole
+    degrees and as in `wedge_angle`.
     """
 
-    tree: BeamTree
-    pairs: NDArray[np.int32]
-    group: Indices
-    edges: _Edges
-    arrivals: _Arrivals
+    edge: NDArray[np.int64]
+    rx: NDArray[np.int64]
+    reflections: NDArray[np.int64]
+    length_m: Floats
+    material: NDArray[np.int64]
+    cosine: Floats
+    most: Floats
+    azimuth_deg: NDArray[np.int64]
+    angle: Floats
+
+
+class _Bounds(NamedTuple):
+    """Bounds of arrivals from `_bounds_of_arrivals`, and the largest rise of a path [m]."""
+
     most: Floats
     faces: NDArray[np.complex128]
     power: Floats
     highest_m: float
-    building: Building
-    reflections: int
-
-
-class _Pair(NamedTuple):
-    """Numbers of a pair of a beam from an edge and a receiver, of the edge, and of the receiver.
-
-    `left` is the number of further reflections allowed, `after` the number of walls that reflect after the edge,
-    `onward_m` this leg's length, `azimuth_rad` and `angle_rad` its direction, from x and from the 0-face; `utd` and
-    `material` as in `_Edges`.
-    """
-
-    number: np.int32
-    edge: np.int64
-    rx: np.int32
-    left: np.int64
-    after: np.int64
-    onward_m: float
-    azimuth_rad: float
-    angle_rad: float
-    exterior_rad: float
-    utd: tuple[float, float, float, float, float]
-    material: tuple[np.int64, np.int64]
 
 
 def find_wedges(geometry: SceneGeometry, *, open_ends: bool) -> Wedges:
@@ -245,34 +238,52 @@ class DiffractionCandidates(_EdgeCandidates):
     def listed(self, found: Floats) -> Iterator[Listed]:
         if self._reflections < 0 or not len(self._wedges.edge_m):
             return
-        plan, room, edges = self._geometry.plan, self._building.room, self._edges
-        receivers, walls = bin_points(room.rx_m[:, :2]), np.array([self._walls_a_side])
-        tree_and_pairs = trace_beams(self._building, bin_points(edges.position_m), room.tx_m[None, :2], walls)
-        arrivals = self._arrivals(*tree_and_pairs, self._walls_a_side)
+        room, edges = self._building.room, self._edges
+        receivers, to_edges = bin_points(room.rx_m[:, :2]), bin_points(edges.position_m)
+        transmitter = Sources.equal(room.tx_m[None, :2], self._walls_a_side, len(edges.position_m))
+        arrivals = self._arrivals(*trace_beams(self._building, to_edges, transmitter), self._walls_a_side)
         materials, heights = self._building.materials, _heights(room, self._reflections + 1)
-        reached, negligible, highest_m = np.flatnonzero(np.diff(arrivals.start)), _NEGLIGIBLE * found, heights.max()
+        reached, highest_m = np.flatnonzero(np.diff(arrivals.start)), heights.max()
+        needed = needed_of(np.maximum(_NEGLIGIBLE * found, _UNSEEN if found.any() else 0.0), room, 4.0 * np.pi)
         if not len(reached):
             return
-        most, faces, power = _bounds_of_arrivals(edges, arrivals, materials, highest_m)
-        bounds = most, faces, power, highest_m
-        fewest = np.minimum.reduceat(arrivals.reflections, arrivals.start[reached])
-        onward = np.minimum(self._walls_a_side, self._reflections - fewest)
+        bounds = _Bounds(*_bounds_of_arrivals(edges, arrivals, materials, highest_m), highest_m)
+        start = arrivals.start[reached]
+        onward = np.arange(self._walls_a_side + 1)
+        possible = arrivals.reflections[:, None] <= self._reflections - onward
+        sums = [np.add.reduceat(bounds.power * some[:, None], start) for some in possible.T]
+        columns = (
+            edges.position_m[reached],
+            np.logical_or.reduceat(possible, start).sum(axis=1) - 1,
+            np.stack(sums, axis=1),
+            np.minimum.reduceat(arrivals.length_m, start),
+        )
         groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
         def of_group(number: int) -> Listed:
-            group, more = reached[groups[number]], onward[groups[number]]
-            tree, pairs = trace_beams(self._building, receivers, edges.position_m[group], more)
-            task = _EdgeTask(tree, pairs, group, edges, arrivals, *bounds, self._building, self._reflections)
-            pair, joined, bound, unlisted = _list_joined(task, heights, negligible, trail_of(plan))
-            write = partial(self._written, task, pair, joined)
+            unlisted, group = np.zeros(len(found)), groups[number]
+            sources = Sources(*(column[group] for column in columns), needed, unlisted)
+            tree, pairs = trace_beams(self._building, receivers, sources)
+            departures = _depart(tree, pairs, reached[group], edges, self._building, highest_m, self._reflections)
+            listing = edges, arrivals, departures, bounds
+            pair, joined, bound = _list_joined(self._building, listing, heights, needed.power, unlisted)
+            write = partial(self._written, tree, pairs, arrivals, pair, joined)
             return Listed(pairs[pair, 1], bound, write, (number + 1) / len(groups), unlisted)
 
         yield from in_order(of_group, range(len(groups)))
 
-    def _written(self, task: _EdgeTask, pair: Indices, joined: NDArray[np.int32], rows: Indices) -> Candidates:
-        size, (node, rx) = task.reflections + 1, task.pairs[pair[rows]].T.copy()
+    def _written(
+        self,
+        tree: BeamTree,
+        pairs: NDArray[np.int32],
+        arrivals: _Arrivals,
+        pair: NDArray[np.int32],
+        joined: NDArray[np.int32],
+        rows: Indices,
+    ) -> Candidates:
+        size, (node, rx) = self._reflections + 1, pairs[pair[rows]].T.copy()
         arrival, variant = np.divmod(joined[rows], 2 * size)
-        return self._candidates(task.tree, task.arrivals, (node, rx, arrival, variant), size)
+        return self._candidates(tree, arrivals, (node, rx, arrival, variant), size)
 
 
 class CrossedEdgeCandidates(_EdgeCandidates):
@@ -344,13 +355,13 @@ def _unfold_all(tree, pairs, edges, building, reflections, trail):
         if count[i] > 0:
             to_x, to_y = points[i, 0, 0], points[i, 0, 1]
         x, y, to_x, to_y = x - target[0], y - target[1], to_x - room.tx_m[0], to_y - room.tx_m[1]
-        lit[i], good[i] = _outside(edges.normals[edge], x, y)
+        lit[i], good[i] = _outside(edges.normals, edge, x, y)
         good[i] &= np.hypot(x, y) > shortest_m
         if good[i] and building.limits.walls > 0:
             entries, crossed[i] = _to_edge(building, target, length[i], length[i], trail)
             good[i] = entries >= 0 and crossed[i] <= building.limits.walls
             left[i] = _leg_power(trail, max(entries, 0), building)
-        from_0 = _angle_rad(edges.face_rad[edge], exterior, x, y)
+        from_0 = _angle_rad(edges.face_rad[edge], exterior, np.arctan2(y, x))
         angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = wedge_angle(from_0, exterior)
         for k, from_face in enumerate((from_0, exterior - from_0)):
             faces[i, k] = max(0.0, np.sin(from_face)) if from_face <= np.pi else -1.0
@@ -387,80 +398,131 @@ def _from_edge(building, origin, target, length, total, count, trail):
 
 
 @njit(cache=True)
-def _outside(normals, x, y):
-    """Return whether a point, relative to the edge, is in front of the 0-face, and of either face."""
-    first = normals[0] * x + normals[1] * y > _EXTERIOR_M
-    return first, first or normals[2] * x + normals[3] * y > _EXTERIOR_M
+def _outside(normals, edge, x, y):
+    """Return whether a point, relative to an edge, is in front of the 0-face, and of either face."""
+    first = normals[edge, 0] * x + normals[edge, 1] * y > _EXTERIOR_M
+    return first, first or normals[edge, 2] * x + normals[edge, 3] * y > _EXTERIOR_M
 
 
 @njit(cache=True)
-def _angle_rad(face_rad, exterior_rad, x, y):
+def _angle_rad(face_rad, exterior_rad, azimuth_rad):
     """Return the angle of a direction from the 0-face of an edge; rounding may turn 0 into 2 pi."""
-    angle = (np.arctan2(y, x) - face_rad) % (2 * np.pi)
+    angle = (azimuth_rad - face_rad) % (2 * np.pi)
     return 0.0 if angle > 0.5 * exterior_rad + np.pi else angle
 
 
 @njit(cache=True)
-def _media(building):
-    materials = building.materials
-    tables = materials.reflection, materials.transition
-    return tables, materials.largest, building.room.flat_material, materials.wavelength_m
-
-
-@njit(cache=True, forceinline=True)
-def _strength(media, arrived, face, after, terms, path):
+def _strength(materials, walls, numbers, face, terms, path):
     """Return the bound of a vertical field after reflections and the diffraction, without the spread of the wave.
 
-    `arrived` and `after` are materials, cosines and number of reflections, `face` is as in `_Pair`, `path` sqrt(2 k L),
-    the horizontal and vertical parts of the direction, and the reflections at floor and ceiling.
+    `walls` are materials and cosines of arrivals and departures, `numbers` an arrival, a departure and their numbers of
+    reflections, `face` the material of the wedge and the cosines at its faces, `path` sqrt(2 k L), the horizontal and
+    vertical parts of the direction, the reflections at floor and ceiling, and the material there.
     """
-    (tables, largest, flat, _), (boundary, sine, slope, bounces) = media, path
-    material, cosine, j, count = arrived
+    (reflection, transition, largest), (boundary, sine, slope, bounces, flat) = materials, path
+    (material, cosine, material_after, cosine_after), (j, i, before, after) = walls, numbers
     field = 1.0, 0.0, 1.0
-    for k in range(count):
+    for k in range(before):
         field = at_wall(largest, material[j, k], cosine[j, k], sine, slope, field)
-    field = at_edge(tables, face[0], terms, boundary, (face[1], face[2]), sine, slope, field)
-    material_after, cosine_after, count = after
-    for k in range(count):
-        field = at_wall(largest, material_after[k], cosine_after[k], sine, slope, field)
+    field = at_edge((reflection, transition), face[0], terms, boundary, (face[1], face[2]), sine, slope, field)
+    for k in range(after):
+        field = at_wall(largest, material_after[i, k], cosine_after[i, k], sine, slope, field)
     return at_flats(largest, flat, slope, bounces, field)
 
 
 @njit(cache=True, nogil=True)
-def _list_joined(task, heights, negligible, trail):
-    """Join paths to edges and from them: pairs, arrivals with variants, and bounds (C,); unlisted (N,).
+def _depart(tree, pairs, group, edges, building, highest, most_reflections):
+    (parent, piece, source_m), (position_m, face_rad, exterior_rad, normals, _, _) = tree, edges
+    rx_m, pieces_m, largest, materials = (
+        building.room.rx_m,
+        building.plan.pieces_m,
+        building.materials.largest,
+        building.material,
+    )
+    size, reflections = len(pairs), np.zeros(len(pairs), np.int64)
+    edge, rx, azimuth_deg = np.empty(size, np.int64), pairs[:, 1].astype(np.int64), np.empty(size, np.int64)
+    length_m, most, angle = np.empty(size), np.ones(size), np.empty((size, 4))
+    material, cosine = np.empty((size, most_reflections), np.int64), np.empty((size, most_reflections))
+    for i in range(size):
+        node = root = pairs[i, 0]
+        while parent[root] >= 0:
+            root, reflections[i] = parent[root], reflections[i] + 1
+        e = edge[i] = group[root // 4]
+        x, y = rx_m[rx[i], 0] - source_m[node, 0], rx_m[rx[i], 1] - source_m[node, 1]
+        length = near = np.sqrt(x * x + y * y)
+        x, y, sine = x / length, y / length, length / np.sqrt(length * length + highest * highest)
+        for k in range(reflections[i] - 1, -1, -1):
+            wall = piece[node]
+            px, py = pieces_m[wall, 0, 0], pieces_m[wall, 0, 1]
+            wx, wy = pieces_m[wall, 1, 0] - px, pieces_m[wall, 1, 1] - py
+            across, along, squared = abs(wx * y - wy * x), wx * x + wy * y, wx * wx + wy * wy
+            near = abs(wx * (position_m[e, 1] - py) - wy * (position_m[e, 0] - px)) / max(across, 1e-15)
+            material[i, k], cosine[i, k] = materials[wall], across / np.sqrt(squared)
+            most[i] *= most_at_wall(largest, material[i, k], cosine[i, k] * sine)
+            x, y, node = 2.0 * along / squared * wx - x, 2.0 * along / squared * wy - y, parent[node]
+        if not (near >= _NEAR_M and _outside(normals, e, near * x, near * y)[1]):
+            reflections[i] = most_reflections + 1
+        azimuth, length_m[i] = np.arctan2(y, x), length
+        azimuth_deg[i] = int(np.degrees(azimuth) + 360.5) % 360
+        turned = wedge_angle(_angle_rad(face_rad[e], exterior_rad[e], azimuth), exterior_rad[e])
+        angle[i, 0], angle[i, 1], angle[i, 2], angle[i, 3] = turned
+    return _Departures(edge, rx, reflections, length_m, material, cosine, most, azimuth_deg, angle)
+
+
+@njit(cache=True, nogil=True)
+def _list_joined(building, listing, heights, negligible, unlisted):
+    """Join paths to edges and from them: departures, arrivals with variants, and bounds (C,); add to `unlisted` (N,).
 
     One number encodes an arrival and a variant. Loops take arrays out of tuples before they begin: numba counts
     references at every access, on all cores.
     """
-    tree, pairs, group, edges, arrivals, most, faces, power, highest, building, reflections = task
-    room, size, unlisted = building.room, reflections + 1, np.zeros(len(building.room.rx_m))
-    out = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), np.int64(0)
-    material, cosine, media = np.empty(size, np.int64), np.empty(size), _media(building)
-    scratch = material, cosine, np.empty((4, 3)), np.empty(2 * size)
-    pieces_m, of_piece, walls, bounce = building.plan.pieces_m, building.material, trail.walls, trail.bounce
-    position_m, face_rad, exterior_rad, normals, _, own = edges
-    for i in range(len(pairs)):
-        root = node = pairs[i, 0]
-        while tree.parent[root] >= 0:
-            root = tree.parent[root]
-        edge, rx = group[root // 4], pairs[i, 1]
-        origin, target, exterior = position_m[edge], room.rx_m[rx], exterior_rad[edge]
-        after, onward = unfold(tree, node, pieces_m, target, walls, bounce)
-        x, y = (bounce[0, 0], bounce[0, 1]) if after > 0 else (target[0], target[1])
-        x, y = x - origin[0], y - origin[1]
-        if after < 0 or np.hypot(x, y) < _NEAR_M or not _outside(normals[edge], x, y)[1]:
-            continue
-        for k in range(after):
-            material[k], cosine[k] = of_piece[walls[k]], bounce[k, 3]
-        directions = np.arctan2(y, x), _angle_rad(face_rad[edge], exterior, x, y), exterior
-        face, utd = (own[edge, 0], own[edge, 1]), _constants(edges, edge)
-        pair = _Pair(np.int32(i), edge, rx, reflections - after, after, onward, *directions, utd, face)
-        bounds = most, faces, power, heights[rx], highest, negligible[rx]
-        out, rough = _list_pair(media, room, arrivals, pair, bounds, scratch, out)
-        unlisted[rx] += rough
-    listed, joined, bound, used = out
-    return listed[:used].copy(), joined[:used].copy(), bound[:used].copy(), unlisted
+    room, largest, wavelength = building.room, building.materials.largest, building.materials.wavelength_m
+    edges, arrivals, departures, (most, at_faces, power, _) = listing
+    own, utd, directed, flat = edges.material, edges.utd, len(room.gains.table) > 1, room.flat_material
+    start, _, reflections, length_m, _, _, material, cosine, angle, faces, lit, toward, gain, _, _ = arrivals
+    edge, rx, after, onward_m, material_after, cosine_after, most_after, azimuth_deg, departure = departures
+    tables = building.materials.reflection, building.materials.transition, largest
+    walls, variants = (material, cosine, material_after, cosine_after), heights.shape[1]
+    pairs, joined, bound = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)
+    used, terms, weight = np.int64(0), np.empty((4, 3)), np.empty(variants)
+    for i in range(len(edge)):
+        e, onward, least, is_weak = edge[i], onward_m[i], negligible[rx[i]], True
+        to_rx = departure[i, 0], departure[i, 1], departure[i, 2], departure[i, 3]
+        for j in range(start[e], start[e + 1]):
+            left, total = variants // 2 - 1 - after[i] - reflections[j], length_m[j] + onward
+            if left < 0:
+                continue
+            rough = most_after[i] ** 2 * power[j, azimuth_deg[i]] / (onward * total)
+            if rough < least:
+                unlisted[rx[i]] += EXPECTED * rough
+                continue
+            if is_weak:
+                _weigh_variants(largest, flat, heights, rx[i], length_m[start[e + 1] - 1] + onward, weight)
+                is_weak = False
+            utd_terms(_constants(utd, e), (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), to_rx, terms)
+            spread, reach = _spread(wavelength, length_m[j], onward)
+            amplitude = most_after[i] * most[j] * most_at_edge(terms, np.sqrt(reach), at_faces[j, 0], at_faces[j, 1])
+            rough = amplitude**2 * spread / total * gain[j]
+            face = own[e, 0] if lit[j] else own[e, 1], faces[j, 0], faces[j, 1]
+            for variant in range(2 * left + 2):
+                height = heights[rx[i], variant]
+                if height < 0.0:
+                    continue
+                if rough * weight[variant] < least:
+                    unlisted[rx[i]] += EXPECTED * rough * weight[variant]
+                    continue
+                long = np.sqrt(total**2 + height**2)
+                path = np.sqrt(reach * total / long), total / long, height / long, variant // 2, flat
+                strength = _strength(tables, walls, (j, i, reflections[j], after[i]), face, terms, path)
+                strength *= strength * spread / long
+                if directed:
+                    rise = rise_of(variant, room, room.rx_m[rx[i]])
+                    strength *= gain_of_departure(room, toward[j, 0], toward[j, 1], rise, total)
+                if used == len(pairs):
+                    pairs, joined, bound = grow(pairs, used + 1), grow(joined, used + 1), grow(bound, used + 1)
+                pairs[used], joined[used], bound[used] = i, j * variants + variant, strength
+                used += 1
+    return pairs[:used].copy(), joined[:used].copy(), bound[:used].copy()
 
 
 @njit(cache=True)
@@ -473,68 +535,18 @@ def _heights(room, size):
     return heights
 
 
-@njit(cache=True, forceinline=True)
-def _list_pair(media, room, arrivals, pair, bounds, scratch, out):
-    """Add the paths of a pair; return the unlisted power: of paths with a rough bound below `negligible`."""
-    (_, largest, flat, wavelength), (material, cosine, terms, weight) = media, scratch
-    most, at_faces, power, heights, highest, negligible = bounds
-    before, before_cosine, lit, lengths = arrivals.material, arrivals.cosine, arrivals.lit, arrivals.length_m
-    reflections, angle, faces = arrivals.reflections, arrivals.angle, arrivals.faces
-    toward, gain = arrivals.toward, arrivals.gain
-    directed, onward, after = len(room.gains.table) > 1, pair.onward_m, (material, cosine, pair.after)
-    pairs, joined, bound, used = out
-    unlisted, size, first, last = 0.0, len(heights), arrivals.start[pair.edge], arrivals.start[pair.edge + 1]
-    most_after = _most_at_walls(largest, material, cosine, pair.after, onward, highest)
-    azimuth, departure, is_weak = int(np.degrees(pair.azimuth_rad) + 360.5) % 360, (0.0, 0.0, 0.0, 0.0), True
-    for j in range(first, last):
-        left, length = pair.left - reflections[j], lengths[j]
-        if left < 0:
-            continue
-        rough = most_after**2 * power[j, azimuth] / (onward * (length + onward))
-        if rough < negligible:
-            unlisted += _EXPECTED * rough
-            continue
-        if is_weak:
-            departure, is_weak = wedge_angle(pair.angle_rad, pair.exterior_rad), False
-            _weigh_variants(largest, flat, heights, lengths[last - 1] + onward, weight)
-        utd_terms(pair.utd, (angle[j, 0], angle[j, 1], angle[j, 2], angle[j, 3]), departure, terms)
-        spread, reach = _spread(wavelength, length, onward)
-        amplitude = most_after * most[j] * most_at_edge(terms, np.sqrt(reach), at_faces[j, 0], at_faces[j, 1])
-        rough = amplitude**2 * spread / (length + onward) * gain[j]
-        face = pair.material[0] if lit[j] else pair.material[1], faces[j, 0], faces[j, 1]
-        for variant in range(2 * left + 2):
-            height = heights[variant]
-            if height < 0.0:
-                continue
-            if rough * weight[variant] < negligible:
-                unlisted += _EXPECTED * rough * weight[variant]
-                continue
-            total = np.sqrt((length + onward) ** 2 + height**2)
-            sine = (length + onward) / total
-            path = np.sqrt(reach * sine), sine, height / total, variant // 2
-            arrived = before, before_cosine, j, reflections[j]
-            strength = _strength(media, arrived, face, after, terms, path) ** 2 * spread / total
-            if directed:
-                rise = rise_of(variant, room, room.rx_m[pair.rx])
-                strength *= gain_of_departure(room, toward[j, 0], toward[j, 1], rise, length + onward)
-            pairs, joined, bound = grow(pairs, used + 1), grow(joined, used + 1), grow(bound, used + 1)
-            pairs[used], joined[used], bound[used] = pair.number, j * size + variant, strength
-            used += 1
-    return (pairs, joined, bound, used), unlisted
-
-
-@njit(cache=True, forceinline=True)
-def _weigh_variants(largest, flat, heights, length, weight):
+@njit(cache=True)
+def _weigh_variants(largest, flat, heights, rx, length, weight):
     """Write the largest powers of variants relative to a path in the plan."""
-    for variant in range(len(heights)):
-        height = max(heights[variant], 0.0)
+    for variant in range(len(weight)):
+        height = max(heights[rx, variant], 0.0)
         total = np.sqrt(length * length + height * height)
         weight[variant] = at_flats(largest, flat, height / total, variant // 2, (1.0, 0.0, 0.0)) ** 2 * length / total
 
 
 @njit(cache=True)
-def _constants(edges, edge):
-    return edges.utd[edge, 0], edges.utd[edge, 1], edges.utd[edge, 2], edges.utd[edge, 3], edges.utd[edge, 4]
+def _constants(utd, edge):
+    return utd[edge, 0], utd[edge, 1], utd[edge, 2], utd[edge, 3], utd[edge, 4]
 
 
 @njit(cache=True)
@@ -561,9 +573,8 @@ def _bounds_of_arrivals(edges, arrivals, materials, highest):
         angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
         spread, reach = _spread(materials.wavelength_m, length, 1.0)
         for azimuth in range(360):
-            x, y = np.cos(np.radians(azimuth)), np.sin(np.radians(azimuth))
-            departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, x, y), exterior)
-            utd_terms(_constants(edges, edge), angle, departure, terms)
+            departure = wedge_angle(_angle_rad(edges.face_rad[edge], exterior, np.radians(azimuth)), exterior)
+            utd_terms(_constants(edges.utd, edge), angle, departure, terms)
             for k in range(4):  # the largest term within half a degree
                 near = max(terms[k, 1] - _HALF_DEGREE, 1e-9)
                 terms[k, 0], terms[k, 1] = terms[k, 0] * terms[k, 1] / near, near
@@ -585,14 +596,14 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):
     """List the strong paths over some edges: edge, receiver, arrival and variant (C, 4), and powers (C,)."""
     room, materials, shortest_m = building.room, building.materials, _shortest_leg_m(building)
     chosen, power, used, terms = np.empty((1024, 4), np.int32), np.empty(1024), np.int64(0), np.empty((4, 3))
-    wavelength, no_walls = materials.wavelength_m, (np.empty(0, np.int64), np.empty(0), np.int64(0))
-    media = _media(building)
+    wavelength, tables = materials.wavelength_m, (materials.reflection, materials.transition, materials.largest)
+    reflecting = arrivals.material, arrivals.cosine, arrivals.material, arrivals.cosine
     for e in group:
-        origin, exterior, constants = edges.position_m[e], edges.exterior_rad[e], _constants(edges, e)
+        origin, exterior, constants = edges.position_m[e], edges.exterior_rad[e], _constants(edges.utd, e)
         for j in range(arrivals.start[e], arrivals.start[e + 1]):
             before, through, gain = arrivals.length_m[j], arrivals.left[j], arrivals.gain[j]
             angle = arrivals.angle[j, 0], arrivals.angle[j, 1], arrivals.angle[j, 2], arrivals.angle[j, 3]
-            arrived = arrivals.material, arrivals.cosine, j, np.int64(0)
+            numbers, flat = (j, np.int64(0), np.int64(0), np.int64(0)), room.flat_material
             own = edges.material[e, 0] if arrivals.lit[j] else edges.material[e, 1]
             face = own, arrivals.faces[j, 0], arrivals.faces[j, 1]
             for rx in range(len(room.rx_m)):
@@ -601,12 +612,13 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):
                 onward = np.hypot(x, y)
                 total = before + onward
                 too_weak = through * gain * (wavelength / (4.0 * np.pi * total)) ** 2 < needed[rx]
-                if too_weak or onward < shortest_m or not _outside(edges.normals[e], x, y)[1]:
+                if too_weak or onward < shortest_m or not _outside(edges.normals, e, x, y)[1]:
                     continue
-                departure = wedge_angle(_angle_rad(edges.face_rad[e], exterior, x, y), exterior)
+                departure = wedge_angle(_angle_rad(edges.face_rad[e], exterior, np.arctan2(y, x)), exterior)
                 utd_terms(constants, angle, departure, terms)
                 spread, reach = _spread(wavelength, before, onward)
-                level = _strength(media, arrived, face, no_walls, terms, (np.sqrt(reach), 1.0, 0.0, np.int64(0)))
+                path = np.sqrt(reach), 1.0, 0.0, np.int64(0), flat
+                level = _strength(tables, reflecting, numbers, face, terms, path)
                 if level**2 * spread * through / total * gain < needed[rx]:
                     continue
                 count, crossed = _from_edge(building, origin, target, onward, total, np.int64(0), trail)
@@ -619,8 +631,8 @@ def _list_crossed(group, edges, arrivals, needed, building, trail):
                     if not has_variant(variant, room) or rise.bounces > building.limits.depth - 1:
                         continue
                     length = np.hypot(total, rise.height_m)
-                    path = np.sqrt(reach * total / length), total / length, rise.height_m / length, rise.bounces
-                    strength = _strength(media, arrived, face, no_walls, terms, path) ** 2 * spread / length
+                    path = np.sqrt(reach * total / length), total / length, rise.height_m / length, rise.bounces, flat
+                    strength = _strength(tables, reflecting, numbers, face, terms, path) ** 2 * spread / length
                     strength *= gain_of_departure(room, arrivals.toward[j, 0], arrivals.toward[j, 1], rise, total)
                     if strength >= needed[rx]:
                         chosen, power = grow(chosen, used + 1), grow(power, used + 1)

@@ -18,7 +18,7 @@ from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import Candidates
-from sionna_partial.tracing.plan.beams import Beams, BeamTree, Task, follow, needed_of, trace_beams
+from sionna_partial.tracing.plan.beams import Beams, BeamTree, Sources, Task, follow, needed_of, trace_beams
 from sionna_partial.tracing.plan.room import (
     FACES,
     Building,
@@ -144,7 +144,8 @@ class SpecularCandidates:
 
     def listed(self, found: Floats, *, pairs_at_once: int = _LISTED_AT_ONCE) -> Iterator[Listed]:
         room, plan, depth = self._building.room, self._building.plan, self._building.limits.depth
-        tree, pairs = trace_beams(self._building, bin_points(room.rx_m[:, :2]), room.tx_m[None, :2], np.array([depth]))
+        sources = Sources.equal(room.tx_m[None, :2], depth, len(room.rx_m))
+        tree, pairs = trace_beams(self._building, bin_points(room.rx_m[:, :2]), sources)
 
         def of_pairs(start: int) -> Listed:
             some = pairs[start : start + pairs_at_once]
@@ -326,8 +327,8 @@ class CrossingCandidates:
     def _found(self, found: Floats) -> tuple[BeamTree, _Paths]:
         """List all beams and the paths that links need; paths of few reflections decide how strong others must be."""
         room, limits, count = self.building.room, self.building.limits, len(found)
-        receivers, reflections = bin_points(room.rx_m[:, :2]), np.array([limits.reflections])
-        beams = Beams.first(room.tx_m[None, :2], reflections, room.gains.largest)
+        receivers, sources = bin_points(room.rx_m[:, :2]), Sources.equal(room.tx_m[None, :2], limits.reflections, 0)
+        beams = Beams.first(sources.position_m, sources.more, room.gains.largest)
         tree, straight = BeamTree.of(beams), np.arange(count, dtype=np.int32)
         pair = np.stack([np.zeros_like(straight), straight], axis=1)
         listed = [self._paths(tree, pair, np.ones(count), np.zeros(count))]
@@ -336,7 +337,8 @@ class CrossingCandidates:
         for _ in range(limits.reflections + 1):
             weakest = limits.min_power(total)
             needed = needed_of(weakest, room, self.building.materials.wavelength_m)
-            beams, pair, through = follow(tree, beams, Task(receivers, self.building, needed, transmitted))
+            task = Task(receivers, self.building, transmitted, sources._replace(needed=needed))
+            beams, pair, through = follow(tree, beams, task)
             listed.append(self._paths(tree, pair, through, weakest))
             total += listed[-1].sums(count)
             tree = tree.extended(beams)
