@@ -28,7 +28,7 @@ from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, Diffraction
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
-from sionna_partial.tracing.select import Block, Kind, rounds
+from sionna_partial.tracing.select import Block, Kind, Stage, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
@@ -38,8 +38,9 @@ CANDIDATES_AT_ONCE = 100_000
 Found = tuple[Candidates | None, SolvedPaths]
 """Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
 
-_DIRECTED = 0.5
-"""Factor of the tolerance with a directive antenna, whose gain is bounded within one degree."""
+_DIRECTED, _ESTIMATED = 0.5, 4.5
+"""Factors of the tolerance with a directive antenna, whose gain is bounded within one degree, and where expected powers
+are added for the paths that are left out."""
 
 Kinds = tuple[list[Kind], list[Kind]]
 """Kinds of candidates between opaque walls, and through walls."""
@@ -117,10 +118,14 @@ class MeshScene:
 
 @dataclass(frozen=True)
 class ExactFinder:
-    """Finder that verifies candidates."""
+    """Finder that verifies candidates.
+
+    If it `estimates`, paths between opaque walls are amplified by the expected power of paths that are left out.
+    """
 
     written: PlanScene | MeshScene
     solver: SceneSolver
+    estimates: bool = False
 
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
@@ -133,16 +138,28 @@ class ExactFinder:
             return
         solver, power, settings = self.solver.polarised(polarisations), np.zeros(len(rx_m)), self.written.settings
         gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
-        tolerance_db = settings.tolerance_db * (1.0 if gains is ISOTROPIC else _DIRECTED)
-        opaque, through_walls = self.written.kinds(solver, tx_m, rx_m, gains)
-        for select in rounds(opaque, through_walls, len(rx_m), tolerance_db, report):
-            for candidates, paths in _verified(solver, select(power), tx_m, rx_m, report):
-                indirect = ~paths.is_direct
-                strength = paths.power
-                if antenna is not None and gains is not ISOTROPIC:
-                    strength = antenna.power(paths, settings.frequency_hz)
-                np.add.at(power, paths.path_rx[indirect], strength[indirect])
-                yield candidates, paths
+        directed = gains is not ISOTROPIC
+        estimates = self.estimates and not directed
+        factor = _DIRECTED if directed else _ESTIMATED if estimates else 1.0
+
+        def found_in(stage: Stage) -> Iterator[Found]:
+            for blocks in stage.rounds:
+                for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
+                    indirect = ~paths.is_direct
+                    strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
+                    np.add.at(power, paths.path_rx[indirect], strength[indirect])
+                    yield candidates, paths
+
+        kinds = self.written.kinds(solver, tx_m, rx_m, gains)
+        for stage in stages(*kinds, power, factor * settings.tolerance_db, report):
+            if not estimates or stage.left_out is None:
+                yield from found_in(stage)
+                continue
+            held = list(found_in(stage))
+            left_out = np.minimum(stage.left_out(), power)
+            amplitude = np.sqrt(1.0 + left_out / np.maximum(power, np.finfo(float).tiny))
+            power += left_out
+            yield from ((None, _amplified(paths, amplitude, ~paths.is_direct)) for _, paths in held)
 
 
 class RayFinder:
@@ -188,7 +205,7 @@ class MeanFinder:
                 indirect = paths.take(~paths.is_direct)
                 found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
         for _, paths in found:
-            yield None, replace(paths, transfer=paths.transfer * amplitude[paths.path_rx, None, None])
+            yield None, _amplified(paths, amplitude)
 
 
 def write_scene_of(
@@ -227,3 +244,9 @@ def _verified(
             waiting = []
         if block is not None and len(block.candidates.rx):
             waiting.append(block)
+
+
+def _amplified(paths: SolvedPaths, amplitude: Floats, which: Bools | bool = True) -> SolvedPaths:
+    """Multiply the transfer of some paths by an amplitude of their link (N,)."""
+    factor = np.where(which, amplitude[paths.path_rx], 1.0)
+    return replace(paths, transfer=paths.transfer * factor[:, None, None])

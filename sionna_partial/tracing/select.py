@@ -1,11 +1,10 @@
 """Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
 
-The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out while their sum does not exceed
-the power that the link may lack.
+The bounds of a link are sorted into levels of 0.75 dB. The weakest levels are left out while their sum does not exceed
+the power that the link may lack. Predictions add the expected power of candidates that are left out.
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple, Protocol
@@ -21,14 +20,14 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
-LEVELS = 96
+LEVELS = 192
 """Number of levels: level 0 is the direct path alone, the last level all weaker candidates."""
 
-_STRONGEST = -25
-"""Level of a power of 0 dB; two levels are a factor of 2."""
+_STRONGEST, _OCTAVE = -50, 4
+"""Level of a power of 0 dB, and number of levels in a factor of 2."""
 
-_FOUND = 0.8
-"""Expected power of the verified paths of a link, relative to the sum of bounds."""
+_FOUND, _EXPECTED = 0.8, 0.95
+"""Power that the verified paths of a link mostly exceed, and expected power, relative to the sum of bounds."""
 
 _WRITTEN_AT_ONCE = 100_000
 """Number of candidates written together, to bound the memory."""
@@ -83,12 +82,23 @@ class Block(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True)
+class Stage(NamedTuple):
+    """Candidates to verify, round after round, and the expected power (N,) of those left out after the last."""
+
+    rounds: Iterable[Iterator[Block]]
+    left_out: Callable[[], Floats] | None = None
+
+
+@dataclass
 class Selection:
-    """Candidates of some kinds; `power` (N, LEVELS) are the sums of bounds by receiver and level."""
+    """Candidates of some kinds; `power` (N, LEVELS) are the sums of bounds by receiver and level.
+
+    Candidates in levels below `end` (N,) have been selected.
+    """
 
     parts: list[Part]
     power: Floats
+    end: NDArray[np.int64]
 
     @classmethod
     def of(cls, kinds: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress) -> "Selection":
@@ -101,7 +111,7 @@ class Selection:
             if exceeded.any() and before.any():
                 own, sums = _levels(kind, np.where(exceeded, 0.0, before), len(kinds), number, report)
             parts, power = [*parts, *own], power + sums
-        return cls(parts, power)
+        return cls(parts, power, np.zeros(receivers, np.int64))
 
     def needed(self, found: Floats, tolerance_db: float) -> NDArray[np.int64]:
         """Return the level (N,) below which links need candidates, for paths of the power `found` (N,)."""
@@ -110,10 +120,20 @@ class Selection:
         first = _first_needed(start, self.power[:, :0:-1].ravel(), missing_power(found, tolerance_db))
         return LEVELS - (first - start[:-1])
 
-    def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
+    def rounds(self, found: Floats, tolerance_db: float, low: float) -> Iterator[Iterator[Block]]:
+        """Select candidates as if paths were as strong as their bounds, then more where `found` (N,) is less by then."""
+        for power, *span in ((expected_power(self.power), 0.4 * low, 0.9 * low), (found, 0.9 * low, low)):
+            first, self.end = self.end, np.maximum(self.end, self.needed(power, tolerance_db))
+            yield self._blocks(first, *span)
+
+    def left_out(self) -> Floats:
+        weaker = np.arange(LEVELS) >= self.end[:, None]
+        return np.asarray(_EXPECTED * np.where(weaker, self.power, 0.0).sum(axis=1))
+
+    def _blocks(self, first: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
         def chosen() -> Iterator[tuple[int, Indices]]:
             for number, (_, part, level) in enumerate(self.parts):
-                rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
+                rows = np.flatnonzero((level >= first[part.rx]) & (level < self.end[part.rx]))
                 yield from ((number, some) for some in part.parts(rows))
 
         def written(item: tuple[int, Indices]) -> Block:
@@ -127,35 +147,29 @@ class Selection:
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:
     parts, power = [], np.zeros((len(before), LEVELS))
     for part in kind.listed(before):
-        level = levels_of(part.bound)
-        sums = np.bincount(part.rx * np.int64(LEVELS) + level, part.bound, power.size).reshape(power.shape)
-        sums[:, 0], sums[:, -1] = 0.0, sums[:, -1] + part.unlisted
-        power += sums
+        level = _sorted_by_level(part.rx, part.bound, power)
+        power[:, -1] += part.unlisted
         parts.append((kind.name, part._replace(bound=part.bound[:0], unlisted=0.0), level))
         report((number + part.done) / kinds, "listing paths")
     return parts, power
 
 
-def rounds(
-    opaque: Sequence[Kind], through_walls: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress
-) -> Iterator[Callable[[Floats], Iterator[Block]]]:
-    """Yield functions that select candidates by the power (N,) of the paths found so far.
+def stages(
+    opaque: Sequence[Kind], through_walls: Sequence[Kind], found: Floats, tolerance_db: float, report: Progress
+) -> Iterator[Stage]:
+    """Yield candidates of opaque walls, then of paths through walls, kind after kind.
 
-    The first selects candidates of opaque walls as if paths were as strong as their bounds; if Sionna RT finds less
-    power, more follow. Paths through walls come last, kind after kind.
+    The caller adds the power of paths to `found` (N,) as it verifies candidates.
     """
     low = 0.6 if through_walls else 1.0
     if tolerance_db == 0.0:
-        yield lambda _: _listed_blocks(opaque, low, lambda part, _: np.arange(len(part.rx)), np.zeros(receivers))
+        yield Stage([_listed_blocks(opaque, low, lambda part, _: np.arange(len(part.rx)), np.zeros_like(found))])
     else:
-        selection = Selection.of(opaque, receivers, tolerance_db, part_of(report, 0.0, 0.4 * low))
-        nothing = np.zeros(receivers, np.int64)
-        first = selection.needed(expected_power(selection.power), tolerance_db)
-        yield lambda _: selection.blocks(nothing, first, 0.4 * low, 0.9 * low)
-        yield lambda found: selection.blocks(first, selection.needed(found, tolerance_db), 0.9 * low, low)
+        selection = Selection.of(opaque, len(found), tolerance_db, part_of(report, 0.0, 0.4 * low))
+        yield Stage(selection.rounds(found, tolerance_db, low), selection.left_out)
     for number, kind in enumerate(through_walls, start=1):
         high = low + (1.0 - low) * number / len(through_walls)
-        yield partial(_listed_blocks, [kind], high, partial(strongest, tolerance_db=tolerance_db))
+        yield Stage([_listed_blocks([kind], high, partial(strongest, tolerance_db=tolerance_db), found)])
 
 
 def _listed_blocks(
@@ -261,11 +275,17 @@ def _first_needed(start, power, allowed):
     return first
 
 
-def levels_of(bound: Floats) -> NDArray[np.uint8]:
-    mantissa, exponent = np.frexp(bound)
-    level = np.clip(_STRONGEST - 2 * exponent + (mantissa < math.sqrt(0.5)), 1, LEVELS - 1)
-    level = np.where(bound > 0.0, level, LEVELS - 1)
-    return np.where(np.isinf(bound), 0, level).astype(np.uint8)
+@njit(cache=True, nogil=True)
+def _sorted_by_level(rx, bound, power):
+    """Return the levels (C,) of candidates, and add their bounds to the power (N, LEVELS) of levels above 0."""
+    level = np.zeros(len(rx), np.uint8)
+    for c in range(len(rx)):
+        if bound[c] == np.inf:
+            continue
+        at = np.ceil(_STRONGEST - _OCTAVE * np.log2(bound[c])) if bound[c] > 0.0 else LEVELS
+        level[c] = min(max(at, 1), LEVELS - 1)
+        power[rx[c], level[c]] += bound[c]
+    return level
 
 
 def expected_power(power: Floats) -> Floats:
