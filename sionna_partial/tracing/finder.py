@@ -20,6 +20,7 @@ from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import SceneSolver, open_scene, set_antennas
+from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
@@ -28,7 +29,7 @@ from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, Diffraction
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
-from sionna_partial.tracing.select import Block, Kind, Stage, stages
+from sionna_partial.tracing.select import Block, Kind, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
@@ -120,7 +121,7 @@ class MeshScene:
 class ExactFinder:
     """Finder that verifies candidates.
 
-    If it `estimates`, paths between opaque walls are amplified by the expected power of paths that are left out.
+    If it `estimates`, paths get the expected power of those that are left out.
     """
 
     written: PlanScene | MeshScene
@@ -136,30 +137,27 @@ class ExactFinder:
         """
         if not len(rx_m):
             return
-        solver, power, settings = self.solver.polarised(polarisations), np.zeros(len(rx_m)), self.written.settings
+        solver, settings = self.solver.polarised(polarisations), self.written.settings
         gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
-        directed = gains is not ISOTROPIC
-        estimates = self.estimates and not directed
-        factor = _DIRECTED if directed else _ESTIMATED if estimates else 1.0
-
-        def found_in(stage: Stage) -> Iterator[Found]:
-            for blocks in stage.rounds:
-                for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
-                    indirect = ~paths.is_direct
-                    strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
-                    np.add.at(power, paths.path_rx[indirect], strength[indirect])
-                    yield candidates, paths
-
+        directed, tolerance_db = gains is not ISOTROPIC, settings.tolerance_db
+        estimates = self.estimates and not directed and tolerance_db > 0.0
+        tolerance_db *= _DIRECTED if directed else _ESTIMATED if estimates else 1.0
+        power, left_out = np.zeros(len(rx_m)), np.zeros(len(rx_m))
         kinds = self.written.kinds(solver, tx_m, rx_m, gains)
-        for stage in stages(*kinds, power, factor * settings.tolerance_db, report):
-            if not estimates or stage.left_out is None:
-                yield from found_in(stage)
-                continue
-            held = list(found_in(stage))
-            left_out = np.minimum(stage.left_out(), power)
-            amplitude = np.sqrt(1.0 + left_out / np.maximum(power, np.finfo(float).tiny))
-            power += left_out
-            yield from ((None, _amplified(paths, amplitude, ~paths.is_direct)) for _, paths in held)
+
+        def verified() -> Iterator[Found]:
+            for stage in stages(*kinds, power, tolerance_db, report):
+                for blocks in stage.rounds:
+                    for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
+                        indirect = ~paths.is_direct
+                        strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
+                        np.add.at(power, paths.path_rx[indirect], strength[indirect])
+                        yield candidates, paths
+                if estimates:
+                    more = stage.left_out(power)
+                    left_out[:], power[:] = left_out + more, power + more
+
+        yield from (_completed([*verified()], left_out) if estimates else verified())
 
 
 class RayFinder:
@@ -205,7 +203,7 @@ class MeanFinder:
                 indirect = paths.take(~paths.is_direct)
                 found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
         for _, paths in found:
-            yield None, _amplified(paths, amplitude)
+            yield None, _amplified(paths, amplitude[paths.path_rx])
 
 
 def write_scene_of(
@@ -246,7 +244,19 @@ def _verified(
             waiting.append(block)
 
 
-def _amplified(paths: SolvedPaths, amplitude: Floats, which: Bools | bool = True) -> SolvedPaths:
-    """Multiply the transfer of some paths by an amplitude of their link (N,)."""
-    factor = np.where(which, amplitude[paths.path_rx], 1.0)
-    return replace(paths, transfer=paths.transfer * factor[:, None, None])
+def _completed(found: list[Found], left_out: Floats) -> Iterator[Found]:
+    """Amplify indirect paths by the power (N,) left out; straight ones through walls only where others have less."""
+    straight = [np.isin(paths.interactions, (0, REFRACTION)).all(axis=1) for _, paths in found]
+    power, others = np.zeros(len(left_out)), np.zeros(len(left_out))
+    for (_, paths), mask in zip(found, straight, strict=True):
+        for total, some in ((power, ~paths.is_direct), (others, ~mask)):
+            np.add.at(total, paths.path_rx[some], paths.power[some])
+    total = np.where(others > left_out, others, power)
+    amplitude = np.sqrt(1.0 + np.minimum(left_out, total) / np.maximum(total, np.finfo(float).tiny))
+    for (_, paths), mask in zip(found, straight, strict=True):
+        kept = paths.is_direct | (mask & (others > left_out)[paths.path_rx])
+        yield None, _amplified(paths, np.where(kept, 1.0, amplitude[paths.path_rx]))
+
+
+def _amplified(paths: SolvedPaths, amplitude: Floats) -> SolvedPaths:
+    return replace(paths, transfer=paths.transfer * amplitude[:, None, None])

@@ -6,7 +6,6 @@ the power that the link may lack. Predictions add the expected power of candidat
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -26,8 +25,8 @@ LEVELS = 192
 _STRONGEST, _OCTAVE = -50, 4
 """Level of a power of 0 dB, and number of levels in a factor of 2."""
 
-_FOUND, _EXPECTED = 0.8, 0.95
-"""Power that the verified paths of a link mostly exceed, and expected power, relative to the sum of bounds."""
+_FOUND = 0.8
+"""Expected power of the verified paths of a link, relative to the sum of bounds."""
 
 _WRITTEN_AT_ONCE = 100_000
 """Number of candidates written together, to bound the memory."""
@@ -83,10 +82,10 @@ class Block(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """Candidates to verify, round after round, and the expected power (N,) of those left out after the last."""
+    """Candidates to verify, round after round; `left_out` returns the expected power (N,) of others by the power found."""
 
     rounds: Iterable[Iterator[Block]]
-    left_out: Callable[[], Floats] | None = None
+    left_out: Callable[[Floats], Floats]
 
 
 @dataclass
@@ -98,20 +97,23 @@ class Selection:
 
     parts: list[Part]
     power: Floats
-    end: NDArray[np.int64]
+
+    def __post_init__(self) -> None:
+        self.end, self._before = np.zeros(len(self.power), np.int64), np.zeros(len(self.power))
 
     @classmethod
-    def of(cls, kinds: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress) -> "Selection":
+    def of(cls, kinds: Sequence[Kind], found: Floats, tolerance_db: float, report: Progress) -> "Selection":
+        """List the candidates that links need whose other indirect paths have the power `found` (N,)."""
         parts: list[Part] = []
-        power = np.zeros((receivers, LEVELS))
+        power = np.zeros((len(found), LEVELS))
         for number, kind in enumerate(kinds):
-            before = power[:, 1:].sum(axis=1)
+            before = found + power[:, 1:].sum(axis=1)
             own, sums = _levels(kind, before, len(kinds), number, report)
-            exceeded = sums[:, -1] > missing_power(expected_power(power + sums), tolerance_db)
+            exceeded = sums[:, -1] > missing_power(found + expected_power(power + sums), tolerance_db)
             if exceeded.any() and before.any():
                 own, sums = _levels(kind, np.where(exceeded, 0.0, before), len(kinds), number, report)
             parts, power = [*parts, *own], power + sums
-        return cls(parts, power, np.zeros(receivers, np.int64))
+        return cls(parts, power)
 
     def needed(self, found: Floats, tolerance_db: float) -> NDArray[np.int64]:
         """Return the level (N,) below which links need candidates, for paths of the power `found` (N,)."""
@@ -120,15 +122,19 @@ class Selection:
         first = _first_needed(start, self.power[:, :0:-1].ravel(), missing_power(found, tolerance_db))
         return LEVELS - (first - start[:-1])
 
-    def rounds(self, found: Floats, tolerance_db: float, low: float) -> Iterator[Iterator[Block]]:
-        """Select candidates as if paths were as strong as their bounds, then more where `found` (N,) is less by then."""
-        for power, *span in ((expected_power(self.power), 0.4 * low, 0.9 * low), (found, 0.9 * low, low)):
-            first, self.end = self.end, np.maximum(self.end, self.needed(power, tolerance_db))
-            yield self._blocks(first, *span)
+    def rounds(self, found: Floats, tolerance_db: float, span: tuple[float, float]) -> Iterator[Iterator[Block]]:
+        """Select candidates as if paths were as strong as their bounds, then more if `found` (N,) is less by then."""
+        self._before, middle = found.copy(), span[0] + 0.85 * (span[1] - span[0])
+        for expected, *part in ((expected_power(self.power), span[0], middle), (0.0, middle, span[1])):
+            first, self.end = self.end, np.maximum(self.end, self.needed(found + expected, tolerance_db))
+            yield self._blocks(first, *part)
 
-    def left_out(self) -> Floats:
-        weaker = np.arange(LEVELS) >= self.end[:, None]
-        return np.asarray(_EXPECTED * np.where(weaker, self.power, 0.0).sum(axis=1))
+    def left_out(self, found: Floats) -> Floats:
+        """Expect the ratio of power and bounds of the selected candidates for the others, too."""
+        total, weaker = self.power[:, 1:].sum(axis=1), np.arange(LEVELS) >= self.end[:, None]
+        rest = np.where(weaker, self.power, 0.0).sum(axis=1)
+        ratio = (found - self._before) / np.maximum(total - rest, np.finfo(float).tiny)
+        return np.asarray(np.where(total > rest, np.clip(ratio, 0.0, 1.0), _FOUND) * rest)
 
     def _blocks(self, first: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
         def chosen() -> Iterator[tuple[int, Indices]]:
@@ -159,38 +165,24 @@ def stages(
 ) -> Iterator[Stage]:
     """Yield candidates of opaque walls, then of paths through walls, kind after kind.
 
-    The caller adds the power of paths to `found` (N,) as it verifies candidates.
+    The caller adds the power of indirect paths to `found` (N,) as it verifies candidates.
     """
-    low = 0.6 if through_walls else 1.0
-    if tolerance_db == 0.0:
-        yield Stage([_listed_blocks(opaque, low, lambda part, _: np.arange(len(part.rx)), np.zeros_like(found))])
-    else:
-        selection = Selection.of(opaque, len(found), tolerance_db, part_of(report, 0.0, 0.4 * low))
-        yield Stage(selection.rounds(found, tolerance_db, low), selection.left_out)
-    for number, kind in enumerate(through_walls, start=1):
-        high = low + (1.0 - low) * number / len(through_walls)
-        yield Stage([_listed_blocks([kind], high, partial(strongest, tolerance_db=tolerance_db), found)])
+    low, share = (0.6, 0.4 / len(through_walls)) if through_walls else (1.0, 0.0)
+    ends = [0.0, *(low + share * number for number in range(len(through_walls) + 1))]
+    for kinds, start, end in zip([opaque, *([kind] for kind in through_walls)], ends, ends[1:], strict=False):
+        if tolerance_db == 0.0 and kinds is opaque:
+            yield Stage([_every_block(kinds, len(found), end)], np.zeros_like)
+            continue
+        middle = start + 0.4 * (end - start)
+        selection = Selection.of(kinds, found, tolerance_db, part_of(report, start, middle))
+        yield Stage(selection.rounds(found, tolerance_db, (middle, end)), selection.left_out)
 
 
-def _listed_blocks(
-    kinds: Sequence[Kind], high: float, chosen: Callable[[Listed, Floats], Indices], found: Floats
-) -> Iterator[Block]:
+def _every_block(kinds: Sequence[Kind], receivers: int, end: float) -> Iterator[Block]:
     for number, kind in enumerate(kinds):
-        for part in kind.listed(found):
-            for rows in part.parts(chosen(part, found)):
-                yield Block(part.write(rows), high * (number + part.done) / len(kinds), f"verifying {kind.name}")
-
-
-def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:
-    """Return the rows of candidates with exact bounds that links need besides `found` (N,)."""
-    order = np.lexsort((part.bound, part.rx))
-    order = order[part.bound[order] > 0.0]
-    rx, power = part.rx[order], part.bound[order]
-    start = np.searchsorted(rx, np.arange(len(found) + 1))
-    total = found + np.bincount(rx, power, len(found))
-    first = _first_needed(start, power, missing_power(total, tolerance_db))
-    least = np.append(power, np.inf)[np.where(first < start[1:], first, len(power))]
-    return np.flatnonzero(part.bound >= least[part.rx])
+        for part in kind.listed(np.zeros(receivers)):
+            for rows in part.parts(np.arange(len(part.rx))):
+                yield Block(part.write(rows), end * (number + part.done) / len(kinds), f"verifying {kind.name}")
 
 
 class Limits(NamedTuple):

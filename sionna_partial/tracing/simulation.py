@@ -211,7 +211,8 @@ class Simulation:
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
-        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=self._predicting_finder):
+        finder = self._predicting_finder
+        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=finder):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
