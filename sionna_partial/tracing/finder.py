@@ -39,9 +39,9 @@ CANDIDATES_AT_ONCE = 100_000
 Found = tuple[Candidates | None, SolvedPaths]
 """Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
 
-_DIRECTED, _ESTIMATED = 0.5, 4.5
-"""Factors of the tolerance with a directive antenna, whose gain is bounded within one degree, and where expected powers
-are added for the paths that are left out."""
+_DIRECTED, _ESTIMATED = (0.5, 0.5), (4.5, 0.5)
+"""Factors of the tolerance for opaque walls and through walls: with a directive antenna, whose gain is bounded within
+one degree, and where paths get the power of others that are left out, for materials that the tolerance ignores, too."""
 
 Kinds = tuple[list[Kind], list[Kind]]
 """Kinds of candidates between opaque walls, and through walls."""
@@ -139,14 +139,15 @@ class ExactFinder:
             return
         solver, settings = self.solver.polarised(polarisations), self.written.settings
         gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
-        directed, tolerance_db = gains is not ISOTROPIC, settings.tolerance_db
-        estimates = self.estimates and not directed and tolerance_db > 0.0
-        tolerance_db *= _DIRECTED if directed else _ESTIMATED if estimates else 1.0
+        directed = gains is not ISOTROPIC
+        estimates = self.estimates and not directed and settings.tolerance_db > 0.0
+        factors = _DIRECTED if directed else _ESTIMATED if estimates else (1.0, 1.0)
+        tolerances_db = factors[0] * settings.tolerance_db, factors[1] * settings.tolerance_db
         power, left_out = np.zeros(len(rx_m)), np.zeros(len(rx_m))
         kinds = self.written.kinds(solver, tx_m, rx_m, gains)
 
         def verified() -> Iterator[Found]:
-            for stage in stages(*kinds, power, tolerance_db, report):
+            for stage in stages(*kinds, power, tolerances_db, report):
                 for blocks in stage.rounds:
                     for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
                         indirect = ~paths.is_direct

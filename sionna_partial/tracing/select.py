@@ -82,7 +82,10 @@ class Block(NamedTuple):
 
 
 class Stage(NamedTuple):
-    """Candidates to verify, round after round; `left_out` returns the expected power (N,) of others by the power found."""
+    """Candidates to verify, round after round.
+
+    `left_out` returns the expected power (N,) of the others by the power (N,) found.
+    """
 
     rounds: Iterable[Iterator[Block]]
     left_out: Callable[[Floats], Floats]
@@ -161,15 +164,20 @@ def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progres
 
 
 def stages(
-    opaque: Sequence[Kind], through_walls: Sequence[Kind], found: Floats, tolerance_db: float, report: Progress
+    opaque: Sequence[Kind],
+    through_walls: Sequence[Kind],
+    found: Floats,
+    tolerances_db: tuple[float, float],
+    report: Progress,
 ) -> Iterator[Stage]:
-    """Yield candidates of opaque walls, then of paths through walls, kind after kind.
+    """Yield candidates of opaque walls, then of paths through walls, kind after kind, with a tolerance of each.
 
     The caller adds the power of indirect paths to `found` (N,) as it verifies candidates.
     """
     low, share = (0.6, 0.4 / len(through_walls)) if through_walls else (1.0, 0.0)
     ends = [0.0, *(low + share * number for number in range(len(through_walls) + 1))]
     for kinds, start, end in zip([opaque, *([kind] for kind in through_walls)], ends, ends[1:], strict=False):
+        tolerance_db = tolerances_db[kinds is not opaque]
         if tolerance_db == 0.0 and kinds is opaque:
             yield Stage([_every_block(kinds, len(found), end)], np.zeros_like)
             continue
