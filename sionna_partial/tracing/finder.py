@@ -20,6 +20,7 @@ from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import SceneSolver, open_scene, set_antennas
+from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
@@ -28,7 +29,7 @@ from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, Diffraction
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
-from sionna_partial.tracing.select import Block, Kind, rounds
+from sionna_partial.tracing.select import Block, Kind, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
 
@@ -38,8 +39,9 @@ CANDIDATES_AT_ONCE = 100_000
 Found = tuple[Candidates | None, SolvedPaths]
 """Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
 
-_DIRECTED = 0.5
-"""Factor of the tolerance with a directive antenna, whose gain is bounded within one degree."""
+_DIRECTED, _ESTIMATED = (0.5, 0.5), (4.5, 0.5)
+"""Factors of the tolerance for opaque walls and through walls: with a directive antenna, whose gain is bounded within
+one degree, and where paths get the power of others that are left out, for materials that the tolerance ignores, too."""
 
 Kinds = tuple[list[Kind], list[Kind]]
 """Kinds of candidates between opaque walls, and through walls."""
@@ -117,10 +119,14 @@ class MeshScene:
 
 @dataclass(frozen=True)
 class ExactFinder:
-    """Finder that verifies candidates."""
+    """Finder that verifies candidates.
+
+    If it `estimates`, paths get the expected power of those that are left out.
+    """
 
     written: PlanScene | MeshScene
     solver: SceneSolver
+    estimates: bool = False
 
     def paths(
         self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
@@ -131,18 +137,28 @@ class ExactFinder:
         """
         if not len(rx_m):
             return
-        solver, power, settings = self.solver.polarised(polarisations), np.zeros(len(rx_m)), self.written.settings
+        solver, settings = self.solver.polarised(polarisations), self.written.settings
         gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
-        tolerance_db = settings.tolerance_db * (1.0 if gains is ISOTROPIC else _DIRECTED)
-        opaque, through_walls = self.written.kinds(solver, tx_m, rx_m, gains)
-        for select in rounds(opaque, through_walls, len(rx_m), tolerance_db, report):
-            for candidates, paths in _verified(solver, select(power), tx_m, rx_m, report):
-                indirect = ~paths.is_direct
-                strength = paths.power
-                if antenna is not None and gains is not ISOTROPIC:
-                    strength = antenna.power(paths, settings.frequency_hz)
-                np.add.at(power, paths.path_rx[indirect], strength[indirect])
-                yield candidates, paths
+        directed = gains is not ISOTROPIC
+        estimates = self.estimates and not directed and settings.tolerance_db > 0.0
+        factors = _DIRECTED if directed else _ESTIMATED if estimates else (1.0, 1.0)
+        tolerances_db = factors[0] * settings.tolerance_db, factors[1] * settings.tolerance_db
+        power, left_out = np.zeros(len(rx_m)), np.zeros(len(rx_m))
+        kinds = self.written.kinds(solver, tx_m, rx_m, gains)
+
+        def verified() -> Iterator[Found]:
+            for stage in stages(*kinds, power, tolerances_db, report):
+                for blocks in stage.rounds:
+                    for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
+                        indirect = ~paths.is_direct
+                        strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
+                        np.add.at(power, paths.path_rx[indirect], strength[indirect])
+                        yield candidates, paths
+                if estimates:
+                    more = stage.left_out(power)
+                    left_out[:], power[:] = left_out + more, power + more
+
+        yield from (_completed([*verified()], left_out) if estimates else verified())
 
 
 class RayFinder:
@@ -188,7 +204,7 @@ class MeanFinder:
                 indirect = paths.take(~paths.is_direct)
                 found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
         for _, paths in found:
-            yield None, replace(paths, transfer=paths.transfer * amplitude[paths.path_rx, None, None])
+            yield None, _amplified(paths, amplitude[paths.path_rx])
 
 
 def write_scene_of(
@@ -227,3 +243,21 @@ def _verified(
             waiting = []
         if block is not None and len(block.candidates.rx):
             waiting.append(block)
+
+
+def _completed(found: list[Found], left_out: Floats) -> Iterator[Found]:
+    """Amplify indirect paths by the power (N,) left out; straight ones through walls only where others have less."""
+    straight = [np.isin(paths.interactions, (0, REFRACTION)).all(axis=1) for _, paths in found]
+    power, others = np.zeros(len(left_out)), np.zeros(len(left_out))
+    for (_, paths), mask in zip(found, straight, strict=True):
+        for total, some in ((power, ~paths.is_direct), (others, ~mask)):
+            np.add.at(total, paths.path_rx[some], paths.power[some])
+    total = np.where(others > left_out, others, power)
+    amplitude = np.sqrt(1.0 + np.minimum(left_out, total) / np.maximum(total, np.finfo(float).tiny))
+    for (_, paths), mask in zip(found, straight, strict=True):
+        kept = paths.is_direct | (mask & (others > left_out)[paths.path_rx])
+        yield None, _amplified(paths, np.where(kept, 1.0, amplitude[paths.path_rx]))
+
+
+def _amplified(paths: SolvedPaths, amplitude: Floats) -> SolvedPaths:
+    return replace(paths, transfer=paths.transfer * amplitude[:, None, None])

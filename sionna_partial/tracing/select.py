@@ -1,13 +1,11 @@
 """Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
 
-The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out while their sum does not exceed
-the power that the link may lack.
+The bounds of a link are sorted into levels of 0.75 dB. The weakest levels are left out while their sum does not exceed
+the power that the link may lack. Predictions add the expected power of candidates that are left out.
 """
 
-import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -21,11 +19,11 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
-LEVELS = 96
+LEVELS = 192
 """Number of levels: level 0 is the direct path alone, the last level all weaker candidates."""
 
-_STRONGEST = -25
-"""Level of a power of 0 dB; two levels are a factor of 2."""
+_STRONGEST, _OCTAVE = -50, 4
+"""Level of a power of 0 dB, and number of levels in a factor of 2."""
 
 _FOUND = 0.8
 """Expected power of the verified paths of a link, relative to the sum of bounds."""
@@ -83,21 +81,38 @@ class Block(NamedTuple):
     message: str
 
 
-@dataclass(frozen=True)
+class Stage(NamedTuple):
+    """Candidates to verify, round after round.
+
+    `left_out` returns the expected power (N,) of the others by the power (N,) found.
+    """
+
+    rounds: Iterable[Iterator[Block]]
+    left_out: Callable[[Floats], Floats]
+
+
+@dataclass
 class Selection:
-    """Candidates of some kinds; `power` (N, LEVELS) are the sums of bounds by receiver and level."""
+    """Candidates of some kinds; `power` (N, LEVELS) are the sums of bounds by receiver and level.
+
+    Candidates in levels below `end` (N,) have been selected.
+    """
 
     parts: list[Part]
     power: Floats
 
+    def __post_init__(self) -> None:
+        self.end, self._before = np.zeros(len(self.power), np.int64), np.zeros(len(self.power))
+
     @classmethod
-    def of(cls, kinds: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress) -> "Selection":
+    def of(cls, kinds: Sequence[Kind], found: Floats, tolerance_db: float, report: Progress) -> "Selection":
+        """List the candidates that links need whose other indirect paths have the power `found` (N,)."""
         parts: list[Part] = []
-        power = np.zeros((receivers, LEVELS))
+        power = np.zeros((len(found), LEVELS))
         for number, kind in enumerate(kinds):
-            before = power[:, 1:].sum(axis=1)
+            before = found + power[:, 1:].sum(axis=1)
             own, sums = _levels(kind, before, len(kinds), number, report)
-            exceeded = sums[:, -1] > missing_power(expected_power(power + sums), tolerance_db)
+            exceeded = sums[:, -1] > missing_power(found + expected_power(power + sums), tolerance_db)
             if exceeded.any() and before.any():
                 own, sums = _levels(kind, np.where(exceeded, 0.0, before), len(kinds), number, report)
             parts, power = [*parts, *own], power + sums
@@ -110,10 +125,24 @@ class Selection:
         first = _first_needed(start, self.power[:, :0:-1].ravel(), missing_power(found, tolerance_db))
         return LEVELS - (first - start[:-1])
 
-    def blocks(self, first: NDArray[np.int64], last: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
+    def rounds(self, found: Floats, tolerance_db: float, span: tuple[float, float]) -> Iterator[Iterator[Block]]:
+        """Select candidates as if paths were as strong as their bounds, then more if `found` (N,) is less by then."""
+        self._before, middle = found.copy(), span[0] + 0.85 * (span[1] - span[0])
+        for expected, *part in ((expected_power(self.power), span[0], middle), (0.0, middle, span[1])):
+            first, self.end = self.end, np.maximum(self.end, self.needed(found + expected, tolerance_db))
+            yield self._blocks(first, *part)
+
+    def left_out(self, found: Floats) -> Floats:
+        """Expect the ratio of power and bounds of the selected candidates for the others, too."""
+        total, weaker = self.power[:, 1:].sum(axis=1), np.arange(LEVELS) >= self.end[:, None]
+        rest = np.where(weaker, self.power, 0.0).sum(axis=1)
+        ratio = (found - self._before) / np.maximum(total - rest, np.finfo(float).tiny)
+        return np.asarray(np.where(total > rest, np.clip(ratio, 0.0, 1.0), _FOUND) * rest)
+
+    def _blocks(self, first: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
         def chosen() -> Iterator[tuple[int, Indices]]:
             for number, (_, part, level) in enumerate(self.parts):
-                rows = np.flatnonzero((level >= first[part.rx]) & (level < last[part.rx]))
+                rows = np.flatnonzero((level >= first[part.rx]) & (level < self.end[part.rx]))
                 yield from ((number, some) for some in part.parts(rows))
 
         def written(item: tuple[int, Indices]) -> Block:
@@ -127,56 +156,41 @@ class Selection:
 def _levels(kind: Kind, before: Floats, kinds: int, number: int, report: Progress) -> tuple[list[Part], Floats]:
     parts, power = [], np.zeros((len(before), LEVELS))
     for part in kind.listed(before):
-        level = levels_of(part.bound)
-        sums = np.bincount(part.rx * np.int64(LEVELS) + level, part.bound, power.size).reshape(power.shape)
-        sums[:, 0], sums[:, -1] = 0.0, sums[:, -1] + part.unlisted
-        power += sums
+        level = _sorted_by_level(part.rx, part.bound, power)
+        power[:, -1] += part.unlisted
         parts.append((kind.name, part._replace(bound=part.bound[:0], unlisted=0.0), level))
         report((number + part.done) / kinds, "listing paths")
     return parts, power
 
 
-def rounds(
-    opaque: Sequence[Kind], through_walls: Sequence[Kind], receivers: int, tolerance_db: float, report: Progress
-) -> Iterator[Callable[[Floats], Iterator[Block]]]:
-    """Yield functions that select candidates by the power (N,) of the paths found so far.
+def stages(
+    opaque: Sequence[Kind],
+    through_walls: Sequence[Kind],
+    found: Floats,
+    tolerances_db: tuple[float, float],
+    report: Progress,
+) -> Iterator[Stage]:
+    """Yield candidates of opaque walls, then of paths through walls, kind after kind, with a tolerance of each.
 
-    The first selects candidates of opaque walls as if paths were as strong as their bounds; if Sionna RT finds less
-    power, more follow. Paths through walls come last, kind after kind.
+    The caller adds the power of indirect paths to `found` (N,) as it verifies candidates.
     """
-    low = 0.6 if through_walls else 1.0
-    if tolerance_db == 0.0:
-        yield lambda _: _listed_blocks(opaque, low, lambda part, _: np.arange(len(part.rx)), np.zeros(receivers))
-    else:
-        selection = Selection.of(opaque, receivers, tolerance_db, part_of(report, 0.0, 0.4 * low))
-        nothing = np.zeros(receivers, np.int64)
-        first = selection.needed(expected_power(selection.power), tolerance_db)
-        yield lambda _: selection.blocks(nothing, first, 0.4 * low, 0.9 * low)
-        yield lambda found: selection.blocks(first, selection.needed(found, tolerance_db), 0.9 * low, low)
-    for number, kind in enumerate(through_walls, start=1):
-        high = low + (1.0 - low) * number / len(through_walls)
-        yield partial(_listed_blocks, [kind], high, partial(strongest, tolerance_db=tolerance_db))
+    low, share = (0.6, 0.4 / len(through_walls)) if through_walls else (1.0, 0.0)
+    ends = [0.0, *(low + share * number for number in range(len(through_walls) + 1))]
+    for kinds, start, end in zip([opaque, *([kind] for kind in through_walls)], ends, ends[1:], strict=False):
+        tolerance_db = tolerances_db[kinds is not opaque]
+        if tolerance_db == 0.0 and kinds is opaque:
+            yield Stage([_every_block(kinds, len(found), end)], np.zeros_like)
+            continue
+        middle = start + 0.4 * (end - start)
+        selection = Selection.of(kinds, found, tolerance_db, part_of(report, start, middle))
+        yield Stage(selection.rounds(found, tolerance_db, (middle, end)), selection.left_out)
 
 
-def _listed_blocks(
-    kinds: Sequence[Kind], high: float, chosen: Callable[[Listed, Floats], Indices], found: Floats
-) -> Iterator[Block]:
+def _every_block(kinds: Sequence[Kind], receivers: int, end: float) -> Iterator[Block]:
     for number, kind in enumerate(kinds):
-        for part in kind.listed(found):
-            for rows in part.parts(chosen(part, found)):
-                yield Block(part.write(rows), high * (number + part.done) / len(kinds), f"verifying {kind.name}")
-
-
-def strongest(part: Listed, found: Floats, tolerance_db: float) -> Indices:
-    """Return the rows of candidates with exact bounds that links need besides `found` (N,)."""
-    order = np.lexsort((part.bound, part.rx))
-    order = order[part.bound[order] > 0.0]
-    rx, power = part.rx[order], part.bound[order]
-    start = np.searchsorted(rx, np.arange(len(found) + 1))
-    total = found + np.bincount(rx, power, len(found))
-    first = _first_needed(start, power, missing_power(total, tolerance_db))
-    least = np.append(power, np.inf)[np.where(first < start[1:], first, len(power))]
-    return np.flatnonzero(part.bound >= least[part.rx])
+        for part in kind.listed(np.zeros(receivers)):
+            for rows in part.parts(np.arange(len(part.rx))):
+                yield Block(part.write(rows), end * (number + part.done) / len(kinds), f"verifying {kind.name}")
 
 
 class Limits(NamedTuple):
@@ -261,11 +275,17 @@ def _first_needed(start, power, allowed):
     return first
 
 
-def levels_of(bound: Floats) -> NDArray[np.uint8]:
-    mantissa, exponent = np.frexp(bound)
-    level = np.clip(_STRONGEST - 2 * exponent + (mantissa < math.sqrt(0.5)), 1, LEVELS - 1)
-    level = np.where(bound > 0.0, level, LEVELS - 1)
-    return np.where(np.isinf(bound), 0, level).astype(np.uint8)
+@njit(cache=True, nogil=True)
+def _sorted_by_level(rx, bound, power):
+    """Return the levels (C,) of candidates, and add their bounds to the power (N, LEVELS) of levels above 0."""
+    level = np.zeros(len(rx), np.uint8)
+    for c in range(len(rx)):
+        if bound[c] == np.inf:
+            continue
+        at = np.ceil(_STRONGEST - _OCTAVE * np.log2(bound[c])) if bound[c] > 0.0 else LEVELS
+        level[c] = min(max(at, 1), LEVELS - 1)
+        power[rx[c], level[c]] += bound[c]
+    return level
 
 
 def expected_power(power: Floats) -> Floats:

@@ -206,11 +206,13 @@ class Simulation:
     ) -> Iterator[SolvedPaths]:
         """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
 
-        `antenna` is as in `ExactFinder.paths`. Limits are coarse where the material of walls is unknown.
+        `antenna` is as in `ExactFinder.paths`. Sums of powers are within the tolerance; weak paths are left out, and
+        others amplified by their expected power. Limits are coarse where the material of walls is unknown.
         """
         polarisations = 1 if antenna is None else 2
         every = [np.arange(len(rx_m))]
-        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=self._coarse_finder):
+        finder = self._predicting_finder
+        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=finder):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
@@ -284,12 +286,19 @@ class Simulation:
         return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
 
     @cached_property
-    def _coarse_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Finder for predictions."""
+    def _predicting_finder(self) -> ExactFinder | RayFinder | MeanFinder:
+        """Finder for predictions, which need the power of links and not every path."""
+
+        def predicting(finder: ExactFinder | RayFinder) -> ExactFinder | RayFinder:
+            if not isinstance(finder, ExactFinder):
+                return finder
+            coarse = replace(finder.written, coarse=True) if self.material_unknown else finder.written
+            return replace(finder, written=coarse, estimates=True)
+
         finder = self._mean_finder
-        if not self.material_unknown or not isinstance(finder, ExactFinder):
-            return finder
-        return replace(finder, written=replace(finder.written, coarse=True))
+        if not isinstance(finder, MeanFinder):
+            return predicting(finder)
+        return MeanFinder(predicting(finder.mapped), [*map(predicting, finder.drawn)])
 
     def _finder_of(self, draw: int) -> ExactFinder | RayFinder:
         if self._only_by_rays:
