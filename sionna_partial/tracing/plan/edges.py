@@ -66,7 +66,7 @@ _NEAR_M = 1e-3
 _ASIDE_M = 1e-3
 """Distance from an edge at which a leg through walls ends [m]: walls that meet there are not crossed."""
 
-_NEGLIGIBLE = 1e-4
+_NEGLIGIBLE = 3e-5
 """Smallest rough bound of a listed diffracted path, relative to the reflected paths of its link."""
 
 _UNSEEN = 1e-18
