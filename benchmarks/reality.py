@@ -138,7 +138,7 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
             power = rows[:, 7] + drawn_errors_db(rows[:, 3:6], rng) if rows.shape[1] > len(COLUMNS) else rows[:, 6]
             given = rng.permutation(np.flatnonzero(power > SENSITIVITY_DBM))[:LOCATE_POINTS]
             measured = sp.Measurements((np.nan, np.nan, tx_m[2]), rows[given, 3:6], power[given])
-            posterior = job._located(Transmitter("", None, Antenna(), nowhere, measured), no_progress)
+            posterior = job.located(Transmitter("", None, Antenna(), nowhere, measured), no_progress)
             probability, apart_m = posterior.probability.ravel(), np.linalg.norm(posterior.points_m - tx_m, axis=1)
             inside = likely_region(probability)[np.where(probability > 0.0, apart_m, np.inf).argmin()]
             found.append((np.linalg.norm(posterior.position_m - tx_m), inside))

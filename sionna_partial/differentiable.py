@@ -416,7 +416,7 @@ class DifferentiableLinks:
         extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
         if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
             partial = self._scene.partial
-            materials = WallMaterials.at(float(self.base.frequency_hz), several=bool(partial.thick_walls.any()))
+            materials = WallMaterials.at(float(self.base.frequency_hz), partial.wall_class_count)
             thin, thick, reflections = unnamed_counts(paths.interactions, partial.wall_classes(paths.vertices_m))
             extra_db = np.outer(materials.reflection_db, reflections) + materials.crossing_db @ [thin, thick]
             prior = materials.prior

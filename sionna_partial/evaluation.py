@@ -46,7 +46,7 @@ LEAST_STD_DB, LEAST_DENSITY = 0.1, LEAST_PROBABILITY / -GAIN_FLOOR_DB
 
 DEFINITIONS = {
     "links": "number of links that were measured.",
-    "accuracy": "fraction of links whose likeliest link state is the true one.",
+    "accuracy": "fraction of links whose most probable link state is the true one.",
     "rmse_db": "root mean square of predictive mean minus true path gain [dB]; an outage counts -150 dB on both sides.",
     "rmse_linked_db": "the same over the links that are not in outage in truth [dB].",
     "nll_state": f"mean of -log P(true link state) [nat]; P counts at least {LEAST_PROBABILITY:g}.",
@@ -54,7 +54,7 @@ DEFINITIONS = {
     f"second term, a standard deviation counts at least {LEAST_STD_DB:g} dB, p at least {LEAST_DENSITY:.1g} per dB.",
     "calibration_error": "expected calibration error of the link state: |accuracy - mean confidence| in "
     f"{CONFIDENCE_BINS} bins of equal width, weighted by their links; the confidence is the probability of the "
-    "likeliest state.",
+    "most probable state.",
     "coverage_90": "fraction of links whose true gain lies in the central 90 % interval, by the randomised probability "
     "integral transform, spread evenly over the probability of an outage; 0.9 is right.",
 }

@@ -269,8 +269,7 @@ class LinkModel:
     @property
     def wall_materials(self) -> WallMaterials:
         """The candidates for an unknown material of walls."""
-        several = bool(self.partial.thick_walls.any())
-        return WallMaterials.at(self.simulation.trace_settings.frequency_hz, several=several)
+        return WallMaterials.at(self.simulation.trace_settings.frequency_hz, self.partial.wall_class_count)
 
     def links(
         self,

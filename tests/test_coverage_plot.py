@@ -47,9 +47,9 @@ def legend(figure):
     return [text.get_text() for text in figure.legends[0].get_texts()]
 
 
-def test_the_likeliest_state_has_its_colour(coverage, figure):
+def test_the_most_probable_state_has_its_colour(coverage, figure):
     panel = panels(figure)[0]
-    assert panel.get_title() == "Likeliest link state"
+    assert panel.get_title() == "Most probable link state"
     drawn = panel.images[0].to_rgba(at_receivers(panel, coverage))[..., :3]
     state = coverage["link_state"].to_numpy()[coverage["valid"].to_numpy()]
     np.testing.assert_allclose(drawn, np.array([OUTAGE, LOS, NLOS])[state.astype(int)])
@@ -128,7 +128,7 @@ def test_several_transmitters_have_a_row_each(several, figure):
     found = plot_coverage(several, layers=("link_state", "gain_mean_db", "state_mixture"))
     rows = np.array(panels(found)).reshape(2, 3)
     assert [row[0].get_ylabel().split("\n")[0] for row in rows] == [*several["tx"].to_numpy()]
-    assert [panel.get_title() for panel in rows[0]] == ["Likeliest link state", "Mean path gain", "Link state"]
+    assert [panel.get_title() for panel in rows[0]] == ["Most probable link state", "Mean path gain", "Link state"]
     for row, tx in zip(rows, several["tx"], strict=True):
         one = several.sel(tx=tx)
         expected = one["gain_mean_db"].to_numpy()[one["valid"].to_numpy()]

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 from meshes import box, scene_mesh
+from meshes import meshed as mesh_of
 
 import sionna_partial as sp
 from sionna_partial.files import temporary_folder
@@ -70,7 +71,7 @@ def test_rays_between_two_that_stay_in_one_wall() -> None:
     for _ in range(200):
         free = np.zeros((40, 40), dtype=bool)
         free[rng.integers(0, 40, 4), rng.integers(0, 40, 4)] = True
-        interior = Interior.of(free, free, np.zeros((0, 2), dtype=bool), 0.05, 0.4)
+        interior = Interior.of(free, free, 0.05, 0.4)
         near, far = ((x, rng.uniform(0.3, 0.9), rng.uniform(1.0, 1.7)) for x in (0.8, rng.uniform(0.9, 1.5)))
         source, rays = (0.05, rng.uniform(0.4, 1.6)), []
 
@@ -172,6 +173,16 @@ def meshed() -> sp.PartialMap:
         return sp.load_map(scene / "scene.xml")
 
 
+def flat() -> sp.PartialMap:
+    """Four rooms in a row, with walls of 20 cm."""
+    cells = np.zeros((34, 98), dtype=np.uint8)
+    cells[[0, 1, -2, -1]] = cells[:, [0, 1, 24, 25, 48, 49, 72, 73, -2, -1]] = sp.CellState.WALL
+    return sp.PartialMap(cells, resolution_m=0.1)
+
+
+FLATS = flat, lambda: mesh_of(flat())
+
+
 def test_reciprocity() -> None:
     settings, partial = replace(EVERY, wall_depth_m=0.6, max_depth=3), of_several_materials()
     there = sp.trace_links(partial, TX, RX, trace_settings=settings)
@@ -192,13 +203,22 @@ def test_opaque_paths_stay(partial: Callable[[], sp.PartialMap]) -> None:
     assert (leaky.interactions == REFRACTION).sum(axis=1).max() <= EVERY.max_walls
 
 
-def test_plans_and_meshes_agree() -> None:
-    settings = replace(EVERY, wall_depth_m=0.6, power_tolerance_db=0.1)
+@pytest.mark.parametrize(
+    ("partials", "tx", "rx"),
+    [
+        ((rooms, meshed), TX, RX),
+        (FLATS, (1.0, 1.0, 1.5), [(8.38, 2.83, 1.4), (8.54, 1.0, 1.4), (6.23, 2.54, 1.4)]),
+        (FLATS, (2.68, 1.7, 1.4), [(5.03, 1.75, 1.4), (6.2, 1.68, 1.4)]),
+    ],
+    ids=["rooms", "reflections at corners of crossed walls", "reflections at a wall beside the transmitter"],
+)
+def test_plans_and_meshes_agree(partials, tx, rx) -> None:
+    settings = replace(EVERY, wall_depth_m=0.6)
     plan, mesh = (
-        sp.trace_links(each, TX, RX, trace_settings=settings, scene_settings=sp.SceneSettings(material=BRICK))
-        for each in (rooms(), meshed())
+        sp.trace_links(partial(), tx, rx, trace_settings=settings, scene_settings=sp.SceneSettings(material=BRICK))
+        for partial in partials
     )
-    np.testing.assert_allclose(mesh.gain_db, plan.gain_db, atol=0.3)
+    np.testing.assert_allclose(mesh.gain_db, plan.gain_db, atol=0.05)
     assert mesh.to_dataframe("paths")["walls"].max() >= 2
 
 

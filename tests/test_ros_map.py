@@ -408,7 +408,7 @@ class TestContinuousValues:
 
     @pytest.mark.parametrize("parts", [[(20, 60, 100)], [(28, 48, 500)], [(50, 99, 100)]])
     def test_values_that_are_not_separate(self, parts: list[tuple[int, int, int]]) -> None:
-        message = "seen cells have an occupancy between 25 and 65 % and are read as unknown: Give free_percent"
+        message = "seen cells have an occupancy between 25 and 65 % and are read as unknown. Give free_percent"
         with pytest.warns(MapWarning, match=message):
             partial = map_from_occupancy(levels(*parts), 0.05)
         assert partial.import_report is not None

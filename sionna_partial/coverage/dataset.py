@@ -65,7 +65,7 @@ ATTRIBUTES: Mapping[str, Mapping[str, Any]] = {
     "p_los": {"long_name": "probability of line of sight", "units": "1"},
     "p_nlos": {"long_name": "probability of paths without line of sight", "units": "1"},
     "p_outage": {"long_name": "probability of outage", "units": "1"},
-    "link_state": {"long_name": "likeliest link state", **_LINK_FLAGS},
+    "link_state": {"long_name": "most probable link state", **_LINK_FLAGS},
     "gain_mean_db": {"long_name": "mean omnidirectional path gain, an outage counting -150 dB", "units": "dB"},
     "gain_std_db": {"long_name": "standard deviation of the omnidirectional path gain", "units": "dB"},
     "gain_los_mean_db": {"long_name": "mean path gain given line of sight", "units": "dB"},

@@ -256,7 +256,7 @@ class CoverageJob:
         model, measured, grid = self.model, transmitter.measured, transmitter.grid
         posterior = None
         if transmitter.position_m is None:
-            posterior = self._located(transmitter, report)
+            posterior = self.located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
             grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m)
         else:
@@ -365,7 +365,8 @@ class CoverageJob:
         p_indoor = np.concatenate([links.p_indoor for links in blocks])
         return LinkPrediction.concatenate([links.prediction for links in blocks]), antenna_db, p_indoor
 
-    def _located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
+    def located(self, transmitter: Transmitter, report: Progress) -> TransmitterPosterior:
+        """Return the posterior over positions of a transmitter with measurements."""
         partial, measured = self.model.partial, transmitter.measured
         assert measured is not None
         measured_at, limit_m = cKDTree(measured.rx), nearest_m(self.model.simulation.trace_settings.frequency_hz)

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, read_only
+from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import float_array, real_array, shown
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError
 from sionna_partial.maps.mesh.cut import SEAM_M, close_seams, cut_triangles, merge_points
@@ -151,7 +151,8 @@ class SceneMesh(Shown):
         used = np.unique(self.material).tolist()
         return {f"material{index}": self.materials[index] or default for index in used}
 
-    def wall_sizes(self, _walls: Bools) -> tuple[tuple[Material | None, ...], Floats]:
+    @property
+    def wall_sizes(self) -> tuple[tuple[Material | None, ...], Floats]:
         area = np.abs(self._doubled_normals)
         steep_m2 = np.linalg.norm(area, axis=1) * (np.hypot(*area.T[:2]) > area[:, 2])
         return self.materials, np.bincount(self.material, steep_m2, len(self.materials)).astype(np.float64)
@@ -305,6 +306,7 @@ class FloorPlan:
     `receivers_at_once`: receivers whose paths are found at once, which bounds the memory.
     """
 
+    state: States
     wall_height_m: float
     wall_material: NDArray[np.uint8] | None
     wall_materials: tuple[Material, ...]
@@ -328,9 +330,10 @@ class FloorPlan:
         used = [0] if self.wall_material is None else np.unique(np.append(self.wall_material, 0)).tolist()
         return {f"material{index or ''}": (default, *self.wall_materials)[index] for index in used}
 
-    def wall_sizes(self, walls: Bools) -> tuple[tuple[Material | None, ...], Floats]:
-        """Return materials of walls, None for unnamed ones, and their number of wall cells (ny, nx) or area."""
-        cells = 0 if self.wall_material is None else self.wall_material
+    @property
+    def wall_sizes(self) -> tuple[tuple[Material | None, ...], Floats]:
+        """Materials of walls, None for unnamed ones, and their numbers of cells or areas."""
+        walls, cells = self.state == CellState.WALL, 0 if self.wall_material is None else self.wall_material
         counts = np.bincount(np.broadcast_to(cells, walls.shape)[walls], minlength=1 + len(self.wall_materials))
         return (None, *self.wall_materials), counts.astype(np.float64)
 

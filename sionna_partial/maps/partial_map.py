@@ -293,7 +293,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     @property
     def environment(self) -> FloorPlan | SceneMesh:
         """Walls extruded from the cells, or the mesh."""
-        return self.mesh or FloorPlan(self.wall_height_m, self.wall_material, self.wall_materials)
+        return self.mesh or FloorPlan(self.state, self.wall_height_m, self.wall_material, self.wall_materials)
 
     @property
     def height_range_m(self) -> tuple[float, float]:
@@ -334,7 +334,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     @cached_property
     def wall_fractions(self) -> dict[Material | None, float]:
         """Fractions of the walls by their named material; None for the others."""
-        materials, sizes = self.environment.wall_sizes(self.state == CellState.WALL)
+        materials, sizes = self.environment.wall_sizes
         fractions = sizes / sizes.sum() if sizes.any() else np.ones(1)
         of_material: dict[Material | None, float] = {}
         for material, fraction in zip(materials, fractions.tolist(), strict=False):
@@ -350,6 +350,11 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def thick_walls(self) -> Bools:
         """Result of the function `thick_walls` for walls without a named material."""
         return thick_walls(self.state == CellState.WALL, self._unnamed_cells, self.resolution_m)
+
+    @property
+    def wall_class_count(self) -> int:
+        """Number of classes of walls without a named material: thick walls are the second."""
+        return 1 + bool(self.thick_walls.any())
 
     @cached_property
     def unnamed_walls(self) -> Floats:
@@ -369,7 +374,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     def wall_classes(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
         """Return the walls at points (..., 3) [m], or NaN: 0 with a named material, 1 thin or 2 thick without."""
-        if self.wall_fractions.keys() == {None} and not self.thick_walls.any():
+        if self.wall_fractions.keys() == {None} and self.wall_class_count == 1:
             return np.ones(points_m.shape[:-1], dtype=np.uint8)
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)
         column, row = np.moveaxis(np.clip(np.floor(cells).astype(np.intp), 0, np.array(self.shape)[::-1] - 1), -1, 0)

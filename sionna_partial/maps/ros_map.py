@@ -325,7 +325,7 @@ def fitted_threshold(
     if threshold is None:
         notes.skip("seen cells", inside, f"{where}: unknown")
         if remedy and is_varied and inside > max(ODD_CELLS, REPORTED_FRACTION * total):
-            warnings.warn(f"{what} and are read as unknown: {remedy}", MapWarning, stacklevel=4)
+            warnings.warn(f"{what} and are read as unknown. {remedy}", MapWarning, stacklevel=4)
         return None
     decided = f"walls are the cells from {threshold:.1f} % on, and other seen cells are free"
     notes.notes.append(f"{inside:,} of {total:,} seen cells have {where}: {decided}")

@@ -74,7 +74,7 @@ def coverage_layers(threshold_db: float, coverage: xr.Dataset | None = None) -> 
     probability = Normalize(0.0, 1.0), "cividis", "probability"
     colours = ListedColormap([STATE_COLOURS[state] for state in sorted(LinkState)])
     layers = {
-        "link_state": Layer("Likeliest link state", _variable("link_state"), Normalize(0, 2), colours),
+        "link_state": Layer("Most probable link state", _variable("link_state"), Normalize(0, 2), colours),
         "state_mixture": Layer(
             "Link state", lambda data: mix_state_colours(data["p_los"], data["p_nlos"], data["p_outage"])
         ),
@@ -551,7 +551,7 @@ def plot_network(network: xr.Dataset) -> Figure:
     servers = ListedColormap(server_colours(len(names)))
     best, norm = network["best_server"].to_numpy(), Normalize(-0.5, len(names) - 0.5)
     _draw_network(axes[0, 0], network, np.where(best >= 0, best, np.nan), servers, norm)
-    axes[0, 0].set_title("Likeliest best server")
+    axes[0, 0].set_title("Most probable best server")
     bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
     bar.ax.set_yticklabels(names, parse_math=False)
     threshold_db = float(network.attrs["sinr_threshold_db"])

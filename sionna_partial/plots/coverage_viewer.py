@@ -38,7 +38,7 @@ STATES = ["outage", "LOS", "NLOS"]
 _STRONGEST = "best server"
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
-    ("likeliest state", "@link_state{custom}"),
+    ("most probable state", "@link_state{custom}"),
     ("LOS, NLOS, outage", "@p_los{0.000}, @p_nlos{0.000}, @p_outage{0.000}"),
     ("path gain", "@gain_mean_db{0.0} ± @gain_std_db{0.0} dB"),
     ("P(gain > threshold)", "@p_above{0.000}"),

@@ -324,7 +324,7 @@ def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
         below.set(xlim=(0.0, 1.0))
         below.set_xticks([0.0, 0.5, 1.0])
     middle = axes[:, len(stages) // 2]
-    middle[0].set_xlabel("probability of the likeliest link state")
+    middle[0].set_xlabel("probability of the most probable link state")
     middle[1].set_xlabel("predicted probability of a smaller path gain")
     axes[0, 0].set_ylabel("accuracy")
     axes[1, 0].set_ylabel("density")

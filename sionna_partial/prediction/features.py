@@ -569,7 +569,7 @@ def features_of_paths(
 
     `blocks` are from `Simulation.blocks`. Without `windows` there is no context.
     """
-    classes = 1 + bool(partial.thick_walls.any()) if material_unknown else 0
+    classes = partial.wall_class_count * material_unknown
     limits = (settings[0].max_walls,) * classes + (settings[0].max_depth,) * material_unknown
     sums = LinkSums(1, len(rx_m), *limits)
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))

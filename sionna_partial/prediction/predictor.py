@@ -258,9 +258,7 @@ class LinkPrediction(Shown):
 
     def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
         """Select links by an index array, a mask (N,) or a slice."""
-        return self.mapped(
-            lambda links: LinkPrediction(*(getattr(links, column.name)[index] for column in fields(links)))
-        )
+        return self._by_column(lambda column: column[index])
 
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
@@ -289,9 +287,10 @@ class LinkPrediction(Shown):
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
         """Return the links in another shape."""
-        return self.mapped(
-            lambda links: LinkPrediction(*(getattr(links, column.name).reshape(shape) for column in fields(links)))
-        )
+        return self._by_column(lambda column: column.reshape(shape))
+
+    def _by_column(self, change: Callable[[Floats], Floats]) -> LinkPrediction:
+        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, each.name)) for each in fields(links))))
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` where a mask (N,) is True, this distribution elsewhere."""
@@ -635,10 +634,9 @@ class OtherPredictor:
         require_each(
             np.asarray(stds_db.min(axis=0) >= 0.0), f"{self.name}.predict: std", stds_db.min(axis=0), "give 0 or more."
         )
-        floor = np.full((1, len(phi)), GAIN_FLOOR_DB)
-        means_db = np.concatenate([floor, np.clip(means_db, GAIN_FLOOR_DB, 0.0)])
+        means_db = np.pad(np.clip(means_db, GAIN_FLOOR_DB, 0.0), ((1, 0), (0, 0)), constant_values=GAIN_FLOOR_DB)
         return LinkPrediction.of_parts(
-            probabilities / probabilities.sum(axis=0), means_db, np.concatenate([0.0 * floor, stds_db])
+            probabilities / probabilities.sum(axis=0), means_db, np.pad(stds_db, ((1, 0), (0, 0)))
         )
 
     def predict_indoor(self, phi: LinkFeatures) -> Floats:

@@ -84,7 +84,7 @@ class WallMaterials:
 
     @classmethod
     @lru_cache(maxsize=16)
-    def at(cls, frequency_hz: float, *, several: bool = False) -> "WallMaterials":
+    def at(cls, frequency_hz: float, class_count: int = 1) -> "WallMaterials":
         covered_hz = min(max(frequency_hz, MODELS_HZ[0]), MODELS_HZ[1])
         mean_db = np.array([wall_loss_db(WALL_MATERIALS[name], covered_hz) for name in COMMON])
         losses_db = np.geomspace(mean_db.min() / BELOW, np.clip(mean_db.max(), *LARGEST_DB), CROSSINGS)
@@ -93,7 +93,7 @@ class WallMaterials:
         of_loss = density / density.sum(axis=0) @ [*COMMON.values()]
         prior, level = np.tile(of_loss / len(REFLECTIONS_DB), len(REFLECTIONS_DB)), np.arange(CROSSINGS)
         pairs, reflection_db = np.tile(level, (2, len(REFLECTIONS_DB))), np.repeat(REFLECTIONS_DB, CROSSINGS)
-        if several:
+        if class_count > 1:
             of_few = of_loss.reshape(-1, EVERY).sum(axis=1)
             differ = np.array(np.nonzero(~np.eye(len(of_few), dtype=bool)))
             of_pair = of_few[differ].prod(axis=0)

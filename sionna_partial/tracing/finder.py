@@ -31,7 +31,7 @@ from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
 from sionna_partial.tracing.select import Block, Kind, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
-from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies, solid_sides
+from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies
 
 CANDIDATES_AT_ONCE = 100_000
 """Number of candidates verified together, to bound the memory."""
@@ -65,10 +65,8 @@ class PlanScene:
 
     @cached_property
     def interior(self) -> Interior:
-        depth_m, partial = self.settings.wall_depth_m, self.partial
-        walls = (partial.state == CellState.WALL) & (depth_m > 0.0)
-        solid = solid_sides(self.geometry.plan, walls, partial.resolution_m)
-        return Interior.of(partial.state == CellState.FREE, self.floor, solid, partial.resolution_m, depth_m)
+        free = self.partial.state == CellState.FREE
+        return Interior.of(free, self.floor, self.partial.resolution_m, self.settings.wall_depth_m)
 
     def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
         geometry, settings = self.geometry, self.settings

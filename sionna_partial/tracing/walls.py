@@ -2,7 +2,7 @@
 
 Consecutive faces are one wall if they are at most `depth_m` apart, measured across them, with no free cell of the map
 between them; in meshes also where the line enters and leaves a closed body. One face of a wall has its loss, and none
-reflects a path that came through another.
+reflects a path in the wall. Where a wall meets another, that one reflects, as if the wall continued behind a mirror.
 
 Plans and meshes group faces in two functions: a mesh counts from the near end of the line, where its cells are also
 sampled, and a common function would change the order of close faces.
@@ -17,49 +17,33 @@ from scipy.sparse.csgraph import connected_components
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.process import njit
-from sionna_partial.scene.outlines import Plan
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes
 from sionna_partial.tracing.power import Materials
+
+_PARALLEL = 0.5
+"""Smallest cosine of the angle between parallel faces."""
+
+_CUT_CELLS = 1.25
+"""Largest distance of a face from the cells of its wall [cells]."""
 
 
 class Interior(NamedTuple):
     """Space between walls: cells (ny, nx) that are free or have a floor, their edge and the largest wall depth [m].
 
-    `free_before` (ny + 1, nx + 1) counts the free cells in smaller rows and columns. `solid` (P, 2) is True where the
-    wall continues on the left or right of its pieces.
+    `free_before` (ny + 1, nx + 1) counts the free cells in smaller rows and columns.
     """
 
     free: Bools
     free_before: Indices
     floor: Bools
-    solid: Bools
     cell_m: float
     depth_m: float
 
     @classmethod
-    def of(cls, free: Bools, floor: Bools, solid: Bools, cell_m: float, depth_m: float) -> "Interior":
+    def of(cls, free: Bools, floor: Bools, cell_m: float, depth_m: float) -> "Interior":
         before = np.pad(free.astype(np.int64).cumsum(axis=0).cumsum(axis=1), ((1, 0), (1, 0)))
-        return cls(free, before, floor, solid, cell_m, depth_m)
-
-
-def solid_sides(plan: Plan, walls: Bools, cell_m: float) -> Bools:
-    """Return which pieces (P,) of walls have only wall cells a cell away on their left and right (P, 2)."""
-    start, along = plan.pieces_m[:, 0], plan.pieces_m[:, 1] - plan.pieces_m[:, 0]
-    length = np.hypot(*along.T)
-    count = np.maximum(1, np.ceil(length / cell_m)).astype(np.int64)
-    piece = np.repeat(np.arange(len(start)), count)
-    part = (np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + 0.5) / count[piece]
-    normal = np.stack([-along[:, 1], along[:, 0]], axis=1) / length[:, None] * cell_m
-    solid = np.ones((len(start), 2), dtype=bool)
-    for side, sign in enumerate((1.0, -1.0)):
-        points = start[piece] + part[:, None] * along[piece] + sign * normal[piece]
-        column, row = np.floor(points / cell_m).astype(np.int64).T
-        inside = (row >= 0) & (row < walls.shape[0]) & (column >= 0) & (column < walls.shape[1])
-        wall = inside.copy()
-        wall[inside] = walls[row[inside], column[inside]]
-        np.logical_and.at(solid[:, side], piece, wall)
-    return solid
+        return cls(free, before, floor, cell_m, depth_m)
 
 
 class Bodies(NamedTuple):
@@ -155,21 +139,33 @@ def is_one_wall(mesh, first, second, a, b, begin, end):
 
 
 @njit(cache=True)
-def is_inside(mesh, first, second, a, b, begin, end):
-    """Return whether two faces, met at fractions of a line from a to b, enclose the inside of one wall.
-
-    Faces that are across each other are a wall and the floor below it, or two walls at a corner.
-    """
+def is_inside(mesh, first, second, crossed, a, b):
+    """Return whether a line is in one wall from a on one face to b on another, and as `is_far_inside`."""
     normal, p, q = mesh.planes.normal, mesh.planes.plane[first], mesh.planes.plane[second]
-    if abs(normal[p, 0] * normal[q, 0] + normal[p, 1] * normal[q, 1] + normal[p, 2] * normal[q, 2]) < 0.5:
-        return False
+    turn = normal[p, 0] * normal[q, 0] + normal[p, 1] * normal[q, 1] + normal[p, 2] * normal[q, 2]
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
-    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    length = max(np.sqrt(dx * dx + dy * dy + dz * dz), 1e-12)
     kx, ky, kz = dx / length, dy / length, dz / length
     steep = min(cosine_at(mesh.planes, first, kx, ky, kz), cosine_at(mesh.planes, second, kx, ky, kz))
-    if (end - begin) * length * steep > mesh.cells.depth_m:
-        return False
-    return is_one_wall(mesh, first, second, a, b, begin, end)
+    inside = length * steep <= mesh.cells.depth_m and is_one_wall(mesh, first, second, a, b, 0.0, 1.0)
+    return inside, is_far_inside(mesh.cells, turn, length * cosine_at(mesh.planes, crossed, kx, ky, kz))
+
+
+@njit(cache=True)
+def are_parallel(turn):
+    return abs(turn) >= _PARALLEL
+
+
+@njit(cache=True)
+def is_far_inside(cells, turn, distance_m):
+    """Return whether a face, at a turn and distance from a crossed face, is not in a corner with it."""
+    return are_parallel(turn) or distance_m > 0.5 * cells.depth_m
+
+
+@njit(cache=True)
+def reflects_inside(before, after):
+    """Return whether a face reflects a path in a wall; `before` and `after` are from `is_inside`."""
+    return (before[0] and (before[1] or after[0])) or (after[0] and after[1])
 
 
 @njit(cache=True)
@@ -247,7 +243,7 @@ def is_free_between(cells, start, end, first, last):
     """Return whether a leg meets a free cell between two fractions, except cells cut by the faces there."""
     dx, dy = end[0] - start[0], end[1] - start[1]
     length = np.hypot(dx, dy)
-    s, high = first * length + cells.cell_m, last * length - cells.cell_m
+    s, high = first * length + _CUT_CELLS * cells.cell_m, last * length - _CUT_CELLS * cells.cell_m
     while s <= high:
         column, row = int((start[0] + s / length * dx) / cells.cell_m), int((start[1] + s / length * dy) / cells.cell_m)
         if 0 <= row < cells.free.shape[0] and 0 <= column < cells.free.shape[1] and cells.free[row, column]:

@@ -42,7 +42,7 @@ from sionna_partial.tracing.power import (
     vertical_field,
 )
 from sionna_partial.tracing.select import Limits, Listed, discount_after, needs_by_distance
-from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces
+from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces, reflects_inside
 
 _REACH, _REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may be farther than the rays reached."""
@@ -357,7 +357,7 @@ def fold_line(node, target, images, face, points):
 def _follow(reflections, target, links, met, entries, faces, points):
     """Write all faces on a path with reflections; return their number, -1 if it crosses no or too many walls."""
     mesh, count, crossed = links.mesh, 0, 0
-    a, own = links.tx_m, np.int64(-1)
+    a, own, before = links.tx_m, np.int64(-1), (False, False)
     for k in range(reflections + 1):
         b, other = target, np.int64(-1)
         if k < reflections:
@@ -366,14 +366,16 @@ def _follow(reflections, target, links, met, entries, faces, points):
         if number == MOST_FACES or count + number + 1 > len(entries.face):
             return -1
         crossed += mark_walls(mesh, a, b, number, met, entries, count)
-        inside = number > 0 and (
-            (k > 0 and is_inside(mesh, faces[k - 1], met.face[0], a, b, 0.0, met.at[0]))
-            or (k < reflections and is_inside(mesh, met.face[number - 1], faces[k], a, b, met.at[number - 1], 1.0))
-        )
-        if inside or crossed > links.limits.walls:
+        after = False, False
+        if k > 0 and number > 0:
+            after = is_inside(mesh, faces[k - 1], met.face[0], met.face[0], a, entries.point_m[count])
+        if reflects_inside(before, after) or crossed > links.limits.walls:
             return -1
-        count += number
+        count, before = count + number, (False, False)
         if k < reflections:
+            if number > 0:
+                last = met.face[number - 1]
+                before = is_inside(mesh, last, faces[k], last, entries.point_m[count - 1], b)
             entries.face[count], entries.kind[count], entries.same_wall[count] = faces[k], REFLECTION, False
             entries.point_m[count] = b
             count += 1

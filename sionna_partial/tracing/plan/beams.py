@@ -41,7 +41,7 @@ from sionna_partial.tracing.plan.clipping import (
 from sionna_partial.tracing.plan.room import FACES, Building, Room
 from sionna_partial.tracing.power import COSINES, gain_between
 from sionna_partial.tracing.select import discount_after, matters, needs_by_distance
-from sionna_partial.tracing.walls import are_in_wall
+from sionna_partial.tracing.walls import are_in_wall, are_parallel
 
 _BEAMS_AT_ONCE = 256
 """Number of beams through walls that a thread follows at a time."""
@@ -451,9 +451,8 @@ def _sort_by_distance(layers, count, t):
 @njit(cache=True)
 def _lay_one(beam, i, active, task, layers, windows):
     scratch, plan_line, low = layers.clipped, task.building.plan.line, task.building.plan.low
-    pieces = task.building.plan.pieces_m
     of_piece, interior = task.building.material, task.building.interior
-    solid, depth_m = interior.solid, interior.depth_m
+    depth_m = interior.depth_m
     most_reflected = task.building.materials.most_reflected
     most_transmitted = task.building.materials.most_transmitted
     limits, left, crossed = task.building.limits, beam.left, beam.crossed
@@ -463,6 +462,8 @@ def _lay_one(beam, i, active, task, layers, windows):
     t1, x_1, y_1, size_1 = scratch.edge[i + 1], layers.ray[i + 1, 0], layers.ray[i + 1, 1], layers.ray[i + 1, 2]
     start_0 = start_1 = steep_0 = steep_1 = first = 0.0
     before_0, before_1, may_be_same = size_0, size_1, order > 0 and depth_m > 0.0
+    vx, vy = beam.window[4] - beam.window[2], beam.window[5] - beam.window[3]
+    width = max(np.hypot(vx, vy), 1e-12)
     for j in range(min(active, FACES)):
         c = scratch.active[j]
         piece = scratch.wall[c]
@@ -480,9 +481,11 @@ def _lay_one(beam, i, active, task, layers, windows):
         if not matters(total * discount, near, task.sources.needed):
             break
         rays = (x_0, y_0, cos_0, before_0, r_0), (x_1, y_1, cos_1, before_1, r_1)
-        inside = may_be_same and are_in_wall(interior, beam.window[0], beam.window[1], rays)
+        inside = may_be_same and are_parallel((ux * vx + uy * vy) / width)
+        inside = inside and are_in_wall(interior, beam.window[0], beam.window[1], rays)
         before_0, before_1, may_be_same = r_0, r_1, depth_m > 0.0 and not low[piece]
-        if beam.more > 0 and not ((inside and j > 0) or _is_solid(pieces, solid, beam.window, piece)):
+        vx, vy, width = ux, uy, 1.0
+        if beam.more > 0 and not (inside and j > 0):
             flat = near / np.hypot(near, 2.0 * task.building.room.height_m)
             part = most_reflected[material, int(min(cos_0, cos_1) * flat * COSINES)]
             if matters(part * total * next_discount, near, task.sources.needed):
@@ -506,14 +509,6 @@ def _lay_one(beam, i, active, task, layers, windows):
             break
         layers.left[i, j], layers.crossed[i, j] = left, crossed
     return windows
-
-
-@njit(cache=True)
-def _is_solid(pieces, solid, beam, piece):
-    px, py = pieces[piece, 0, 0], pieces[piece, 0, 1]
-    dx, dy = pieces[piece, 1, 0] - px, pieces[piece, 1, 1] - py
-    left = dx * (beam[1] - py) - dy * (beam[0] - px) > 0.0
-    return solid[piece, 0 if left else 1]
 
 
 @njit(cache=True)

@@ -34,6 +34,7 @@ from sionna_partial.tracing.plan.room import (
     has_long_legs,
     has_variant,
     height_at,
+    is_reflected_inside,
     rise_of,
     trail_of,
     write_path,
@@ -119,6 +120,8 @@ def _meet(k, building, target, trail):
         if level < k:
             count = add_entry(trail, count, other, np.int64(REFLECTION), end[0], end[1], stop)
         start, done, own = end, stop, other
+    if building.interior.depth_m > 0.0 and is_reflected_inside(building.plan, building.interior, count, trail):
+        return -1, crossed
     return count, crossed
 
 

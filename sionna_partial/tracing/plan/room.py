@@ -20,7 +20,7 @@ from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACT
 from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
 from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, gain_towards
 from sionna_partial.tracing.select import Limits
-from sionna_partial.tracing.walls import Interior, group_faces, is_free_between
+from sionna_partial.tracing.walls import Interior, group_faces, is_far_inside, is_free_between, reflects_inside
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
 """Surfaces: none, floor, ceiling, vertical edge; from `WALLS` on walls or entries of a trail."""
@@ -89,7 +89,7 @@ class Building(NamedTuple):
     @classmethod
     def opaque(cls, plan: Plan, room: Room, materials: Materials, max_depth: int) -> "Building":
         nothing = np.zeros((1, 1), np.bool_)
-        interior = Interior(nothing, np.zeros((2, 2), np.int64), nothing, np.zeros((0, 2), np.bool_), 1.0, 0.0)
+        interior = Interior(nothing, np.zeros((2, 2), np.int64), nothing, 1.0, 0.0)
         return cls.of(plan, interior, room, materials, Limits(max_depth, max_depth, 0, 1.0, 0.0))
 
 
@@ -227,18 +227,13 @@ def trail_of(plan: Plan) -> Trail:
 
 @njit(cache=True)
 def cross_leg(plan, interior, leg, count, trail):
-    """Add the faces that a leg crosses to `count` entries; return the number of entries, and of walls crossed.
-
-    The first is -1 if there are too many, or if a wall reflects a leg that came through another face of it.
-    """
+    """Add the faces that a leg crosses to `count` entries; return their number, -1 if too many, and walls crossed."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
     length = np.hypot(dx, dy)
     if length < 1e-9:
         return count, 0
     n = _faces_on(plan, leg, dx, dy, length, trail)
     if n < 0 or count + n >= len(trail.surface) - 1:
-        return -1, 0
-    if n > 0 and interior.depth_m > 0.0 and _is_reflected_inside(plan, interior, leg, n, trail):
         return -1, 0
     for j in range(n):
         t, i, entry = trail.found[j], trail.wall[j], count + j
@@ -313,19 +308,32 @@ def _cosine(plan, piece, dx, dy, length):
 
 
 @njit(cache=True)
-def _is_reflected_inside(plan, interior, leg, n, trail):
-    dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
-    length = np.hypot(dx, dy)
-    for wall, face, t in ((leg.own, 0, 0.0), (leg.other, n - 1, 1.0)):
-        if wall < 0 or plan.low[trail.wall[face]]:
-            continue
-        first, last = min(t, trail.found[face]), max(t, trail.found[face])
-        cosine = min(_cosine(plan, wall, dx, dy, length), _cosine(plan, trail.wall[face], dx, dy, length))
-        if (last - first) * length * cosine <= interior.depth_m and not is_free_between(
-            interior, leg.start, leg.end, first, last
-        ):
+def is_reflected_inside(plan, interior, count, trail):
+    """Return whether a wall reflects a path in it or in another wall."""
+    before, after = (False, False), (False, False)
+    for i in range(count):
+        before, after = after, (False, False)
+        if i + 1 < count and trail.kind[i] != trail.kind[i + 1]:
+            after = _is_inside(plan, interior, i, trail)
+        if trail.kind[i] == REFLECTION and reflects_inside(before, after):
             return True
     return False
+
+
+@njit(cache=True)
+def _is_inside(plan, interior, i, trail):
+    """Return whether a path is in one wall between entry i and the next, and as `is_far_inside`."""
+    first, second = trail.surface[i], trail.surface[i + 1]
+    crossed = second if trail.kind[i] == REFLECTION else first
+    if plan.low[crossed]:
+        return False, False
+    (ax, ay, _), (bx, by, _) = trail.points[i], trail.points[i + 1]
+    dx, dy, turned = bx - ax, by - ay, plan.pieces_m[first, 1] - plan.pieces_m[first, 0]
+    length, size = max(np.hypot(dx, dy), 1e-12), np.hypot(turned[0], turned[1])
+    cosine = min(_cosine(plan, first, dx, dy, length), _cosine(plan, second, dx, dy, length))
+    inside = length * cosine <= interior.depth_m and not is_free_between(interior, (ax, ay), (bx, by), 0.0, 1.0)
+    turn = _cosine(plan, second, -turned[1], turned[0], size)
+    return inside, is_far_inside(interior, turn, length * _cosine(plan, crossed, dx, dy, length))
 
 
 @njit(cache=True)
