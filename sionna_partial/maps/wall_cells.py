@@ -185,8 +185,9 @@ def _seen_faces(state: States) -> tuple[Indices, Indices]:
 
 
 def _is_line(columns: Indices) -> Bools:
-    steps = np.diff(columns, axis=0)
-    return (abs(steps) <= 2).all(axis=0) & ~((steps > 0).any(axis=0) & (steps < 0).any(axis=0))
+    """Return whether steps between rows are at most 2, all to the same side."""
+    size, sideways = abs(np.diff(columns, axis=0)), abs(columns[-1] - columns[0])
+    return np.logical_and(size.max(axis=0) <= 2, size.sum(axis=0) == sideways)
 
 
 def _sticks_out(columns: Indices) -> Bools:

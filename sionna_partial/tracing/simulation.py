@@ -500,7 +500,7 @@ def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settin
         return 1
     if scene_settings.geometries is not None:
         return scene_settings.geometries
-    if trace_settings.through_walls or not partial.is_nearly_complete:
+    if trace_settings.through_walls or partial.is_complete or not partial.is_nearly_complete:
         return 1
     return 1 if partial.wall_noise <= LEAST_NOISE else GEOMETRIES
 
