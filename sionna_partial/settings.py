@@ -243,7 +243,8 @@ class TraceSettings(Checked):
         True if walls of a floor plan also diffract at ends where observation stopped.
     power_tolerance_db : float or None
         Largest change of the power of a link's indirect paths by leaving out weak paths [dB], 0 to 1; 0 keeps every
-        path. None is 0.1 for powers and predictions, and 0 for channels, for which links are traced again.
+        path. None is 0.1 for powers and predictions, and 0 for channels, for which links are traced again. Predictions
+        leave out more paths, and add their expected power.
     refraction : bool or None
         True if paths go through walls. None is True below 24 GHz only, as the paper assumes opaque walls.
     max_walls : int

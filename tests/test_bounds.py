@@ -5,6 +5,7 @@ import pytest
 from extruded import ROOM, SPLINTERS, drawn, drywall, extrude, room_of
 
 import sionna_partial as sp
+from sionna_partial.checks import no_progress
 from sionna_partial.constants import LinkState
 from sionna_partial.scene.scene import write_scene
 from sionna_partial.tracing.engine import SceneSolver
@@ -110,3 +111,8 @@ def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance
     assert (lost_db >= -1e-6).all()
     assert lost_db.max() <= tolerance_db
     assert np.abs(every.gain_db - some.gain_db).max() <= tolerance_db
+    model = sp.LinkModel(plan)
+    amplified = sum(len(paths.a) for paths in model.simulation.blocks(np.array(tx), np.array(rx), no_progress))
+    assert amplified < 0.5 * len(some.a)
+    gain_db = model.features(tx, rx).gain_db
+    assert np.abs(every.gain_db - gain_db).max() <= 0.5 * tolerance_db

@@ -68,13 +68,15 @@ def test_variables_have_cf_attributes_and_are_missing_exactly_where_no_receiver_
     assert coverage["x"].attrs["standard_name"] == "projection_x_coordinate"
 
 
-def test_each_receiver_has_the_prediction_of_its_own_link(coverage):
-    """As traced and predicted step by step, in another order of the receivers."""
-    partial, model, valid = map_of(PICTURE), shipped(), coverage["valid"].to_numpy()
+def test_each_receiver_has_the_prediction_of_its_own_link():
+    """As traced and predicted step by step, in another order of the receivers, with every path."""
+    partial, model, every = map_of(PICTURE), shipped(), TraceSettings(power_tolerance_db=0.0)
+    coverage = predicted(partial, spacing_m=0.5, trace_settings=every)
+    valid = coverage["valid"].to_numpy()
     x, y = np.meshgrid(coverage["x"], coverage["y"])
     order = np.random.default_rng(0).permutation(valid.sum())
     rx_m = np.column_stack([x[valid], y[valid], np.full(valid.sum(), 1.5)])[order]
-    phi = link_features(partial, trace_links(partial, (*TX, 1.5), rx_m))
+    phi = link_features(partial, trace_links(partial, (*TX, 1.5), rx_m, trace_settings=every))
     free = partial.state_at(rx_m) == CellState.FREE
     prediction, p_indoor = model.predict(phi), model.predict_indoor(phi)
     expected = arrays(prediction) | {

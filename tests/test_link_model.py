@@ -79,6 +79,7 @@ def test_is_taken_in_place_of_a_map():
     assert sp.trace_links(model, TX, RX).gain_db.shape == (2,)
     assert sp.place_transmitter(model).partial is model.partial
     assert sp.next_views(model, goal="area").partial is model.partial
+    model = sp.LinkModel(half_open(sp.CellState.UNKNOWN), trace_settings=sp.TraceSettings(power_tolerance_db=0.0))
     gain_db = sp.DifferentiableScene(model).links(TX, RX)().gain_mean_db
     assert gain_db.numpy() == pytest.approx(model.predict(TX, RX).gain_mean_db, abs=1e-6)
 

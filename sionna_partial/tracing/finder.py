@@ -156,7 +156,7 @@ class ExactFinder:
                     more = stage.left_out(power)
                     left_out[:], power[:] = left_out + more, power + more
 
-        yield from (_completed([*verified()], left_out) if estimates else verified())
+        yield from (_completed([paths for _, paths in verified()], left_out) if estimates else verified())
 
 
 class RayFinder:
@@ -243,16 +243,16 @@ def _verified(
             waiting.append(block)
 
 
-def _completed(found: list[Found], left_out: Floats) -> Iterator[Found]:
+def _completed(found: list[SolvedPaths], left_out: Floats) -> Iterator[Found]:
     """Amplify indirect paths by the power (N,) left out; straight ones through walls only where others have less."""
-    straight = [np.isin(paths.interactions, (0, REFRACTION)).all(axis=1) for _, paths in found]
+    straight = [np.isin(paths.interactions, (0, REFRACTION)).all(axis=1) for paths in found]
     power, others = np.zeros(len(left_out)), np.zeros(len(left_out))
-    for (_, paths), mask in zip(found, straight, strict=True):
+    for paths, mask in zip(found, straight, strict=True):
         for total, some in ((power, ~paths.is_direct), (others, ~mask)):
             np.add.at(total, paths.path_rx[some], paths.power[some])
     total = np.where(others > left_out, others, power)
     amplitude = np.sqrt(1.0 + np.minimum(left_out, total) / np.maximum(total, np.finfo(float).tiny))
-    for (_, paths), mask in zip(found, straight, strict=True):
+    for paths, mask in zip(found, straight, strict=True):
         kept = paths.is_direct | (mask & (others > left_out)[paths.path_rx])
         yield None, _amplified(paths, np.where(kept, 1.0, amplitude[paths.path_rx]))
 

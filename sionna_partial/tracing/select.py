@@ -28,8 +28,8 @@ _STRONGEST, _OCTAVE = -50, 4
 _FOUND = 0.8
 """Expected power of the verified paths of a link, relative to the sum of bounds."""
 
-_WRITTEN_AT_ONCE = 100_000
-"""Number of candidates written together, to bound the memory."""
+_WRITTEN_AT_ONCE = 25_000
+"""Number of candidates that one thread writes together, to bound the memory."""
 
 _USUAL_REFLECTIONS = 3
 """Reflections beyond which the power of a path through walls is discounted."""
@@ -131,6 +131,7 @@ class Selection:
         for expected, *part in ((expected_power(self.power), span[0], middle), (0.0, middle, span[1])):
             first, self.end = self.end, np.maximum(self.end, self.needed(found + expected, tolerance_db))
             yield self._blocks(first, *part)
+        self.parts.clear()  # the next stage needs the memory
 
     def left_out(self, found: Floats) -> Floats:
         """Expect the ratio of power and bounds of the selected candidates for the others, too."""
