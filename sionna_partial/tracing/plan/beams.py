@@ -227,7 +227,7 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
     starts, nothing = range(0, count, at_once), tuple(column[:0] for column in beams[:6])
     found = in_order(followed, starts) if len(starts) > 1 else map(followed, starts)
     children, pair, through = zip((nothing, np.zeros((0, 2), np.int32), np.zeros(0)), *found, strict=True)
-    columns = [np.concatenate(column) for column in zip(*children, strict=True)]
+    columns: list[Any] = [np.concatenate(column) for column in zip(*children, strict=True)]
     above, line, lines = columns[0] - before, building.plan.line[columns[1]], int(building.plan.line.max(initial=0)) + 1
     _, sequence = np.unique(beams.sequence[above] * lines + line, return_inverse=True)
     along = building.plan.pieces_m[columns[1], 1] - building.plan.pieces_m[columns[1], 0]
@@ -235,8 +235,8 @@ def follow(tree: BeamTree, beams: Beams, task: Task) -> tuple[Beams, NDArray[np.
     turn_rad = (beams.turn_rad[above] + twice) % (2.0 * math.pi)
     pairs, receivers = np.concatenate(pair), max(1, len(task.receivers.order))
     _, once = np.unique(beams.sequence[pairs[:, 0] - before] * receivers + pairs[:, 1], return_index=True)
-    columns += [beams.origin[above], turn_rad, sequence]
-    return Beams(*columns, beams.reflections + 1), pairs[once], np.concatenate(through)[once]
+    columns += [beams.origin[above], turn_rad, sequence, beams.reflections + 1]
+    return Beams(*columns), pairs[once], np.concatenate(through)[once]
 
 
 @njit(cache=True, nogil=True)

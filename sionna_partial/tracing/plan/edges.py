@@ -247,22 +247,20 @@ class DiffractionCandidates(_EdgeCandidates):
         needed = needed_of(np.maximum(_NEGLIGIBLE * found, _UNSEEN if found.any() else 0.0), room, 4.0 * np.pi)
         if not len(reached):
             return
-        bounds = _Bounds(*_bounds_of_arrivals(edges, arrivals, materials, highest_m), highest_m)
+        most, faces, power = _bounds_of_arrivals(edges, arrivals, materials, highest_m)
+        bounds = _Bounds(most, faces, power, highest_m)
         start = arrivals.start[reached]
         onward = np.arange(self._walls_a_side + 1)
         possible = arrivals.reflections[:, None] <= self._reflections - onward
-        sums = [np.add.reduceat(bounds.power * some[:, None], start) for some in possible.T]
-        columns = (
-            edges.position_m[reached],
-            np.logical_or.reduceat(possible, start).sum(axis=1) - 1,
-            np.stack(sums, axis=1),
-            np.minimum.reduceat(arrivals.length_m, start),
-        )
+        sums = [np.add.reduceat(power * some[:, None], start) for some in possible.T]
+        more, strongest = np.logical_or.reduceat(possible, start).sum(axis=1) - 1, np.stack(sums, axis=1)
+        position_m, before_m = edges.position_m[reached], np.minimum.reduceat(arrivals.length_m, start)
         groups = [slice(first, first + _EDGES_AT_ONCE) for first in range(0, len(reached), _EDGES_AT_ONCE)]
 
         def of_group(number: int) -> Listed:
             unlisted, group = np.zeros(len(found)), groups[number]
-            sources = Sources(*(column[group] for column in columns), needed, unlisted)
+            ends = position_m[group], more[group], strongest[group], before_m[group]
+            sources = Sources(*ends, needed, unlisted)
             tree, pairs = trace_beams(self._building, receivers, sources)
             departures = _depart(tree, pairs, reached[group], edges, self._building, highest_m, self._reflections)
             listing = edges, arrivals, departures, bounds
