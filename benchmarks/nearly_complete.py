@@ -105,7 +105,7 @@ def links_of(home: sp.PartialMap, partial: sp.PartialMap) -> Links:
             for scene, settings in ((home, None), (partial, None), (partial, single))
         )
         phi = sp.link_features(partial, traced)
-        alone = replace(phi, context=replace(phi.context, nearly_complete=np.zeros(len(phi), dtype=bool)))
+        alone = replace(phi, context=replace(phi.context, both_seen=np.zeros(len(phi), dtype=bool)))
         models = {
             "mapped walls": LinkPrediction.of_trace(sp.link_features(partial, mapped, windows=False)),
             "mean": LinkPrediction.of_trace(phi),

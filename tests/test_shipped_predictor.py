@@ -14,7 +14,7 @@ from sionna_partial.evaluation import WITH_INDOOR, Evaluation
 from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.features import excess_noise
 from sionna_partial.prediction.map_networks import SEEN_WIDENING, WIDENING
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.predictor import NARROWER, LinkPrediction
 from sionna_partial.resources import scenes_folder
 
 pytestmark = QUIET
@@ -54,6 +54,7 @@ def test_a_map_with_range_noise_is_predicted_less_certainly(range_noise_m: float
     wall_noise = links.context.wall_noise[0]
     assert low <= wall_noise <= high
     phi = links.phi
+    phi = replace(phi, context=replace(phi.context, both_seen=np.zeros(len(links), dtype=bool)))
     as_exact = replace(phi, context=replace(phi.context, wall_noise=np.zeros(len(links))))
     wider, usual = (shipped().predict(each) for each in (phi, as_exact))
     both_seen = links.context.tx_seen & links.context.rx_seen
@@ -91,7 +92,7 @@ def test_on_a_nearly_complete_map_the_trace_counts_with_its_errors(noise: float)
     rx_m = [(1.0, 4.5, 1.5), (6.0, 1.0, 1.5), (7.5, 4.8, 1.5), (7.9, 0.4, 1.5), (2.2, 2.2, 1.5)]
     phi = sp.link_features(partial, sp.trace_links(partial, (1.0, 1.0, 1.5), rx_m))
     assert phi.context.nearly_complete.tolist() == [True, True, True, True, False]
-    alone = replace(phi, context=replace(phi.context, nearly_complete=np.zeros(5, dtype=bool)))
+    alone = replace(phi, context=replace(phi.context, both_seen=np.zeros(5, dtype=bool)))
     ours, networks = (shipped().predict(each) for each in (phi, alone))
     np.testing.assert_allclose(ours.p_los + ours.p_nlos + ours.p_outage, 1.0)
     assert (ours.gain_std_db[:4] > 0.1).all()
@@ -102,5 +103,15 @@ def test_on_a_nearly_complete_map_the_trace_counts_with_its_errors(noise: float)
     exact = LinkPrediction.of_nearly_complete(replace(phi, context=replace(phi.context, wall_noise=np.zeros(5))), 28e9)
     rough = LinkPrediction.of_nearly_complete(phi, 28e9)
     assert (rough.gain_std_db >= exact.gain_std_db).all()
+    incomplete = replace(phi.context, nearly_complete=np.zeros(5, dtype=bool))
+    hidden = replace(incomplete, indirect_gain_db=np.column_stack([phi.context.indirect_gain_db[:, :-1], [-150.0] * 5]))
+    unseen = replace(hidden, both_seen=np.zeros(5, dtype=bool))
+    traced = (phi.link_state == sp.LinkState.NLOS) & (rough.gain_std_db < NARROWER * networks.gain_std_db)
+    assert (traced & incomplete.both_seen).any()
+    open_map, open_path, alone_too = (
+        shipped().predict(replace(phi, context=context)).gain_mean_db for context in (incomplete, hidden, unseen)
+    )
+    np.testing.assert_array_equal(open_map, networks.where(traced & incomplete.both_seen, rough).gain_mean_db)
+    np.testing.assert_array_equal(open_path, alone_too)
     complete = replace(phi, context=replace(phi.context, complete=np.ones(5, dtype=bool)))
     assert (shipped().predict(complete).gain_std_db[:4] == 0.0).all()

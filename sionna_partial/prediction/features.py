@@ -67,8 +67,10 @@ class LinkContext(Shown):
         True in observed cells.
     complete : (N,) bool array
         The map is complete and one end is observed: the trace is the truth.
+    both_seen : (N,) bool array
+        Both ends are observed, on a floor plan.
     nearly_complete : (N,) bool array
-        The map is nearly complete and both ends are observed: the trace is close to the truth.
+        The map is nearly complete too: the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
@@ -96,6 +98,7 @@ class LinkContext(Shown):
     tx_seen: Bools
     rx_seen: Bools
     complete: Bools
+    both_seen: Bools
     nearly_complete: Bools
     walled_m: Floats
     wall_noise: Floats
@@ -125,19 +128,20 @@ class LinkContext(Shown):
     ) -> "LinkContext":
         """Compute the context of links on the maps `map_index` (N,), without windows."""
         count = len(map_index)
-        tx_seen, rx_seen, complete, nearly = (np.zeros(count, dtype=bool) for _ in range(4))
+        tx_seen, rx_seen, complete, both_seen, nearly = (np.zeros(count, dtype=bool) for _ in range(5))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
         for number in np.unique(map_index):
             here, partial = map_index == number, maps[number]
             ends = tx_m[here], rx_m[here]
             tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
             complete[here] = is_enclosed(partial, *ends)
-            nearly[here] = tx_seen[here] & rx_seen[here] & partial.is_nearly_complete
+            both_seen[here] = tx_seen[here] & rx_seen[here] & partial.environment.is_extruded
+            nearly[here] = both_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
             wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
             seen = unobserved_distance_m[here] == 0.0
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
-        found = (tx_seen, rx_seen, complete, nearly, walled_m, wall_noise, possible)
+        found = (tx_seen, rx_seen, complete, both_seen, nearly, walled_m, wall_noise, possible)
         _, window_index = transmitters(map_index, tx_m)
         return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
 

@@ -61,7 +61,7 @@ SHIPPED = ("map", "paper")
 
 
 class TraceErrors(NamedTuple):
-    """Errors of the trace of a nearly complete map against the trace of the building.
+    """Errors of the trace of a nearly complete map, or of its seen part, against the trace of the building.
 
     The depth of a link is its traced gain below free space [dB].
 
@@ -93,9 +93,13 @@ class TraceErrors(NamedTuple):
     nlos_slope: float
 
 
-EXACT = TraceErrors(0.03, 18.0, 10.0, 0.001, -12.0, 7.0, 0.01, 0.08, 0.2, 2.2, 0.03, 0.0)
-NOISY = TraceErrors(0.25, 15.0, 16.0, 0.01, -6.0, 5.0, 0.9, 0.2, 0.4, 3.5, 0.17, 0.05)
-"""Errors on maps without and with full noise; measured on procedural homes, halls and warehouses with even seeds."""
+EXACT = TraceErrors(0.03, 18.0, 10.0, 0.001, -12.0, 7.0, 0.01, 0.2, 0.2, 1.3, 0.085, 0.06)
+NOISY = TraceErrors(0.25, 15.0, 16.0, 0.01, -6.0, 5.0, 0.9, 0.4, 0.4, 3.8, 0.13, 0.1)
+"""Errors on maps without and with full noise; measured on procedural homes, floors, halls and warehouses."""
+
+NARROWER, MOST_UNSEEN_DB = 0.85, 10.0
+"""Limits below which the trace predicts an NLOS link of an incomplete map: ratio of its standard deviation to the
+networks', and indirect power over the power through observed space [dB]."""
 
 MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 
@@ -508,9 +512,12 @@ class Predictor(Shown):
         prediction = LinkPrediction.of_parts(
             *evaluate_context_networks(networks, features, self.settings.frequency_hz, read)
         )
-        if context.nearly_complete.any() and not self.settings.through_walls:
+        if context.both_seen.any() and not self.settings.through_walls:
             traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
-            prediction = prediction.where(context.nearly_complete, traced)
+            indirect_db, seen_db = context.indirect_gain_db[:, 0], context.indirect_gain_db[:, -1]
+            reached = (features.link_state == LinkState.NLOS) & (indirect_db - seen_db < MOST_UNSEEN_DB)
+            reached &= traced.gain_std_db < NARROWER * prediction.gain_std_db
+            prediction = prediction.where(context.both_seen & (context.nearly_complete | reached), traced)
         return prediction.where(context.complete, LinkPrediction.of_trace(features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
