@@ -194,10 +194,10 @@ class SceneSettings(Checked):
         Walls as straight lines fitted to the wall cells, or as the staircase through their centres, without
         `bridge_gap_m`.
     geometries : int or None
-        Number of geometries, 1 to 16, over which powers of links without line of sight are averaged: the mapped
-        outlines, and outlines with vertices moved at random by 2 cm. None is 3 on nearly complete maps with range noise
-        (`PartialMap.wall_noise` above 0.05) and opaque walls, else 1. Gradients, channels, meshes, links with a folder
-        and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
+        Number of geometries, 1 to 16, over which gains [dB] of links without line of sight are averaged: the mapped
+        outlines, and outlines with vertices moved at random by 2 cm. None is 3 on nearly complete maps with strong
+        range noise (`PartialMap.wall_noise` above 0.5) and opaque walls, else 1. Gradients, channels, meshes, links
+        with a folder and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
 
     Raises
     ------

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
-from sionna_partial.constants import CellState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.display import part_of
 from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import narrow_areas
@@ -179,9 +179,10 @@ class RayFinder:
 
 @dataclass(frozen=True)
 class MeanFinder:
-    """Finder of paths between mapped and drawn walls, with powers whose sum is the mean over these geometries.
+    """Finder of paths between mapped and drawn walls; the power of a link is the mean over these geometries in dB.
 
-    A link in sight between the mapped walls has the paths of that geometry alone; others have no direct path.
+    A link in sight between the mapped walls has the paths of that geometry alone; others have no direct path. An
+    outage counts as -150 dB.
     """
 
     mapped: ExactFinder | RayFinder
@@ -192,15 +193,19 @@ class MeanFinder:
     ) -> Iterator[Found]:
         count = 1 + len(self.drawn)
         found = list(self.mapped.paths(tx_m, rx_m, polarisations, part_of(report, 0.0, 1.0 / count), antenna))
-        amplitude = np.full(len(rx_m), count**-0.5)
+        in_sight, power = np.zeros(len(rx_m), dtype=bool), np.zeros((count, len(rx_m)))
         for _, paths in found:
-            amplitude[paths.path_rx[paths.is_direct]] = 1.0
-        hidden = np.flatnonzero(amplitude < 1.0).astype(np.int32)
+            in_sight[paths.path_rx[paths.is_direct]] = True
+            np.add.at(power[0], paths.path_rx, paths.power)
+        hidden = np.flatnonzero(~in_sight).astype(np.int32)
         for number, finder in enumerate(self.drawn, start=1):
             part = part_of(report, number / count, (number + 1) / count)
             for _, paths in finder.paths(tx_m, rx_m[hidden], polarisations, part, antenna):
                 indirect = paths.take(~paths.is_direct)
                 found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
+                np.add.at(power[number], found[-1][1].path_rx, indirect.power)
+        mean = np.exp(np.log(np.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0))).mean(axis=0))
+        amplitude = np.where(in_sight, 1.0, np.sqrt(mean / np.maximum(power.sum(axis=0), np.finfo(float).tiny)))
         for _, paths in found:
             yield None, _amplified(paths, amplitude[paths.path_rx])
 
