@@ -1,6 +1,6 @@
 """Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
 
-The bounds of a link are sorted into levels of 0.75 dB. The weakest levels are left out while their sum does not exceed
+The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out while their sum does not exceed
 the power that the link may lack. Predictions add the expected power of candidates that are left out.
 """
 
@@ -19,10 +19,10 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.paths import Candidates
 
-LEVELS = 192
+LEVELS = 96
 """Number of levels: level 0 is the direct path alone, the last level all weaker candidates."""
 
-_STRONGEST, _OCTAVE = -50, 4
+_STRONGEST, _OCTAVE = -26, 2
 """Level of a power of 0 dB, and number of levels in a factor of 2."""
 
 _FOUND = 0.8

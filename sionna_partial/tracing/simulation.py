@@ -289,13 +289,14 @@ class Simulation:
 
     @cached_property
     def _predicting_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Finder for predictions, which need the power of links and not every path."""
+        """Finder for predictions, which need every path only on maps where weak paths in observed space matter."""
+        estimates = self.partial.is_complete or self.partial.is_nearly_complete
 
         def predicting(finder: ExactFinder | RayFinder) -> ExactFinder | RayFinder:
             if not isinstance(finder, ExactFinder):
                 return finder
             coarse = replace(finder.written, coarse=True) if self.material_unknown else finder.written
-            return replace(finder, written=coarse, estimates=True)
+            return replace(finder, written=coarse, estimates=estimates)
 
         finder = self._mean_finder
         if not isinstance(finder, MeanFinder):
