@@ -50,6 +50,9 @@ THICK_M, THICK_FRACTIONS = 0.15, (0.1, 0.9)
 LEAST_NOISE = 0.05
 """Noise up to which a map counts as exact, as of cells cut out of meshes."""
 
+STRONG_NOISE = 0.5
+"""Noise, as of ranges with 1 cm, up to which walls are best outlined as on exact maps."""
+
 RAGGED_FACTOR = 2.0
 """Largest distance of a line from ragged walls, in tolerances."""
 

@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from sionna_partial.arrays import Bools, Floats, Indices, States, cross, span_in_strip
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import LEAST_NOISE, fit_runs, row_runs, wall_cells
+from sionna_partial.maps.wall_cells import STRONG_NOISE, fit_runs, row_runs, wall_cells
 from sionna_partial.process import njit
 
 _KEY = 1 << 32
@@ -107,7 +107,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
 
     `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
     staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
-    ragged faces (`fit_runs`). Range noise puts cells before and behind walls; lines of noisy maps are in their middle.
+    ragged faces (`fit_runs`). Strong range noise puts cells before and behind walls: lines are then in their middle.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
@@ -119,7 +119,7 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     graph = _wall_graph(walls.cells, cut_spurs=True)
     shift = _layer_shift(graph.points, walls.peeled)
     chains = [_fitted(graph, shift, points, (1.0 + walls.roughness) * tolerance_cells) for points in _chains(graph)]
-    noisy = partial.wall_noise > LEAST_NOISE
+    noisy = partial.wall_noise > STRONG_NOISE
     if noisy:
         _centre(chains, graph, state)
     while True:

@@ -31,6 +31,7 @@ from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
+from sionna_partial.maps.wall_cells import STRONG_NOISE
 from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
@@ -43,9 +44,6 @@ from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, pa
 
 GEOMETRIES = 3
 """Default of `SceneSettings.geometries` on nearly complete maps with strong range noise."""
-
-MEAN_NOISE = 0.5
-"""Largest `wall_noise`, as of ranges with 1 cm, for which mapped outlines alone are as good as a mean."""
 
 DRAWN_TOLERANCE_DB = 0.5
 """Tolerance of powers between drawn walls [dB]."""
@@ -505,7 +503,7 @@ def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settin
         return scene_settings.geometries
     if trace_settings.through_walls or partial.is_complete or not partial.is_nearly_complete:
         return 1
-    return 1 if partial.wall_noise <= MEAN_NOISE else GEOMETRIES
+    return 1 if partial.wall_noise <= STRONG_NOISE else GEOMETRIES
 
 
 def nearest_m(frequency_hz: float) -> float:
