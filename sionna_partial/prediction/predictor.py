@@ -294,7 +294,7 @@ class LinkPrediction(Shown):
         return self._by_column(lambda column: column.reshape(shape))
 
     def _by_column(self, change: Callable[[Floats], Floats]) -> LinkPrediction:
-        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, each.name)) for each in fields(links))))
+        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, part.name)) for part in fields(links))))
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` where a mask (N,) is True, this distribution elsewhere."""
