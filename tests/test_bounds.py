@@ -21,7 +21,7 @@ from sionna_partial.tracing.power import (
     wedge_angle,
     wedge_constants,
 )
-from sionna_partial.tracing.select import LEVELS, Selection, missing_power
+from sionna_partial.tracing.select import LEVELS, Listed, Selection, missing_power
 
 DRYWALL = np.array([2.94, 0.1226, 0.1])
 
@@ -116,3 +116,21 @@ def test_what_is_left_out_changes_power_and_states_by_no_more_than_the_tolerance
     assert amplified < 0.5 * len(some.a)
     gain_db = model.features(tx, rx).gain_db
     assert np.abs(every.gain_db - gain_db).max() <= 0.5 * tolerance_db
+
+
+@pytest.mark.parametrize("tolerance_db", [0.0, 0.1])
+def test_candidates_without_power_are_never_written(tolerance_db: float) -> None:
+    """A bound of 0 marks a line that is no path, whose faces are unknown."""
+    written: list[int] = []
+
+    class Lines:
+        name = "lines"
+
+        def listed(self, _: np.ndarray):
+            yield Listed(np.zeros(4, np.int64), np.array([1e-6, 0.0, 1e-40, 0.0]), written.extend, 1.0)
+
+    found = np.zeros(1)
+    selection = Selection.of([Lines()], found, tolerance_db, no_progress)
+    for blocks in selection.rounds(np.full(1, 1e-3 if tolerance_db == 0.0 else 0.0), tolerance_db, (0.0, 1.0)):
+        list(blocks)
+    assert written == ([0, 2] if tolerance_db == 0.0 else [0])

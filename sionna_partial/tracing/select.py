@@ -25,6 +25,9 @@ LEVELS = 96
 _STRONGEST, _OCTAVE = -26, 2
 """Level of a power of 0 dB, and number of levels in a factor of 2."""
 
+_NEVER = 255
+"""Level of candidates without power, which may be no paths at all."""
+
 _FOUND = 0.8
 """Expected power of the verified paths of a link, relative to the sum of bounds."""
 
@@ -283,8 +286,10 @@ def _sorted_by_level(rx, bound, power):
     for c in range(len(rx)):
         if bound[c] == np.inf:
             continue
-        at = np.ceil(_STRONGEST - _OCTAVE * np.log2(bound[c])) if bound[c] > 0.0 else LEVELS
-        level[c] = min(max(at, 1), LEVELS - 1)
+        if bound[c] <= 0.0:
+            level[c] = _NEVER
+            continue
+        level[c] = min(max(np.ceil(_STRONGEST - _OCTAVE * np.log2(bound[c])), 1), LEVELS - 1)
         power[rx[c], level[c]] += bound[c]
     return level
 
