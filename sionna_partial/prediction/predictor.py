@@ -210,7 +210,7 @@ class LinkPrediction(Shown):
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
-        """Return the trace on a nearly complete map with its uncertainty (`TraceErrors`)."""
+        """Return the trace with its uncertainty (`TraceErrors`), for links with observed ends."""
         context, traced = context_of(phi), phi.link_state
         exact, noisy = np.array([EXACT, NOISY])[..., None]
         of = TraceErrors(*(exact + (noisy - exact) * excess_noise(context.wall_noise)))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import CellState
 from sionna_partial.display import part_of
 from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import narrow_areas
@@ -29,7 +29,7 @@ from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, Diffraction
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
-from sionna_partial.tracing.select import Block, Kind, stages
+from sionna_partial.tracing.select import NO_POWER, Block, Kind, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies
 
@@ -204,7 +204,7 @@ class MeanFinder:
                 indirect = paths.take(~paths.is_direct)
                 found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
                 np.add.at(power[number], found[-1][1].path_rx, indirect.power)
-        mean = np.exp(np.log(np.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0))).mean(axis=0))
+        mean = np.exp(np.log(np.maximum(power, NO_POWER)).mean(axis=0))
         amplitude = np.where(in_sight, 1.0, np.sqrt(mean / np.maximum(power.sum(axis=0), np.finfo(float).tiny)))
         for _, paths in found:
             yield None, _amplified(paths, amplitude[paths.path_rx])

@@ -37,7 +37,7 @@ _WRITTEN_AT_ONCE = 25_000
 _USUAL_REFLECTIONS = 3
 """Reflections beyond which the power of a path through walls is discounted."""
 
-_NO_POWER = 10.0 ** (GAIN_FLOOR_DB / 10.0)
+NO_POWER = 10.0 ** (GAIN_FLOOR_DB / 10.0)
 
 
 class Listed(NamedTuple):
@@ -225,7 +225,7 @@ class Limits(NamedTuple):
         return cls(depth, min(depth, reflections), walls, 0.03, weakest)
 
     def min_power(self, found: Floats) -> Floats:
-        return self.weakest * np.maximum(found, _NO_POWER)
+        return self.weakest * np.maximum(found, NO_POWER)
 
 
 @njit(cache=True)
@@ -304,4 +304,4 @@ def missing_power(found: Floats, tolerance_db: float) -> Floats:
     The gain changes by `tolerance_db` at most; links without paths may lack power that no receiver notices.
     """
     fraction = 10.0 ** (tolerance_db / 10.0) - 1.0
-    return np.maximum(fraction * found, _NO_POWER - found)
+    return np.maximum(fraction * found, NO_POWER - found)
