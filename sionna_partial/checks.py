@@ -132,11 +132,11 @@ def is_whole(value: object, low: int = 0) -> bool:
 
 
 def are_stages(value: Any) -> bool:
-    """Return whether `value` has increasing whole numbers (of steps) or increasing fractions in [0, 1)."""
+    """Return whether `value` has increasing whole numbers (of steps) or increasing fractions in [0, 1]."""
     stages = list(value) if isinstance(value, Sequence) or getattr(value, "ndim", 0) == 1 else []
     numbers = all(isinstance(stage, Real) and not isinstance(stage, bool) for stage in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
-    return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] < 1))
+    return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] <= 1))
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:

@@ -383,7 +383,8 @@ class DatasetSettings(Checked):
     transmitters_per_home : int
         Number of transmitters in free cells of the complete home.
     stages : tuple of int, or of float
-        Increasing exploration steps; or, all in [0, 1), observed fractions of the home's free area.
+        Increasing exploration steps; or, in [0, 1], observed fractions of the home's free area. At 1, the robot drove to
+        the end, and unknown cells that touch free ones are walls: the map is complete, with the robot's errors.
     seed : int
         Seed of positions and robot, combined with the home's name.
     tx_height_m, rx_height_m : float
@@ -433,7 +434,7 @@ class DatasetSettings(Checked):
         enough = self.links_per_home >= self.transmitters_per_home
         remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
         require(enough, "links_per_home", self.links_per_home, remedy)
-        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
+        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1]."
         require(isinstance(self.stages, tuple) and are_stages(self.stages), "stages", self.stages, remedy)
         object.__setattr__(self, "stages", tuple(map(plain, self.stages)))
         mixed = isinstance(self.sensor, str) and self.sensor == "mixed"

@@ -152,7 +152,7 @@ def test_choices(name: str, field: str, words: tuple[str, ...]) -> None:
             CLASSES[name](**{field: value})
 
 
-STAGES = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1)."
+STAGES = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1]."
 FREQUENCIES = "give a number in [1e+06, 1e+12]."
 
 

@@ -27,6 +27,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import is_whole, require, shown
@@ -193,6 +194,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     rng = np.random.default_rng(_home_seed(name, settings))
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
+    if settings.stages[-1] == 1.0 and len(maps) > 1:
+        maps[-1] = enclosed_map(maps[-1])
     positions = _draw_positions(home, maps, name, settings, rng)
     inside, link_state, gain_db, cir = _truth(home, positions, settings)
     return LinkTable.concatenate(
@@ -229,6 +232,13 @@ def closed_home(home: PartialMap, name: str) -> PartialMap:
         )
     _log.warning("home %r has free cells at the border of its grid: they are taken to end at walls there", name)
     return closed
+
+
+def enclosed_map(partial: PartialMap) -> PartialMap:
+    """Return a map whose unknown cells beside free ones are walls: complete, with the errors of the robot."""
+    beside_free = ndimage.binary_dilation(partial.state == CellState.FREE)
+    closing = beside_free & (partial.state == CellState.UNKNOWN)
+    return replace(partial, state=np.where(closing, CellState.WALL, partial.state).astype(np.uint8))
 
 
 def home_sensor(name: str, settings: DatasetSettings) -> SensorSettings:

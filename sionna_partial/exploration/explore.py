@@ -115,7 +115,7 @@ def explore(
         Complete; unknown cells stop the robot and its view.
     steps : sequence of int or float
         Increasing numbers of actions [1], at most 100,000; the map after 0 is empty. Or increasing fractions of the
-        free area in [0, 1): the first map with that fraction, or the last one if nothing is left to see or 1000 actions
+        free area in [0, 1]: the first map with that fraction, or the last one if nothing is left to see or 1000 actions
         made no progress.
     seed : int
         Seed of start, heading, goals and errors, at least 0.
@@ -184,7 +184,7 @@ def explore_trajectory(
     """
     remedy = (
         f"give increasing whole numbers of 0 to {MAX_STEPS:,}, such as (50, 100, 150, 200), or increasing fractions "
-        "of the free area in [0, 1), such as (0.25, 0.5, 0.75)."
+        "of the free area in [0, 1], such as (0.25, 0.5, 0.75)."
     )
     require(are_stages(steps) and steps[-1] <= MAX_STEPS, "steps", steps, remedy)
     require(is_whole(seed), "seed", seed, "give a whole number of 0 or more.")

@@ -1,0 +1,203 @@
+"""Fields of the known and unknown space of a map: reach of unobserved space, routes between points, images.
+
+Fields live on cells of about 0.3 m that are centred on the known part of the map, so that neither the grid of the map nor
+its origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
+
+- exposure: probability that a walk from a point, of mean length `WALK_M`, ends in unobserved space.
+- route: negative logarithm of the density of walks between two points, which grows like the length of the way around
+  known walls. It is symmetric in its ends.
+"""
+
+import math
+import weakref
+from functools import cached_property
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, sparse
+from scipy.sparse.linalg import splu
+
+from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
+
+CELL_M = 0.3
+WALK_M = 2.0
+"""Mean length of a random walk [m]."""
+
+MARGIN_CELLS, POOLED_CELLS = 16, 8
+"""Unknown cells around the known ones; cells that networks pool, which divide the sides of images."""
+
+LONGEST_ROUTE = 60.0
+"""Largest route, in `WALK_M`, also of points that known walls separate."""
+
+_PARTS = 6
+"""Points along a cell at which walls are looked up."""
+
+_ASIDE_CELLS = 1e-3
+"""Distance of the look-ups on both sides of a point, which may lie on the border of map cells [map cells]."""
+
+_SEPARATE = 1e-9
+"""Smallest conductance between neighbouring cells."""
+
+_kept: dict[int, tuple[Any, "MapSpace"]] = {}
+
+
+class MapSpace:
+    """Fields of a map on H x W cells.
+
+    Attributes
+    ----------
+    image : (H, W, 3) float32 array
+        Fractions of free and wall, and of unobserved space that can be entered.
+    exposure : (H, W) float64 array
+    """
+
+    def __init__(self, partial: PartialMap) -> None:
+        self._resolution_m = partial.resolution_m
+        known = np.argwhere(partial.state != CellState.UNKNOWN)
+        ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
+        centre = 0.5 * (ends[0] + ends[1])
+        self._cells = CELL_M / partial.resolution_m
+        half = 0.5 * (ends[1] - ends[0]) / self._cells + MARGIN_CELLS
+        half_counts = (np.ceil(half / (POOLED_CELLS / 2) - 1e-9) * (POOLED_CELLS / 2)).astype(int)
+        self.shape = tuple((2 * half_counts).tolist())
+        first = centre - half_counts * self._cells
+        self.corner_m = np.array(partial.origin_m) + partial.resolution_m * first[::-1]
+        state = partial.state
+        entered = _entered(state)
+        masks = (state == CellState.FREE, state == CellState.WALL, entered)
+        edges = [first[axis] + np.arange(self.shape[axis] + 1) * self._cells for axis in (0, 1)]
+        rows, columns = (_overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
+        fractions = [rows @ mask.astype(np.float64) @ columns.T for mask in masks]
+        if entered.any() or not len(known):  # the space beyond the grid, too
+            inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
+            fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
+        self.image = np.stack(fractions, axis=-1).astype(np.float32)
+        self._walls = _sampled_walls(state == CellState.WALL, first, self._cells, self.shape)
+
+    @classmethod
+    def of(cls, partial: PartialMap) -> "MapSpace":
+        """Return the fields of a map; the latest are kept."""
+        key = id(partial)
+        if key not in _kept:
+            for old in [key for key, (owner, _) in _kept.items() if owner() is None]:
+                del _kept[old]
+            _kept[key] = weakref.ref(partial), cls(partial)
+        return _kept[key][1]
+
+    @cached_property
+    def _walk(self) -> Any:
+        """Factors of the operator of the walk, 1 - (WALK_M / CELL_M)^2 times the Laplacian between walls."""
+        across, down = _conductances(self._walls, self.shape)
+        numbers = np.arange(math.prod(self.shape)).reshape(self.shape)
+        pairs = [(numbers[:, :-1], numbers[:, 1:], across), (numbers[:-1], numbers[1:], down)]
+        weight = (WALK_M / CELL_M) ** 2
+        start, end, value = (
+            np.concatenate(each) for each in zip(*((a.ravel(), b.ravel(), c.ravel()) for a, b, c in pairs), strict=True)
+        )
+        count = numbers.size
+        graph = sparse.coo_array((weight * value, (start, end)), shape=(count, count))
+        graph = graph + graph.T
+        operator = sparse.diags_array(1.0 + np.asarray(graph.sum(axis=1)).ravel()) - graph
+        return splu(operator.tocsc(), permc_spec="MMD_AT_PLUS_A", options={"SymmetricMode": True})
+
+    @cached_property
+    def exposure(self) -> Floats:
+        unobserved = self.image[..., 2].astype(np.float64)
+        if not unobserved.any():
+            return np.zeros(self.shape)
+        return np.clip(self._walk.solve(unobserved.ravel()), 0.0, 1.0).reshape(self.shape)
+
+    def exposure_at(self, points_m: Any, ops: ModuleType = np) -> Any:
+        """Return the exposure (N,) of points (N, 2 or 3) [m]."""
+        return self.read(self.exposure[..., None], points_m, ops)[:, 0]
+
+    def routes(self, tx_m: Any, rx_m: Floats, ops: ModuleType = np) -> Any:
+        """Return the routes (N,), in `WALK_M`, from a transmitter (3,) to receivers (N, 3) [m]."""
+        tx_cells, tx_weights = self.corners(tx_m[None], ops)
+        rx_cells, rx_weights = self.corners(rx_m)
+        start = np.zeros((math.prod(self.shape), 4))
+        start[tx_cells[0], np.arange(4)] = 1.0
+        density = np.maximum(self._walk.solve(start)[rx_cells.ravel()], math.exp(-LONGEST_ROUTE))
+        length = (-np.log(density).reshape(*rx_cells.shape, 4) * rx_weights[..., None]).sum(axis=1)
+        return ops.sum(length * tx_weights, axis=1)
+
+    def corners(self, points_m: Any, ops: ModuleType = np) -> tuple[Indices, Any]:
+        """Return the four cells (N, 4) around points (N, 2 or 3) [m], and their bilinear weights (N, 4)."""
+        limits = np.array(self.shape[::-1]) - 1.0
+        at = ops.clip((points_m[:, :2] - self.corner_m) / CELL_M - 0.5, 0.0, limits - 1e-6)
+        low = np.floor(np.asarray(at)).astype(np.intp)
+        part = at - low
+        cells = low[:, 1:] * self.shape[1] + low[:, :1] + np.array([0, 1, self.shape[1], self.shape[1] + 1])
+        x, y = part[:, 0], part[:, 1]
+        weights = ops.stack([(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y], axis=1)
+        return cells, weights
+
+    def read(self, values: Any, points_m: Any, ops: ModuleType = np) -> Any:
+        """Interpolate a field (H, W, C) at points (N, 2 or 3) [m]: return (N, C)."""
+        cells, weights = self.corners(points_m, ops)
+        flat = ops.reshape(values, (-1, values.shape[-1]))
+        return ops.sum(ops.take(flat, cells, axis=0) * weights[..., None], axis=1)
+
+
+def _entered(state: NDArray[np.uint8]) -> Bools:
+    """Return the unknown cells that can be entered from free ones without crossing known walls."""
+    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+    labels, count = ndimage.label(unknown)
+    free = np.pad(state == CellState.FREE, 1)
+    beside = ndimage.binary_dilation(free) & unknown
+    entered = np.zeros(count + 1, dtype=bool)
+    entered[labels[beside]] = True
+    if not free.any():
+        entered[1:] = True
+    entered[0] = False
+    return np.asarray(entered[labels][1:-1, 1:-1])
+
+
+def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
+    """Return 1 if the space beyond the grid can be entered, else 0."""
+    rim = np.ones(state.shape, dtype=bool)
+    rim[1:-1, 1:-1] = False
+    return float((entered & rim).any() or (rim & (state == CellState.FREE)).any() or not (state != CellState.UNKNOWN).any())
+
+
+def _overlaps(edges: Floats, count: int) -> Any:
+    """Return the fractions (K, count), sparse, of intervals between `edges` (K + 1,) covered by unit cells."""
+    low, high = np.clip(edges[:-1], 0.0, count), np.clip(edges[1:], 0.0, count)
+    widest = math.ceil(float((edges[1] - edges[0]))) + 1
+    cells = np.floor(low).astype(np.intp)[:, None] + np.arange(widest)
+    part = np.minimum(high[:, None], cells + 1) - np.maximum(low[:, None], cells)
+    part = np.where(cells < count, np.maximum(part, 0.0), 0.0) / (edges[1] - edges[0])
+    row = np.broadcast_to(np.arange(len(low))[:, None], cells.shape)
+    kept = part > 0.0
+    return sparse.csr_array((part[kept], (row[kept], cells[kept])), shape=(len(low), count)).toarray()
+
+
+def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, ...]) -> Bools:
+    """Return known walls at `_PARTS` x `_PARTS` points of each cell."""
+    step = cells / _PARTS
+    if step > 1.0:  # thin walls between the points
+        wall = ndimage.maximum_filter(wall, size=math.ceil(step))
+    sampled = np.zeros(tuple(_PARTS * count for count in shape), dtype=bool)
+    at = [first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
+    for up in (-_ASIDE_CELLS, _ASIDE_CELLS):
+        for right in (-_ASIDE_CELLS, _ASIDE_CELLS):
+            rows, columns = (np.floor(axis + aside).astype(np.intp) for axis, aside in zip(at, (up, right), strict=True))
+            inside = [(0 <= index) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
+            looked_up = wall[np.ix_(np.clip(rows, 0, wall.shape[0] - 1), np.clip(columns, 0, wall.shape[1] - 1))]
+            sampled |= looked_up & np.logical_and.outer(*inside)
+    return sampled
+
+
+def _conductances(walls: Bools, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
+    """Return the fractions of open lines between the centres of neighbouring cells: (H, W - 1) and (H - 1, W)."""
+    half = _PARTS // 2
+
+    def across(lines: Bools, height: int, width: int) -> Floats:
+        inner = lines[:, half : half + _PARTS * (width - 1)].reshape(height, _PARTS, width - 1, _PARTS)
+        return np.maximum((~inner.any(axis=3)).mean(axis=1), _SEPARATE)
+
+    return across(walls, shape[0], shape[1]), across(walls.T, shape[1], shape[0]).T
