@@ -18,6 +18,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.wall_cells import LEAST_NOISE
+from sionna_partial.prediction.space import MapSpace
 from sionna_partial.prediction.unobserved import (
     GRAZE,
     draw_windows,
@@ -74,7 +75,11 @@ class LinkContext(Shown):
     walled_m : (N,) float64 array
         Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
-        Range noise of the map's walls, 0 (exact) to 1.
+        Range noise of the walls near both ends, 0 (exact) to 1.
+    exposure : (N, 2) float64 array
+        Exposure of transmitter and receiver to unobserved space (`space`), 0 to 1.
+    route : (N,) float64 array
+        Length of the way around known walls (`space`).
     possible : (N, 3) bool array
         Possible LinkStates, at least one.
     indirect_gain_db : (N, len(ATTENUATION_LENGTHS_M)) float64 array
@@ -102,6 +107,8 @@ class LinkContext(Shown):
     nearly_complete: Bools
     walled_m: Floats
     wall_noise: Floats
+    exposure: Floats
+    route: Floats
     possible: Bools
     indirect_gain_db: Floats
     strongest_unobserved_m: Floats
@@ -130,6 +137,7 @@ class LinkContext(Shown):
         count = len(map_index)
         tx_seen, rx_seen, complete, both_seen, nearly = (np.zeros(count, dtype=bool) for _ in range(5))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
+        exposure, route = np.zeros((count, 2)), np.zeros(count)
         for number in np.unique(map_index):
             here, partial = map_index == number, maps[number]
             ends = tx_m[here], rx_m[here]
@@ -138,10 +146,13 @@ class LinkContext(Shown):
             both_seen[here] = tx_seen[here] & rx_seen[here] & partial.environment.is_extruded
             nearly[here] = both_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
-            wall_noise[here] = 0.0 if complete[here].all() else partial.wall_noise
+            wall_noise[here] = partial.wall_noise
+            space = MapSpace.of(partial)
+            exposure[here] = np.stack([space.exposure_at(end_m) for end_m in ends], axis=1)
+            route[here] = space.routes_of(*ends)
             seen = unobserved_distance_m[here] == 0.0
             possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
-        found = (tx_seen, rx_seen, complete, both_seen, nearly, walled_m, wall_noise, possible)
+        found = (tx_seen, rx_seen, complete, both_seen, nearly, walled_m, wall_noise, exposure, route, possible)
         _, window_index = transmitters(map_index, tx_m)
         return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
 

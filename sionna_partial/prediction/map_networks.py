@@ -87,7 +87,7 @@ FEATURES: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in ("unobserved_distance_m", "distance_m")},
     "indirect_gain_db": tuple(f"indirect_gain_reach_{length_m:g}_m_db" for length_m in ATTENUATION_LENGTHS_M),
     **{name: (name,) for name in ("strongest_unobserved_m", "straight_gain_db", "straight_walls", "wall_loss_db")},
-    **dict.fromkeys(("tx_seen", "rx_seen", "possible", "walled_m"), ()),
+    **dict.fromkeys(("tx_seen", "rx_seen", "both_seen", "possible", "walled_m", "wall_noise", "exposure", "route"), ()),
 }
 """Features of links by their names in `LinkFeatures` or `LinkContext`, and their columns in data sets, if stored."""
 

@@ -125,6 +125,15 @@ class MapSpace:
         length = (-np.log(density).reshape(*rx_cells.shape, 4) * rx_weights[..., None]).sum(axis=1)
         return ops.sum(length * tx_weights, axis=1)
 
+    def routes_of(self, tx_m: Floats, rx_m: Floats) -> Floats:
+        """Return the routes (N,) of links (N, 3) [m] of several transmitters."""
+        found = np.zeros(len(rx_m))
+        sources_m, source = np.unique(tx_m, axis=0, return_inverse=True)
+        for number, source_m in enumerate(sources_m):
+            here = source.ravel() == number
+            found[here] = self.routes(source_m, rx_m[here])
+        return found
+
     def corners(self, points_m: Any, ops: ModuleType = np) -> tuple[Indices, Any]:
         """Return the four cells (N, 4) around points (N, 2 or 3) [m], and their bilinear weights (N, 4)."""
         limits = np.array(self.shape[::-1]) - 1.0

@@ -1,0 +1,174 @@
+"""The rule of prediction: the one place where the distribution of a link is made.
+
+Two experts know a link: the trace of the partial map, and a model of unobserved space (networks, or mean losses through
+walls). The prediction is their mixture. The trace has the weight 1 - doubt (1 - trust).
+
+- doubt grows from 0 with the exposure of both ends to unobserved space and with the range noise of the walls near them:
+  where nothing unknown and no error can change a link, the prediction is the trace exactly.
+- trust, 0 to 1, and the errors of the trace are outputs of the gate, a network that was trained on buildings of all
+  kinds. Without a gate trust is 0, and the trace has no errors.
+
+All functions take NumPy arrays, or tensors with `ops` = keras.ops.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.prediction.space import WALK_M
+
+GATE_NETWORK, GATE_OUTPUTS = "gate_network", 5
+"""Name of the gate, and its outputs: logit of trust; shift and spread of the traced gain given LOS, and given NLOS."""
+
+DOUBT_SCALE = 8.0
+"""Growth of the logarithm of 1 - doubt with exposure and noise."""
+
+_SHIFT_DB, _STDS_DB, _SPREAD_RANGE = 10.0, (1.0, 4.0), 2.5
+"""Unit of shifts; standard deviations of an untrained gate; largest logarithm of a change of them."""
+
+_LEAST_PROBABILITY = 1e-30
+
+
+class Parts(NamedTuple):
+    """Probabilities of link states, and mean and standard deviation of the gain given each [dB]: (3, N) by LinkState."""
+
+    probabilities: Any
+    means_db: Any
+    stds_db: Any
+
+
+class Evidence(NamedTuple):
+    """What the rule knows about N links besides the experts.
+
+    Parameters
+    ----------
+    values : mapping
+        Features by name (`map_networks.feature_values`), with `free_db`, the free-space gain at the links' frequency.
+    traced : (N,) array of LinkState
+    """
+
+    values: Mapping[str, Any]
+    traced: States
+
+
+def doubt(values: Mapping[str, Any], ops: ModuleType = np) -> Any:
+    """Return the doubt (N,) about the trace, 0 to 1."""
+    exposure = values["exposure"]
+    return 1.0 - ops.exp(-DOUBT_SCALE * (exposure[:, 0] + exposure[:, 1] + values["wall_noise"]))
+
+
+def traced_parts(traced: States, gain_db: Any, ops: ModuleType = np) -> Parts:
+    """Return the trace without errors."""
+    states = np.array([traced == state for state in LinkState], dtype=np.float64)
+    means_db = ops.stack([gain_db] * len(LinkState))
+    return Parts(states, means_db, np.zeros_like(states))
+
+
+def predicted(
+    evidence: Evidence, expert: Parts, gate: Callable[[Any], Any] | None = None, ops: ModuleType = np
+) -> Parts:
+    """Return the mixture of the trace and the expert for unobserved space."""
+    values, doubts = evidence.values, doubt(evidence.values, ops)
+    trace = traced_parts(evidence.traced, values["gain_db"], ops)
+    if gate is None:
+        return mixture((trace, expert), (1.0 - doubts, doubts), ops)
+    outputs = gate(gate_inputs(evidence, expert, ops))
+    possible = np.take_along_axis(values["possible"], evidence.traced[:, None].astype(np.intp), axis=1)[:, 0]
+    trust = possible / (1.0 + ops.exp(-outputs[:, 0]))
+    weight = 1.0 - doubts * (1.0 - trust)
+    return mixture((with_errors(trace, outputs, doubts, ops), expert), (weight, 1.0 - weight), ops)
+
+
+def with_errors(trace: Parts, outputs: Any, doubts: Any, ops: ModuleType = np) -> Parts:
+    """Return the trace with the errors of the gate, which vanish with the doubt."""
+    shifts_db = [doubts * _SHIFT_DB * outputs[:, column] for column in (1, 3)]
+    root = ops.sqrt(ops.maximum(doubts, 1e-12))
+    stds_db = [
+        root * std_db * ops.exp(_SPREAD_RANGE * ops.tanh(outputs[:, column] / _SPREAD_RANGE))
+        for column, std_db in zip((2, 4), _STDS_DB, strict=True)
+    ]
+    nothing = ops.zeros_like(shifts_db[0])
+    means_db = trace.means_db + ops.stack([nothing, *shifts_db])
+    return Parts(trace.probabilities, ops.maximum(means_db, GAIN_FLOOR_DB), ops.stack([nothing, *stds_db]))
+
+
+def mixture(parts: Sequence[Parts], weights: Sequence[Any], ops: ModuleType = np) -> Parts:
+    """Return the mixture of K distributions by weights (N,) or (), which sum to 1; gains given a state are Gaussian."""
+    joint = [weight * part.probabilities for part, weight in zip(parts, weights, strict=True)]
+    probabilities = sum(joint)
+    shares = [each + _LEAST_PROBABILITY * (weight + 1e-9) for each, weight in zip(joint, weights, strict=True)]
+    total = sum(shares)
+    shares = [each / total for each in shares]
+    mean_db = sum(share * part.means_db for share, part in zip(shares, parts, strict=True))
+    variance = sum(
+        share * (part.stds_db**2 + (part.means_db - mean_db) ** 2) for share, part in zip(shares, parts, strict=True)
+    )
+    spread = variance > 0.0
+    std_db = ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0)
+    return Parts(probabilities / ops.sum(probabilities, axis=0), mean_db, std_db)
+
+
+_SCALE_M, _SCALE_DB = 3.0, 30.0
+
+
+class _Links(NamedTuple):
+    """Inputs of the gate's table: features, the expert, and the ops."""
+
+    values: Mapping[str, Any]
+    traced: States
+    expert: Parts
+    ops: ModuleType
+
+    def log_length(self, length_m: Any) -> Any:
+        """Return a length, compressed."""
+        return self.ops.log(1.0 + self.ops.maximum(length_m, 0.0) / _SCALE_M)
+
+    def depth(self, gain_db: Any) -> Any:
+        """Return how far a gain is below free space."""
+        return self.ops.clip((self.values["free_db"] - gain_db) / _SCALE_DB, -0.5, 3.0)
+
+    def indirect(self, column: int) -> Any:
+        """Return the depth of the indirect power for one attenuation length."""
+        return self.depth(self.values["indirect_gain_db"][:, column])
+
+    def apart(self, state: LinkState) -> Any:
+        """Return the mean of the expert relative to the trace."""
+        return self.ops.clip((self.expert.means_db[state] - self.values["gain_db"]) / _SCALE_DB, -2.0, 3.0)
+
+
+GATE_INPUTS: dict[str, Callable[[_Links], Any]] = {
+    **{state.name.lower(): lambda of, state=state: 1.0 * (of.traced == state) for state in LinkState},  # type: ignore[misc]
+    "both_seen": lambda of: 1.0 * of.values["both_seen"],
+    "an_end_seen": lambda of: 1.0 * (of.values["tx_seen"] | of.values["rx_seen"]),
+    "exposure": lambda of: of.values["exposure"][:, 0] + of.values["exposure"][:, 1],
+    "both_exposed": lambda of: of.values["exposure"][:, 0] * of.values["exposure"][:, 1],
+    "noise": lambda of: of.values["wall_noise"],
+    "route": lambda of: of.values["route"] / 10.0,
+    "detour": lambda of: of.log_length(of.values["route"] * WALK_M - of.values["distance_m"]),
+    "distance": lambda of: of.log_length(of.values["distance_m"]),
+    "unobserved": lambda of: of.log_length(of.values["unobserved_distance_m"]),
+    "strongest_unobserved": lambda of: of.log_length(of.values["strongest_unobserved_m"]),
+    "walled": lambda of: of.ops.minimum(of.values["walled_m"], 1.0),
+    "depth": lambda of: of.depth(of.values["gain_db"]),
+    **{f"indirect_{column}": lambda of, column=column: of.indirect(column) for column in range(5)},  # type: ignore[misc]
+    "hidden_power": lambda of: of.indirect(4) - of.indirect(0),
+    **{
+        f"expert_p_{state.name.lower()}": lambda of, state=state: of.expert.probabilities[state]  # type: ignore[misc]
+        for state in LinkState
+    },
+    "expert_los_apart": lambda of: of.apart(LinkState.LOS),
+    "expert_nlos_apart": lambda of: of.apart(LinkState.NLOS),
+    "expert_nlos_width": lambda of: of.ops.log(of.expert.stds_db[LinkState.NLOS] / 10.0),
+}
+"""Inputs of the gate in order, dimensionless and symmetric in the ends of a link, if the expert is."""
+
+
+def gate_inputs(evidence: Evidence, expert: Parts, ops: ModuleType = np) -> Any:
+    """Return the inputs (N, len(GATE_INPUTS)) of the gate."""
+    links = _Links(evidence.values, evidence.traced, expert, ops)
+    return ops.stack([make(links) for make in GATE_INPUTS.values()], axis=1)
