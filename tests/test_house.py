@@ -50,7 +50,7 @@ ROOMS = {
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "features"),
+        *("unobserved", "features", "evaluate"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
