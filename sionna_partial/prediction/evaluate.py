@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.special import expit
+from scipy.special import expit, log_softmax
 
 if TYPE_CHECKING:
     import keras
@@ -117,6 +117,28 @@ def _by_name(ends: Any, values: Mapping[str, Any]) -> Any:
     return {key: values[end[0]] for key, end in ends.items()} if isinstance(ends, Mapping) else values[ends[0]]
 
 
+class _ArrayOps:
+    """NumPy, and the functions of ``keras.ops`` that it lacks."""
+
+    cast = staticmethod(np.asarray)
+    sigmoid = staticmethod(expit)
+
+    @staticmethod
+    def softplus(x: Any) -> Any:
+        return np.logaddexp(x, 0.0)
+
+    @staticmethod
+    def log_softmax(x: Any) -> Any:
+        return log_softmax(x, axis=-1)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(np, name)
+
+
+array_ops: Any = _ArrayOps()
+"""Takes the place of ``keras.ops`` in functions of networks, for arrays."""
+
+
 def _filled(argument: Any, values: Mapping[str, Array]) -> Any:
     """Replace tensors in the arguments of a call by their values."""
     if isinstance(argument, list | tuple):
@@ -155,10 +177,12 @@ def _read(dataset: Any, most: int) -> Array:
 
 def _taken(weights: Iterator[Array], *shape: int | None) -> Array:
     """Return the next weights, which must have this shape; None is any length."""
-    found = next(weights, np.empty(0))
+    found = np.asarray(next(weights, np.empty(0)))
     wanted = [length if size is None else size for size, length in itertools.zip_longest(shape, found.shape)]
     if list(found.shape) != wanted:
         raise ValueError(f"weights of shape {found.shape} instead of {shape}")
+    if not np.isfinite(found).all():
+        raise ValueError("weights that are not finite")
     return found
 
 
@@ -180,7 +204,7 @@ _ACTIVATIONS: dict[str, Callable[[Array], Array]] = {
     "sigmoid": expit,
     "silu": lambda x: x * expit(x),
     "softmax": _softmax,
-    "softplus": lambda x: np.logaddexp(x, 0.0),
+    "softplus": _ArrayOps.softplus,
     "tanh": np.tanh,
 }
 
