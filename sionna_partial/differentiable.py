@@ -391,7 +391,7 @@ class DifferentiableLinks:
             predicted = self._by_context(moved_m, numeric, shift_db)
         else:
             inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
-            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db)
+            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db, ops)
         pairs = zip(trace, predicted, strict=True)
         return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
 
@@ -457,16 +457,17 @@ class DifferentiableLinks:
         columns = link_inputs(numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
-        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
+        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m, ops)
         free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops) - shift_db
-        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi))
+        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi), ops)
 
     def _maps(self, tx_m: Any) -> list[Any]:
         """Return the outputs (1, ...) of the map networks, linear around the traced transmitter."""
         networks = self._scene.networks
         if not reads_maps(networks):
             return []
-        maps = read_maps(networks, self._windows[:1] if tx_m is None else self._windows)
+        windows = self._windows[:1] if tx_m is None else self._windows
+        maps = read_maps(networks, windows, import_keras().ops)
         if tx_m is None:
             return maps
         steps = tf.cast(tx_m - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)

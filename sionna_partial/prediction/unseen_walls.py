@@ -7,8 +7,10 @@ were fitted to procedural buildings with 3 to 26 dB per wall (`benchmarks/unseen
 
 import functools
 import io
+import itertools
+import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -20,9 +22,10 @@ from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.evaluate import Network, array_ops
 from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
-from sionna_partial.prediction.paper_networks import import_keras, layer, tf
+from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.unobserved import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
@@ -107,10 +110,10 @@ class WallDensity(NamedTuple):
 
 
 class UnseenWalls(NamedTuple):
-    """Networks for the walls of cells and the corrections of lines."""
+    """Networks for the walls of cells and the corrections of lines: Keras models before training."""
 
-    cells: "keras.Model"
-    lines: "keras.Model"
+    cells: Any
+    lines: Any
 
     @classmethod
     def untrained(cls, seed: int = 0) -> Self:
@@ -120,18 +123,16 @@ class UnseenWalls(NamedTuple):
     @classmethod
     @functools.cache
     def shipped(cls) -> Self:
-        networks = cls.untrained()
+        """Return the trained networks as functions of arrays."""
         with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
-            for name, network in networks._asdict().items():
-                network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
-        return networks
+            return cls(*(Network(json.loads(str(stored[name])), _numbered(stored, name)) for name in cls._fields))
 
     def save(self, path: Path) -> None:
-        arrays = {
-            f"{name}_{number}": values
-            for name, network in self._asdict().items()
-            for number, values in enumerate(network.get_weights())
-        }
+        """Write the configuration and the weights of trained Keras models."""
+        arrays = {}
+        for name, model in self._asdict().items():
+            arrays[name] = np.array(json.dumps(json.loads(model.to_json())["config"]))
+            arrays |= {f"{name}_{number}": values for number, values in enumerate(model.get_weights())}
         with atomic_write(path) as stream:
             np.savez_compressed(stream, **arrays)
 
@@ -162,6 +163,10 @@ def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
     return keras.Model(line, layer(keras, "Dense", "outputs", 2, kernel_initializer="zeros")(x), name="lines")
 
 
+def _numbered(stored: Mapping[str, Any], name: str) -> Iterator[Any]:
+    return (stored[f"{name}_{number}"] for number in itertools.count())
+
+
 def _known_part(partial: PartialMap) -> PartialMap:
     known = partial.state != CellState.UNKNOWN
     if not known.any():
@@ -187,32 +192,36 @@ def map_image(
     return np.round(255.0 * np.stack(fractions, axis=-1)).astype(np.uint8)
 
 
-def walls_per_m(cells: "keras.Model", images: Any, *, training: bool = False) -> Any:
-    """Return the walls per metre (B, ny, nx, 2) along x and y of images (B, ny, nx, 2) in [0, 255]."""
+def walls_per_m(cells: Any, images: Any, ops: Any = array_ops, *, training: bool = False) -> Any:
+    """Return the walls per metre (B, ny, nx, 2) along x and y of images (B, ny, nx, 2) in [0, 255].
+
+    `ops` is `array_ops` for a `Network`, or keras.ops for a Keras model.
+    """
     known = images / 255.0
-    unknown = tf.maximum(1.0 - tf.reduce_sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
-    return cells(tf.concat([known, unknown], axis=-1), training=training) * unknown
+    unknown = ops.maximum(1.0 - ops.sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
+    options = {"training": True} if training else {}
+    return cells(ops.concatenate([known, unknown], axis=-1), **options) * unknown
 
 
-def walls_met(per_m: Any, start: Any, end: Any) -> Any:
+def walls_met(per_m: Any, start: Any, end: Any, ops: Any = array_ops) -> Any:
     """Integrate walls per metre (B, ny, nx, 2) over lines (B, R) from `start` to `end` (B, R, 2) [cells]."""
-    at = (tf.range(_POINTS, dtype=tf.float32) + 0.5) / _POINTS
+    (images, ny, nx, _), receivers = per_m.shape, start.shape[1]
+    at = ((np.arange(_POINTS) + 0.5) / _POINTS).astype(np.float32)
     points = start[..., None, :] + (end - start)[..., None, :] * at[:, None]
-    ny, nx = tf.shape(per_m)[1], tf.shape(per_m)[2]
     column, row = (
-        tf.clip_by_value(tf.cast(tf.floor(points[..., axis]), tf.int32), 0, count - 1)
-        for axis, count in enumerate((nx, ny))
+        ops.clip(ops.cast(ops.floor(points[..., axis]), "int32"), 0, count - 1) for axis, count in enumerate((nx, ny))
     )
-    values = tf.gather(tf.reshape(per_m, (tf.shape(per_m)[0], -1, 2)), row * nx + column, batch_dims=1)
-    return tf.reduce_sum(tf.reduce_sum(values, axis=2) * tf.abs(end - start) * (CELL_M / _POINTS), axis=-1)
+    cells = ops.reshape(row * nx + column, (images, -1)) + ny * nx * np.arange(images, dtype=np.int32)[:, None]
+    values = ops.take(ops.reshape(per_m, (-1, 2)), ops.reshape(cells, (images, receivers, _POINTS)), axis=0)
+    return ops.sum(ops.sum(values, axis=2) * ops.abs(end - start) * (CELL_M / _POINTS), axis=-1)
 
 
-def corrected(lines: "keras.Model", integral: Any, unobserved_m: Any, distance_m: Any, known: Any) -> Any:
-    lengths = (tf.math.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
-    share, none = unobserved_m / (distance_m + 0.1), tf.cast(known == 0.0, tf.float32)
-    inputs = tf.stack([tf.math.log(integral + 0.02), *lengths, tf.math.log(1.0 + known), share, none], axis=-1)
-    outputs = tf.reshape(lines(tf.reshape(inputs, (-1, _LINE_INPUTS))), tf.concat([tf.shape(integral), [2]], axis=0))
-    return integral * tf.exp(outputs[..., 0]) + tf.math.softplus(outputs[..., 1] + _LEAST)
+def corrected(lines: Any, integral: Any, unobserved_m: Any, distance_m: Any, known: Any, ops: Any = array_ops) -> Any:
+    lengths = (ops.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
+    share, none = unobserved_m / (distance_m + 0.1), ops.cast(known == 0.0, "float32")
+    inputs = ops.stack([ops.log(integral + 0.02), *lengths, ops.log(1.0 + known), share, none], axis=-1)
+    outputs = ops.reshape(lines(ops.reshape(inputs, (-1, _LINE_INPUTS))), (*integral.shape, 2))
+    return integral * ops.exp(outputs[..., 0]) + ops.softplus(outputs[..., 1] + _LEAST)
 
 
 def count_probabilities(walls: Floats) -> Floats:
