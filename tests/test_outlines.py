@@ -14,7 +14,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.settings import SceneSettings
@@ -295,9 +295,32 @@ def test_wall_noise_is_of_cells_that_stick_out_of_straight_walls(angle_deg: floa
     found = []
     for fraction in (0.0, 0.03, 0.1):
         noisy = (across >= -1.0) & (across < thickness + 1.0) & (rng.random(state.shape) < fraction)
-        found.append(PartialMap(np.where(noisy, CellState.WALL, state).astype(np.uint8), 0.05).wall_noise)
-    assert found[0] == 0.0
-    assert min(found[1:]) > 0.2
+        partial = PartialMap(np.where(noisy, CellState.WALL, state).astype(np.uint8), 0.05)
+        near = partial.noise_near(cell_centres_m(partial, np.argwhere(state == CellState.FREE)))
+        found.append((partial.wall_noise, near.mean(), near.max()))
+    assert max(found[0]) == 0.0
+    assert np.min(found[1:]) > 0.2
+
+
+def test_noise_near_is_local_continuous_and_turns_and_moves_with_the_map() -> None:
+    """A corridor of 40 m whose walls are noisy in one half alone."""
+    rng = np.random.default_rng(2)
+    state = np.full((60, 800), CellState.UNKNOWN, dtype=np.uint8)
+    state[10:-10, 10:-10] = CellState.WALL
+    state[9:-9, 10:400][rng.random((42, 390)) < 0.3] = CellState.WALL
+    state[11:-11, 11:-11] = CellState.FREE
+    partial = PartialMap(state, 0.05)
+    points_m = np.column_stack([np.linspace(1.0, 39.0, 1000), np.full(1000, 1.7)])
+    noise = partial.noise_near(points_m)
+    assert noise[:300].min() > 0.6
+    assert (noise[-300:] == 0.0).all()
+    assert np.abs(np.diff(noise)).max() < 0.02
+    for transpose, rows, columns in SYMMETRIES:
+        turned = PartialMap(transformed(state, transpose, rows, columns), 0.05, (-3.21, 1e3))
+        there_m = transformed_points(points_m / 0.05, state.shape, transpose, rows, columns) * 0.05 + turned.origin_m
+        np.testing.assert_allclose(turned.noise_near(there_m), noise, rtol=0, atol=1e-9)
+    padded = PartialMap(np.pad(state, ((3, 8), (40, 2)), constant_values=CellState.UNKNOWN), 0.05, (-2.0, -0.15))
+    np.testing.assert_allclose(padded.noise_near(points_m), noise, rtol=0, atol=1e-9)
 
 
 def test_niche_of_a_clean_wall_stays() -> None:

@@ -21,7 +21,7 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.wall_cells import thick_walls, wall_noise
+from sionna_partial.maps.wall_cells import noise_field, thick_walls, wall_noise
 from sionna_partial.settings import Material
 
 MAX_CELLS = 100_000_000
@@ -330,6 +330,29 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     def wall_noise(self) -> float:
         """Range noise from the depth of uneven walls: 0 (exact) to 1."""
         return wall_noise(self.state, self.resolution_m)
+
+    @cached_property
+    def _noise_field(self) -> Floats:
+        return noise_field(self.state, self.resolution_m)
+
+    def noise_near(self, points_m: NDArray[np.floating]) -> Floats:
+        """Return the range noise of the walls within a few metres of points (..., 2 or 3) [m]: 0 (exact) to 1.
+
+        It is continuous, turns and moves with the map, and is 0 where walls show no noise or there are none.
+
+        Examples
+        --------
+        >>> import numpy as np, sionna_partial as sp
+        >>> home = sp.make_home(74000)
+        >>> lidar = sp.SensorSettings(range_noise_m=0.02, field_of_view_deg=360.0, range_m=12.0)
+        >>> seen = sp.explore(home, (0.9,), 0, sensor=lidar)[0]
+        >>> middle_m = np.array([np.mean(np.reshape(home.bounds_m, (2, 2)), axis=0)])
+        >>> home.noise_near(middle_m).item(), seen.noise_near(middle_m).item() > 0.5
+        (0.0, True)
+        """
+        cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m - 0.5
+        row_column = np.moveaxis(cells[..., ::-1], -1, 0)
+        return np.asarray(ndimage.map_coordinates(self._noise_field, row_column, order=1, mode="nearest"))
 
     @cached_property
     def wall_fractions(self) -> dict[Material | None, float]:

@@ -47,6 +47,14 @@ _DEPTH_M = 0.014
 THICK_M, THICK_FRACTIONS = 0.15, (0.1, 0.9)
 """Thickness of thick walls [m], and fractions of their length between which thickness distinguishes walls."""
 
+DEPTH_WINDOW_M, SIGNS_WINDOW_M = 3.0, 5.0
+"""Standard deviations of the windows, about Gaussians, for the depth and for the signs of local noise [m]."""
+
+_EXACT_DEPTH_M, _SIGNS_PER_FACE = 0.001, 0.003
+"""Depth of the cells behind exact faces, as of walls cut out of meshes [m]; signs of noise per cell of a face at which
+depth is range noise to 1 - 1/e. A single sign is none: exact walls have them at corners.
+"""
+
 LEAST_NOISE = 0.05
 """Noise up to which a map counts as exact, as of cells cut out of meshes."""
 
@@ -157,6 +165,44 @@ def wall_noise(state: States, resolution_m: float) -> float:
     depth_m = float((wall & ~facing).sum() / max(1, facing.sum()) * resolution_m)
     depth = math.sqrt(-math.expm1(-depth_m / _DEPTH_M))
     return depth * float(np.interp(_uneven_faces(state), _UNEVEN, (0.0, 1.0))) if depth > 0.0 else 0.0
+
+
+def noise_field(state: States, resolution_m: float) -> Floats:
+    """Return the local range noise (ny, nx) of the walls around the centre of each cell: 0 (exact or no walls) to 1.
+
+    Depth is as in `wall_noise`, in a window; it is noise where cells stick out behind the faces of walls.
+    """
+    wall, near_free = state == CellState.WALL, ndimage.binary_dilation(state == CellState.FREE, structure=_SQUARE)
+    ragged, faces = _ragged_behind(wall, state != CellState.UNKNOWN) & ~near_free, wall & near_free
+    hidden, around = (_counted(cells, DEPTH_WINDOW_M / resolution_m) for cells in (wall & ~near_free, faces))
+    signs, farther = (_counted(cells, SIGNS_WINDOW_M / resolution_m) for cells in (ragged, faces))
+    depth_m = np.maximum(hidden / (around + 1.0) * resolution_m - _EXACT_DEPTH_M, 0.0)
+    evidence = np.maximum(signs - 1.0, 0.0) / (_SIGNS_PER_FACE * (farther + 1.0))
+    return np.asarray(np.sqrt(-np.expm1(-depth_m / _DEPTH_M)) * -np.expm1(-evidence))
+
+
+def _counted(cells: Bools, deviation: float) -> Floats:
+    """Count cells with the weights of a window that is 1 in its middle: three box filters."""
+    half = round((math.sqrt(4.0 * deviation**2 + 1.0) - 1.0) / 2.0)
+    counts = np.pad(cells.astype(np.float64), half)  # so that unknown cells around a map change nothing
+    for _ in range(3):
+        counts = ndimage.uniform_filter(counts, 2 * half + 1, mode="constant")
+    return 2.0 * math.pi * deviation**2 * counts[half : half + cells.shape[0], half : half + cells.shape[1]]
+
+
+def _ragged_behind(wall: Bools, known: Bools) -> Bools:
+    """Return wall cells with at most one neighbour by a side, or that stick out of a diagonal into unknown space."""
+    sides = ndimage.convolve(wall.astype(np.uint8), [[0, 1, 0], [1, 0, 1], [0, 1, 0]], mode="constant")
+    ragged = wall & (sides <= 1)
+    for turns in _TURNS:
+        walls, knowns = (np.pad(np.rot90(mask, turns), 3) for mask in (wall, known))
+        found = walls.copy()
+        for shift in ((-1, 0), (0, -1), (1, -1), (-1, 1)):
+            found &= ~np.roll(knowns, shift, (0, 1))
+        for shift in ((1, 0), (0, 1), (2, -1), (-1, 2), (3, -2), (-2, 3)):
+            found &= np.roll(walls, shift, (0, 1))
+        ragged |= np.rot90(found[3:-3, 3:-3], -turns)
+    return ragged
 
 
 def _uneven_faces(state: States) -> float:
