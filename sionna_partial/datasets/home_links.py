@@ -362,7 +362,7 @@ def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSe
             features.append(features[-1])
             continue
         links = _traced(partial, positions.tx_m, positions.rx_m, settings)
-        features.append(LinkFeatures.concatenate([link_features(partial, each, windows=False) for each in links]))
+        features.append(LinkFeatures.concatenate([link_features(partial, each) for each in links]))
     return features
 
 

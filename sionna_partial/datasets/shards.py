@@ -129,12 +129,12 @@ class LinkTable(Shown):
 
     @cached_property
     def phi(self) -> LinkFeatures:
-        """Features with windows, drawn at the first access."""
-        return self.features.with_windows(self.maps, self.map_index)
+        """The features."""
+        return self.features
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
         """Select links."""
-        features = self.__dict__.get("phi", self.features).take(index)  # with windows, if drawn
+        features = self.features.take(index)
         columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
         cir = {name: values[index] for name, values in self.cir.items()}
         return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, cir=cir, **columns)

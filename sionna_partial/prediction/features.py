@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
-from sionna_partial.checks import number_of, require_bool, require_type, shown
+from sionna_partial.checks import number_of, require_type, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
@@ -21,13 +21,11 @@ from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.prediction.unobserved import (
     GRAZE,
-    draw_windows,
     in_cells,
     is_enclosed,
     lengths_in_unknown_m,
     map_line_fractions,
     parts_at_walls,
-    transmitters,
     unobserved_lengths_m,
     walled_lengths_m,
 )
@@ -58,7 +56,7 @@ _BEYOND_CELLS = 2
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkContext(Shown):
-    """Context of N links: walls along their paths, possible link states, and windows of the map.
+    """Context of N links: walls along their paths, possible link states, and fields of the map.
 
     Parameters
     ----------
@@ -86,16 +84,16 @@ class LinkContext(Shown):
         Gain of the indirect paths, attenuated by unobserved space [dB], at least -150.
     strongest_unobserved_m : (N,) float64 array
         Unobserved length of the strongest indirect path [m]; the distance if there is none.
-    windows : (W, *WINDOWS) uint8 array, optional
-        Map around the transmitters, for map networks.
     straight_gain_db : (N,) float64 array
         Gain of the direct path through known walls [dB], at least -150.
     straight_walls : (N,) float64 array
         Number of these walls.
     wall_loss_db : (N,) float64 array
         From `mean_wall_loss_db` [dB].
-    window_index : (N,) int array
-        Transmitter and window of each link.
+    map_index : (N,) int array
+        Map of each link in `spaces`.
+    spaces : tuple of MapSpace
+        Fields of the maps.
     """
 
     tx_m: Floats
@@ -115,8 +113,8 @@ class LinkContext(Shown):
     straight_gain_db: Floats
     straight_walls: Floats
     wall_loss_db: Floats
-    window_index: Indices
-    windows: NDArray[np.uint8] | None = None
+    map_index: Indices
+    spaces: tuple[MapSpace, ...]
 
     def __len__(self) -> int:
         return len(self.tx_m)
@@ -133,11 +131,11 @@ class LinkContext(Shown):
         unobserved_distance_m: Floats,
         **traced: Any,
     ) -> "LinkContext":
-        """Compute the context of links on the maps `map_index` (N,), without windows."""
+        """Compute the context of links on the maps `map_index` (N,)."""
         count = len(map_index)
         tx_seen, rx_seen, complete, both_seen, nearly = (np.zeros(count, dtype=bool) for _ in range(5))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
-        exposure, route = np.zeros((count, 2)), np.zeros(count)
+        exposure, route, spaces = np.zeros((count, 2)), np.zeros(count), tuple(map(MapSpace.of, maps))
         for number in np.unique(map_index):
             here, partial = map_index == number, maps[number]
             ends = tx_m[here], rx_m[here]
@@ -146,46 +144,32 @@ class LinkContext(Shown):
             both_seen[here] = tx_seen[here] & rx_seen[here] & partial.environment.is_extruded
             nearly[here] = both_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
-            wall_noise[here] = partial.wall_noise
-            space = MapSpace.of(partial)
+            wall_noise[here] = 0.5 * sum(partial.noise_near(end_m) for end_m in ends)
+            space = spaces[number]
             exposure[here] = np.stack([space.exposure_at(end_m) for end_m in ends], axis=1)
             route[here] = space.routes_of(*ends)
             seen = unobserved_distance_m[here] == 0.0
-            possible[here] = _possible_states(partial, ends, link_state[here], seen, walled_m[here])
+            lines = seen, walled_m[here], wall_noise[here]
+            possible[here] = _possible_states(partial, ends, link_state[here], lines)
         found = (tx_seen, rx_seen, complete, both_seen, nearly, walled_m, wall_noise, exposure, route, possible)
-        _, window_index = transmitters(map_index, tx_m)
-        return cls(tx_m, rx_m, *found, window_index=window_index, **traced)
-
-    def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkContext":
-        """Return the context with windows of the maps."""
-        keys, window_index = transmitters(map_index, self.tx_m)
-        return replace(self, windows=draw_windows(maps, keys), window_index=window_index)
+        return cls(tx_m, rx_m, *found, map_index=map_index, spaces=spaces, **traced)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
-        """Select links; the windows are shared."""
-        return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, windows=self.windows)
+        """Select links; the fields of maps are shared."""
+        return LinkContext(**{name: getattr(self, name)[index] for name in _COLUMNS}, spaces=self.spaces)
 
     @classmethod
     def concatenate(cls, parts: Sequence["LinkContext"]) -> "LinkContext":
-        """Join links; there are windows only if all parts have them."""
+        """Join links."""
         columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS}
-        first: dict[int, int] = {}
-        index, windows, count = [], [], 0
-        for part in parts:
-            key = id(part if part.windows is None else part.windows)
-            if key not in first:
-                first[key] = count
-                count += part.window_index.max(initial=-1) + 1 if part.windows is None else len(part.windows)
-                windows.append(part.windows)
-            index.append(part.window_index + first[key])
-        columns["window_index"] = np.concatenate(index)
-        drawn = [each for each in windows if each is not None]
-        if len(drawn) < len(windows):
-            return cls(**columns)
-        return cls(**columns, windows=drawn[0] if len(drawn) == 1 else np.concatenate(drawn))
+        spaces = {id(space): space for part in parts for space in part.spaces}
+        number = {key: index for index, key in enumerate(spaces)}
+        of_part = [np.array([number[id(space)] for space in part.spaces], dtype=np.intp) for part in parts]
+        columns["map_index"] = np.concatenate([own[part.map_index] for own, part in zip(of_part, parts, strict=True)])
+        return cls(**columns, spaces=tuple(spaces.values()))
 
 
-_COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "windows")
+_COLUMNS = tuple(field.name for field in fields(LinkContext) if field.name != "spaces")
 
 
 class IndirectPaths:
@@ -223,7 +207,7 @@ class IndirectPaths:
         self._strongest[links], self._strongest_m[links] = power[strongest[links]], unobserved_m[strongest[links]]
 
     def context(self, link_state: States, unobserved_distance_m: Floats) -> LinkContext:
-        """Return the context of all T N links without windows."""
+        """Return the context of all T N links."""
         tx_m, rx_m = np.repeat(self.tx_m, len(self.rx_m), axis=0), np.tile(self.rx_m, (len(self.tx_m), 1))
         return LinkContext.on_maps(
             (self.partial,),
@@ -278,7 +262,7 @@ def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
 
 
 def _possible_states(
-    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, seen: Bools, walled_m: Floats
+    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, lines: tuple[Bools, Floats, Floats]
 ) -> Bools:
     """Return the possible link states (N, 3) on a map.
 
@@ -291,15 +275,14 @@ def _possible_states(
 
     Mesh cells do not give the heights of surfaces: only the second rule applies.
     """
-    los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
+    los, states, (seen, walled_m, wall_noise) = link_state == LinkState.LOS, np.arange(len(LinkState)), lines
     possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
     if partial.environment.is_extruded:
         walled = walled_m > 0.0
         doubtful = (walled & ~(seen & los)) | ~los
         blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))
         opaque = walled_m >= _OPAQUE_CELLS * partial.resolution_m
-        if (opaque & los & ~blocked).any() and partial.wall_noise <= LEAST_NOISE:
-            opaque &= ~los
+        opaque &= ~los | (wall_noise > LEAST_NOISE)
         blocked |= opaque
         walled_off, enclosed = _regions(partial, *ends_m)
         outage = (walled_off | enclosed) & (link_state == LinkState.OUTAGE)
@@ -474,12 +457,6 @@ class LinkFeatures(Shown):
         path_power = np.concatenate(powers) if len(powers) == len(parts) else None
         return cls(**columns, context=context, frequency_hz=frequencies_hz.pop(), path_power=path_power)
 
-    def with_windows(self, maps: Sequence[PartialMap], map_index: NDArray[np.int64]) -> "LinkFeatures":
-        """Return the features with windows of the maps; `map_index` (N,) is the map of each link."""
-        if self.context is None or self.context.windows is not None:
-            return self
-        return replace(self, context=self.context.with_windows(maps, map_index))
-
 
 _OPTIONAL = ("context", "frequency_hz", "path_power")
 _PAPER = tuple(field.name for field in fields(LinkFeatures) if field.name not in _OPTIONAL)
@@ -519,7 +496,7 @@ def link_states(name: str, values: ArrayLike, shape: tuple[int, ...]) -> States:
     return states.astype(np.uint8)
 
 
-def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = True) -> LinkFeatures:
+def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     """Extract the features of traced links (paper, eq. 8).
 
     Parameters
@@ -528,8 +505,6 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
         The map on which the links were traced.
     links : TracedLinks
         Links on this map.
-    windows : bool
-        Draw the map around the transmitters for the predictor "map" (20 ms each).
 
     Returns
     -------
@@ -541,7 +516,7 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     MapError
         If `partial` is no PartialMap.
     SettingsError
-        If `links` are no TracedLinks, or `windows` is no bool.
+        If `links` are no TracedLinks.
     PredictorError
         For links that were not traced (``invalid="nan"``).
 
@@ -557,7 +532,6 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     """
     require_map("partial", partial)
     require_type("links", links, TracedLinks, "give what trace_links returned.")
-    require_bool("windows", windows)
     if not links.valid.all():
         count = int((~links.valid).sum())
         raise PredictorError(f"links has {count} that were not traced: trace rx[links.valid], those that can be.")
@@ -566,7 +540,6 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     paths.add(links)
     frequency_hz = links.trace_settings.frequency_hz
     phi = _features(paths, links.link_state.ravel(), links.gain_db.ravel(), frequency_hz)
-    phi = phi.with_windows((partial,), np.zeros(len(phi), dtype=np.int64)) if windows else phi
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
@@ -576,13 +549,12 @@ def features_of_paths(
     rx_m: Floats,
     blocks: Iterable[SolvedPaths],
     settings: tuple[TraceSettings, SceneSettings],
-    windows: NDArray[np.uint8] | None,
     *,
     material_unknown: bool = False,
 ) -> LinkFeatures:
     """Extract the features of links from (3,) to (N, 3) [m] during the trace, without keeping paths.
 
-    `blocks` are from `Simulation.blocks`. Without `windows` there is no context.
+    `blocks` are from `Simulation.blocks`.
     """
     classes = partial.wall_class_count * material_unknown
     limits = (settings[0].max_walls,) * classes + (settings[0].max_depth,) * material_unknown
@@ -590,21 +562,19 @@ def features_of_paths(
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
     for paths in blocks:
         sums.add(paths, partial.wall_classes(paths.vertices_m) if material_unknown else None)
-        if windows is not None:
-            indirect.add(paths)
+        indirect.add(paths)
     link_state, gain_db = sums.states_and_gains()
-    phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz, context=windows is not None)
-    phi = replace(phi, path_power=sums.path_power) if material_unknown else phi
-    return phi if phi.context is None else replace(phi, context=replace(phi.context, windows=windows))
+    phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz)
+    return replace(phi, path_power=sums.path_power) if material_unknown else phi
 
 
 def _features(
-    paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float, *, context: bool = True
+    paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float
 ) -> LinkFeatures:
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
-    found = paths.context(link_state, unobserved_m) if context else None
-    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, found, frequency_hz)
+    context = paths.context(link_state, unobserved_m)
+    return LinkFeatures(link_state, unobserved_m, distance_m, gain_db, context, frequency_hz)
 
 
 def require_each(good: Bools, name: str, values: Floats, remedy: str) -> None:

@@ -1,8 +1,9 @@
-"""Networks that read maps and paths, as Keras 3 models.
+"""Networks that read the map and the paths of links, as Keras 3 models.
 
-Map networks are U-Nets (Ronneberger, Fischer and Brox 2015) that return `MAP_FEATURES` numbers per cell of the near and
-the far window, less their output for an empty window: unobserved space adds nothing. The link network reads the
-features of a link and these numbers at its receiver.
+The map network is a U-Net (Ronneberger, Fischer and Brox 2015) on the image of a map (`space.MapSpace`) that returns
+`MAP_FEATURES` numbers per cell, once for a map. Its kernels are symmetric: turned and mirrored maps give turned and
+mirrored features. The link network reads the features of a link, and those of the map at both ends and along the
+direct line, symmetrically in the ends.
 """
 
 import itertools
@@ -22,38 +23,40 @@ from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.evaluate import array_ops
 from sionna_partial.prediction.features import (
     ATTENUATION_LENGTHS_M,
-    LinkContext,
     LinkFeatures,
     context_of,
-    excess_noise,
     shifted_gain_db,
 )
-from sionna_partial.prediction.paper_networks import (
-    STD_RANGE_DB,
-    Networks,
-    free_space_gain_db,
-    import_keras,
-    layer,
-    tf,
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
+from sionna_partial.prediction.rule import (
+    GATE_INPUTS,
+    GATE_NETWORK,
+    GATE_OUTPUTS,
+    Parts,
+    predicted,
 )
-from sionna_partial.prediction.unobserved import CELLS_M, CHANNELS, WINDOW_CELLS
+from sionna_partial.prediction.space import WALK_M, MapSpace
 from sionna_partial.settings import NetworkKind, PredictorSettings
 
 if TYPE_CHECKING:
     import keras
 
 Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
+Networks = Mapping[str, Callable[[Any], Any]]
 
-MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
-"""Names of the networks; map networks in the order of `CELLS_M`."""
+MAP_NETWORK, LINK_NETWORK = "map_network", "link_network"
 
-MAP_FEATURES = 16
+MAP_CHANNELS, MAP_FEATURES = 3, 16
+"""Channels of the image of a map, and features of its cells."""
+
+LINE_POINTS = 24
+"""Points of the direct line at which the features of the map are averaged."""
 
 LINK_OUTPUTS = 7
 """Logits of the link states, then mean and spread of the gain given LOS and given NLOS."""
 
-WINDOWS_AT_ONCE, LINKS_OF_WINDOW = 16, 100
-"""Windows per gradient step, and links drawn per window."""
+MAPS_AT_ONCE = 8
+"""Maps per gradient step, of similar size."""
 
 LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 """Parameters of AdamW; the rate falls to 0 along a cosine."""
@@ -61,25 +64,21 @@ LEARNING_RATE, WEIGHT_DECAY = 4e-3, 1e-4
 GAIN_WEIGHT = 0.05
 """Weight of the gain's score against the log-likelihood of the link state [1/dB]."""
 
-WIDENING, SEEN_WIDENING = 0.15, 0.5
-"""Relative increase of standard deviations on maps of full noise, and for links with both ends observed.
+EXPERT_WEIGHT = 0.5
+"""Weight of the score of the networks alone against the score of the mixture with the trace."""
 
-Chosen for 90 % coverage of the 90 % intervals on procedural homes explored with range noise, drift and missed walls.
-"""
-
-_WIDTHS = ((16, 32, 48, 64), (8, 16, 24, 32))
-_HIDDEN_UNITS = 64
+_WIDTHS = (12, 24, 32, 48)
+_HIDDEN_UNITS, _GATE_UNITS = 64, 24
 _LOS_MOST_DB = 10.0
 """Largest mean gain given LOS over free space [dB]: other paths add at most this power."""
 
 _LOS_OFFSET = -1.5
 _NLOS_DB, _NLOS_SCALE_DB = -25.0, 20.0
 _STATISTICS_MOMENTUM = 0.9
-_FADE_CELLS = 8.0
-"""Width of the rim of a window in which its numbers fade to 0 [cells]."""
 
 _IMPOSSIBLE = -1e30
-_LINKS_AT_ONCE, _MAPS_AT_ONCE, _MAPS_KEPT = 16_384, 8, 8
+_LEAST_PROBABILITY, _LEAST_STD_DB = 1e-4, 0.1
+_LINKS_AT_ONCE, _MAPS_KEPT = 16_384, 8
 _REPORT_STEPS = 50
 
 _log = logging.getLogger(__name__)
@@ -93,7 +92,7 @@ FEATURES: dict[str, tuple[str, ...]] = {
     **{name: (name,) for name in ("unobserved_distance_m", "distance_m")},
     "indirect_gain_db": tuple(f"indirect_gain_reach_{length_m:g}_m_db" for length_m in ATTENUATION_LENGTHS_M),
     **{name: (name,) for name in ("strongest_unobserved_m", "straight_gain_db", "straight_walls", "wall_loss_db")},
-    **dict.fromkeys(("tx_seen", "rx_seen", "both_seen", "possible", "walled_m", "wall_noise", "exposure", "route"), ()),
+    **dict.fromkeys(("tx_seen", "rx_seen", "possible", "walled_m", "wall_noise", "exposure", "route"), ()),
 }
 """Features of links by their names in `LinkFeatures` or `LinkContext`, and their columns in data sets, if stored."""
 
@@ -130,8 +129,13 @@ _INDIRECT: dict[str, Callable[[Values], Any]] = {
 
 LINK_INPUTS: dict[str, Make] = {
     **{state.name.lower(): _is_state(state) for state in LinkState},
-    "tx_seen": _flag("tx_seen"),
-    "rx_seen": _flag("rx_seen"),
+    "both_seen": lambda of, ops: 1.0 * (of["tx_seen"] & of["rx_seen"]),
+    "an_end_seen": lambda of, ops: 1.0 * (of["tx_seen"] | of["rx_seen"]),
+    "exposure": lambda of, ops: of["exposure"][:, 0] + of["exposure"][:, 1],
+    "both_exposed": lambda of, ops: of["exposure"][:, 0] * of["exposure"][:, 1],
+    "noise": lambda of, ops: of["wall_noise"],
+    "route": lambda of, ops: of["route"] / 10.0,
+    "detour": _log_length(lambda of: np.maximum(of["route"] * WALK_M - of["distance_m"], 0.0)),
     **{f"{state.name.lower()}_possible": _flag("possible", state) for state in LinkState},
     "walled": lambda of, ops: ops.minimum(of["walled_m"], 1.0),
     "log_distance": lambda of, ops: ops.log(of["near_m"]),
@@ -148,15 +152,16 @@ LINK_INPUTS: dict[str, Make] = {
 }
 """Inputs of the link network in order, dimensionless, as functions of the features."""
 
-_SQUARE = (WINDOW_CELLS, WINDOW_CELLS)
-_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + len(CELLS_M) * MAP_FEATURES
+_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + 3 * MAP_FEATURES
+_GATE_SHAPES = {GATE_NETWORK: ((None, len(GATE_INPUTS)), (None, GATE_OUTPUTS))}
 
 CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
     {},
-    {LINK_NETWORK: ((None, len(LINK_INPUTS)), (None, LINK_OUTPUTS))},
+    {LINK_NETWORK: ((None, len(LINK_INPUTS)), (None, LINK_OUTPUTS)), **_GATE_SHAPES},
     {
         LINK_NETWORK: ((None, _LINK_INPUTS_WITH_MAP), (None, LINK_OUTPUTS)),
-        **dict.fromkeys(MAP_NETWORKS, ((None, *_SQUARE, len(CHANNELS)), (None, *_SQUARE, MAP_FEATURES))),
+        MAP_NETWORK: ((None, None, None, MAP_CHANNELS), (None, None, None, MAP_FEATURES)),
+        **_GATE_SHAPES,
     },
 )
 """For "paper", "paths" and "map": inputs and outputs of the added networks."""
@@ -195,17 +200,14 @@ def scaled_inputs(phi: LinkFeatures, frequency_hz: float) -> NDArray[np.float32]
     return inputs.astype(np.float32)
 
 
-def receiver_offsets_m(phi: LinkFeatures) -> NDArray[np.float32]:
-    context = context_of(phi)
-    return (context.rx_m - context.tx_m)[:, :2].astype(np.float32)
-
-
 def context_networks(seed: int, *, with_map: bool = True) -> dict[str, "keras.Model"]:
     keras, start = import_keras(), kernel_starts(seed)
-    networks = {LINK_NETWORK: _link_network(keras, start, _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS))}
-    for name, widths in zip(MAP_NETWORKS, _WIDTHS, strict=True) if with_map else ():
-        networks[name] = _map_network(keras, start, name, widths)
-    return networks
+    inputs = _LINK_INPUTS_WITH_MAP if with_map else len(LINK_INPUTS)
+    networks = {
+        LINK_NETWORK: _dense_network(keras, start, LINK_NETWORK, (inputs, _HIDDEN_UNITS, LINK_OUTPUTS)),
+        GATE_NETWORK: _dense_network(keras, start, GATE_NETWORK, (len(GATE_INPUTS), _GATE_UNITS, GATE_OUTPUTS)),
+    }
+    return networks | ({MAP_NETWORK: _map_network(keras, start)} if with_map else {})
 
 
 def kernel_starts(seed: int) -> Callable[[], Any]:
@@ -213,12 +215,23 @@ def kernel_starts(seed: int) -> Callable[[], Any]:
     return lambda: keras.initializers.GlorotUniform(seed=next(seeds))
 
 
-def _map_network(keras: Any, start: Callable[[], Any], name: str, widths: tuple[int, ...]) -> "keras.Model":
-    window = keras.Input((*_SQUARE, len(CHANNELS)), name="window", dtype="float32")
-    fractions = layer(keras, "Rescaling", "shares", 1.0 / 255.0)(window)
-    joined = layer(keras, "Concatenate", "all")([u_net(keras, start, fractions, widths), fractions])
+def _map_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
+    image = keras.Input((None, None, MAP_CHANNELS), name="image", dtype="float32")
+    joined = layer(keras, "Concatenate", "all")([u_net(keras, start, image, _WIDTHS), image])
     values = layer(keras, "Conv2D", "values", MAP_FEATURES, 1, kernel_initializer=start())(joined)
-    return keras.Model(window, values, name=name)
+    network = keras.Model(image, values, name=MAP_NETWORK)
+    for weight in network.trainable_variables:
+        weight.assign(symmetric(weight.value))
+    return network
+
+
+def symmetric(kernel: Any) -> Any:
+    """Return the mean over the eight turned and mirrored kernels (h, w, C, D); other weights as they are."""
+    if len(kernel.shape) != len("hwcd"):
+        return kernel
+    ops = import_keras().ops
+    mirrored = sum(ops.flip(kernel, axis) for axis in ((0,), (1,), (0, 1))) + kernel
+    return (mirrored + ops.transpose(mirrored, (1, 0, 2, 3))) / 8.0
 
 
 def u_net(keras: Any, start: Callable[[], Any], image: Any, widths: tuple[int, ...]) -> Any:
@@ -243,13 +256,13 @@ def u_net(keras: Any, start: Callable[[], Any], image: Any, widths: tuple[int, .
     return x
 
 
-def _link_network(keras: Any, start: Callable[[], Any], inputs: int) -> "keras.Model":
+def _dense_network(keras: Any, start: Callable[[], Any], name: str, sizes: tuple[int, int, int]) -> "keras.Model":
+    inputs, units, outputs = sizes
     x = link = keras.Input((inputs,), name="link", dtype="float32")
     for number in (1, 2):
         options = {"activation": "silu", "kernel_initializer": start()}
-        x = layer(keras, "Dense", f"hidden_{number}", _HIDDEN_UNITS, **options)(x)
-    outputs = layer(keras, "Dense", "outputs", LINK_OUTPUTS, kernel_initializer="zeros")(x)
-    return keras.Model(link, outputs, name=LINK_NETWORK)
+        x = layer(keras, "Dense", f"hidden_{number}", units, **options)(x)
+    return keras.Model(link, layer(keras, "Dense", "outputs", outputs, kernel_initializer="zeros")(x), name=name)
 
 
 def kind_of(networks: Networks) -> NetworkKind:
@@ -257,114 +270,80 @@ def kind_of(networks: Networks) -> NetworkKind:
 
 
 def reads_maps(networks: Networks) -> bool:
-    return MAP_NETWORKS[0] in networks
+    return MAP_NETWORK in networks
 
 
-def read_maps(networks: Networks, windows: Any, ops: Any = array_ops, *, training: bool = False) -> list[Any]:
-    """Return the outputs of the map networks for windows (B, *WINDOWS) in [0, 255], less those for an empty window.
-
-    In training, values are normalised by the statistics of this batch. `ops` is `array_ops`, or keras.ops
-    for tensors.
-    """
-    if not reads_maps(networks):
-        return []
-    windows = ops.concatenate([windows, ops.zeros_like(windows[:1])], axis=0)
-    options = {"training": True} if training else {}
-    maps = [networks[name](windows[:, scale], **options) for scale, name in enumerate(MAP_NETWORKS)]
-    return [each[:-1] - each[-1:] for each in maps]
+def line_points_m(tx_m: Any, rx_m: Any) -> Any:
+    """Return points (N, 2 + LINE_POINTS, 2) [m] of links: both ends, and points along the direct line."""
+    along = np.concatenate([[0.0, 1.0], (np.arange(LINE_POINTS) + 0.5) / LINE_POINTS])[:, None]
+    return tx_m[:, None, :2] * (1.0 - along) + rx_m[:, None, :2] * along
 
 
-class MapReader:
-    """Reads windows by map networks, and keeps the latest results."""
+def link_outputs(networks: Networks, inputs: Any, points: Any | None, ops: Any = array_ops) -> Any:
+    """Return the outputs (N, LINK_OUTPUTS) for inputs (N, I) and map features (N, 2 + LINE_POINTS, F) of points."""
+    if points is not None:
+        first, last = points[:, 0], points[:, 1]
+        inputs = ops.concatenate([inputs, first + last, first * last, ops.mean(points[:, 2:], axis=1)], axis=1)
+    return networks[LINK_NETWORK](inputs)
+
+
+def expert_parts(outputs: Any, free_db: Any, possible: Any, ops: Any = array_ops) -> Parts:
+    """Return the distribution of the networks."""
+    states = ops.where(possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
+    los_db = _LOS_MOST_DB * ops.sigmoid(_LOS_OFFSET + outputs[:, 3])
+    means_db = [free_db + los_db, free_db + _NLOS_DB + _NLOS_SCALE_DB * outputs[:, 4]]
+    low, high = (math.log(std_db) for std_db in STD_RANGE_DB)
+    stds_db = [ops.exp(low + (high - low) * ops.sigmoid(outputs[:, column])) for column in (5, 6)]
+    outage = ops.zeros_like(free_db)
+    return Parts(
+        ops.transpose(ops.exp(ops.log_softmax(states))),
+        ops.maximum(ops.stack([outage + GAIN_FLOOR_DB, *means_db]), GAIN_FLOOR_DB),
+        ops.stack([outage, *stds_db]),
+    )
+
+
+class MapFeatures:
+    """Features of the latest maps by a map network."""
 
     def __init__(self, networks: Networks) -> None:
-        self._networks = networks
-        self._kept: dict[bytes, list[list[Any]]] = {}
+        self._networks, self._kept = networks, dict[bytes, Any]()
 
-    def __call__(self, windows: NDArray[np.uint8]) -> list[list[Any]]:
-        """Return `read_maps` of each window (W, *WINDOWS)."""
-        key, kept = windows.tobytes(), self._kept
-        if key not in kept:
-            maps = read_maps(self._networks, windows.astype(np.float32))
-            each_window = [[each[at : at + 1] for each in maps] for at in range(len(windows))]
-            self._kept = kept = dict([*kept.items()][1 - _MAPS_KEPT :]) | {key: each_window}
-        return kept[key]
+    def __call__(self, space: MapSpace) -> Any:
+        """Return the features (H, W, F) of the cells of a map."""
+        key = space.image.tobytes()
+        if key not in self._kept:
+            found = self._networks[MAP_NETWORK](space.image[None])[0]
+            self._kept = dict([*self._kept.items()][1 - _MAPS_KEPT :]) | {key: found}
+        return self._kept[key]
 
 
-def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any, ops: Any = array_ops) -> Any:
-    """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters."""
-    at_receivers = [_interpolated(each, offsets_m / cell_m, ops) for each, cell_m in zip(maps, CELLS_M, strict=False)]
-    links = ops.concatenate([links, *at_receivers], axis=-1)
-    outputs = networks[LINK_NETWORK](ops.reshape(links, (-1, links.shape[-1])))
-    return ops.reshape(outputs, (*offsets_m.shape[:2], LINK_OUTPUTS))
-
-
-def _interpolated(maps: Any, offsets: Any, ops: Any) -> Any:
-    """Interpolate maps (B, S, S, C) at offsets (B, R, 2) from their centres [cells], fading to 0 at the border."""
-    half, (receivers, features) = WINDOW_CELLS / 2, (offsets.shape[1], maps.shape[-1])
-    inside = ops.clip((half - ops.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
-    centres = np.arange(WINDOW_CELLS, dtype=np.float32) + np.float32(0.5 - half)
-    weights = inside[..., None] * ops.maximum(1.0 - ops.abs(offsets[..., None] - centres), 0.0)
-    rows = ops.matmul(weights[:, :, 1], ops.reshape(maps, (-1, WINDOW_CELLS, WINDOW_CELLS * features)))
-    rows = ops.reshape(rows, (-1, receivers, WINDOW_CELLS, features))
-    return ops.matmul(weights[:, :, :1], rows)[:, :, 0]
-
-
-def decode(outputs: Any, free_db: Any, ops: Any = array_ops) -> tuple[Any, Any, Any]:
-    """Return log-probabilities (..., 3), and means [dB] and log-variances (..., 2) given LOS and NLOS."""
-    los_db = _LOS_MOST_DB * ops.sigmoid(_LOS_OFFSET + outputs[..., 3])
-    nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
-    means_db = free_db[..., None] + ops.stack([los_db, nlos_db], axis=-1)
-    low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
-    return ops.log_softmax(outputs[..., :3]), means_db, low + (high - low) * ops.sigmoid(outputs[..., 5:])
-
-
-def distribution(outputs: Any, free_db: Any, context: LinkContext, ops: Any = array_ops) -> tuple[Any, Any, Any]:
-    """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
-
-    Standard deviations grow with the range noise of the map, which the networks do not notice.
-    """
-    widening = 1.0 + excess_noise(context.wall_noise) * np.where(
-        context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
-    )
-    states = ops.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
-    outputs = ops.concatenate([states, outputs[:, len(LinkState) :]], axis=1)
-    log_probabilities, gains_db, log_variances = decode(outputs, free_db, ops)
-    outage = np.full((1, len(context)), GAIN_FLOOR_DB)
-    means_db = ops.concatenate([outage, ops.transpose(ops.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
-    stds_db = ops.concatenate([np.zeros_like(outage), ops.transpose(ops.exp(0.5 * log_variances))], axis=0)
-    return ops.transpose(ops.exp(log_probabilities)), means_db, stds_db * widening
-
-
-def evaluate_context_networks(
-    networks: Networks, phi: LinkFeatures, frequency_hz: float, read: MapReader | None = None
-) -> tuple[Floats, Floats, Floats]:
-    """Return the `distribution` of N links with a context."""
-    inputs, offsets_m = scaled_inputs(phi, frequency_hz), receiver_offsets_m(phi)
+def predict_by_context(networks: Networks, phi: LinkFeatures, frequency_hz: float, features: MapFeatures) -> Parts:
+    """Predict N links with a context."""
+    context, inputs = context_of(phi), scaled_inputs(phi, frequency_hz)
     outputs = np.zeros((len(phi), LINK_OUTPUTS))
-    for maps, links in _by_window(networks, context_of(phi), read):
+    for index, links in enumerate(_links_by_map(phi)):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
-            outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
+            points = None
+            if reads_maps(networks):
+                space = context.spaces[index]
+                points = space.read(features(space), line_points_m(context.tx_m[here], context.rx_m[here]))
+            outputs[here] = link_outputs(networks, inputs[here], points)
+    values = rule_values(phi, frequency_hz)
+    expert = expert_parts(outputs, values["free_db"], context.possible)
+    return predicted(values, expert, networks[GATE_NETWORK])
+
+
+def rule_values(phi: LinkFeatures, frequency_hz: float) -> dict[str, Any]:
+    """Return the features that the rule reads."""
     free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
-    return distribution(outputs, free_db, context_of(phi))
+    return feature_values(phi) | {"free_db": free_db}
 
 
-def _by_window(networks: Networks, context: LinkContext, read: MapReader | None) -> Iterator[tuple[list[Any], Indices]]:
-    if not reads_maps(networks):
-        yield [], np.arange(len(context))
-        return
-    assert context.windows is not None
-    read = read or MapReader(networks)
-    used, links = _links_by_window(context)
-    for start in range(0, len(used), _MAPS_AT_ONCE):
-        here = slice(start, start + _MAPS_AT_ONCE)
-        yield from zip(read(context.windows[used[here]]), links[here], strict=True)
-
-
-def _links_by_window(context: LinkContext) -> tuple[Indices, list[Indices]]:
-    used, counts = np.unique(context.window_index, return_counts=True)
-    return used, np.split(np.argsort(context.window_index, kind="stable"), np.cumsum(counts)[:-1])
+def _links_by_map(phi: LinkFeatures) -> list[Indices]:
+    index, count = context_of(phi).map_index, len(context_of(phi).spaces)
+    order = np.argsort(index, kind="stable")
+    return np.split(order, np.searchsorted(index[order], np.arange(1, count)))
 
 
 def fit_context_networks(
@@ -375,93 +354,102 @@ def fit_context_networks(
     *,
     progress: Progress | None = None,
 ) -> dict[str, "keras.Model"]:
-    """Fit the networks of `settings` to links with a context, with windows turned and mirrored at random."""
+    """Fit the networks of `settings` and the gate, together, to links with a context."""
     networks = context_networks(settings.seed, with_map=settings.networks == "map")
     examples = _Examples(phi, link_state, gain_db, settings)
-    steps = math.ceil(settings.passes * len(examples) / WINDOWS_AT_ONCE)
+    steps = math.ceil(settings.passes * len(examples) / MAPS_AT_ONCE)
     step = _gradient_step(networks, steps)
     losses = []
     for number, batch in enumerate(examples.batches(steps, np.random.default_rng(settings.seed))):
-        losses.append(float(step(**batch)))
+        losses.append(float(step(*batch)))
         if progress and number % _REPORT_STEPS == 0:
             recent = np.mean(losses[-_REPORT_STEPS:])
             progress(number / steps, f"step {number} of {steps}, loss {recent:.4f}")
-    _log.info("%d steps on %d windows: loss %.4f", steps, len(examples), np.mean(losses[-_REPORT_STEPS:]))
+    _log.info("%d steps on %d maps: loss %.4f", steps, len(examples), np.mean(losses[-_REPORT_STEPS:]))
     if not np.isfinite(losses).all():
         raise PredictorError(f"training diverged in step {int(np.argmin(np.isfinite(losses)))}: give another seed.")
     return networks
 
 
 class _Examples:
-    """Training links by window."""
+    """Training links by map."""
 
     def __init__(self, phi: LinkFeatures, link_state: States, gain_db: Floats, settings: PredictorSettings) -> None:
-        self._used, links = _links_by_window(context_of(phi))
-        self._windows = context_of(phi).windows if settings.networks == "map" else None
-        self._first = np.cumsum([0, *map(len, links)])
-        columns = {
-            "links": scaled_inputs(phi, settings.frequency_hz),
-            "offsets_m": receiver_offsets_m(phi),
-            "free_db": free_space_gain_db(phi.distance_m, settings.frequency_hz).astype(np.float32),
-            "link_state": link_state.astype(np.int32),
-            "gain_db": gain_db.astype(np.float32),
-        }
-        order = np.concatenate(links)
-        self._columns = {name: column[order] for name, column in columns.items()}
+        context, reads = context_of(phi), settings.networks == "map"
+        maps = [(context.spaces[index], links) for index, links in enumerate(_links_by_map(phi)) if len(links)]
+        self._maps = sorted(maps, key=lambda each: math.prod(each[0].shape))
+        self._ends_m = (context.tx_m, context.rx_m) if reads else None
+        values = rule_values(phi, settings.frequency_hz)
+        columns = values | {"inputs": scaled_inputs(phi, settings.frequency_hz), "true_gain_db": gain_db}
+        self._columns = {
+            name: np.asarray(column, dtype=np.float32 if np.asarray(column).dtype.kind == "f" else None)
+            for name, column in columns.items()
+        } | {"true_state": link_state.astype(np.int32)}
 
     def __len__(self) -> int:
-        return len(self._used)
+        return len(self._maps)
 
-    def batches(self, steps: int, rng: np.random.Generator) -> Iterator[dict[str, NDArray[np.generic]]]:
-        order = np.zeros(0, dtype=np.intp)
+    def batches(self, steps: int, rng: np.random.Generator) -> Iterator[tuple[Any, ...]]:
+        starts: list[int] = []
         for _ in range(steps):
-            while len(order) < WINDOWS_AT_ONCE:
-                order = np.concatenate([order, rng.permutation(len(self))])
-            chosen, order = order[:WINDOWS_AT_ONCE], order[WINDOWS_AT_ONCE:]
-            low, high = self._first[chosen], self._first[chosen + 1]
-            links = rng.integers(low[:, None], high[:, None], (len(chosen), LINKS_OF_WINDOW))
-            batch = {name: column[links] for name, column in self._columns.items()}
-            turns = rng.integers(8, size=len(chosen))
-            pairs = zip(batch["offsets_m"], turns, strict=True)
-            batch["offsets_m"] = np.stack([turned_offsets(offset_m, turn) for offset_m, turn in pairs])
-            if self._windows is not None:
-                images = zip(self._windows[self._used[chosen]], turns, strict=True)
-                batch["windows"] = np.stack([turned(image, turn) for image, turn in images]).astype(np.float32)
-            yield batch
+            if not starts:  # maps of similar size, from another first map in each pass
+                first = int(rng.integers(MAPS_AT_ONCE)) - MAPS_AT_ONCE + 1
+                starts = rng.permutation(np.arange(first, len(self), MAPS_AT_ONCE)).tolist()
+            start = starts.pop()
+            maps = self._maps[max(start, 0) : start + MAPS_AT_ONCE]
+            links = np.concatenate([links for _, links in maps])
+            columns = {name: column[links] for name, column in self._columns.items()}
+            yield (columns, *(self._images(maps) if self._ends_m else ()))
+
+    def _images(self, maps: Sequence[tuple[MapSpace, Indices]]) -> tuple[Any, Any, Any]:
+        """Return images (B, H, W, C) of equal size, cells of points (N, P, 4) in them, and weights."""
+        assert self._ends_m is not None
+        ny, nx = (max(space.shape[axis] for space, _ in maps) for axis in (0, 1))
+        images, cells, weights = [], [], []
+        for number, (space, links) in enumerate(maps):
+            more = [(0, ny - space.shape[0]), (0, nx - space.shape[1]), (0, 0)]
+            images.append(np.pad(space.image, more, mode="edge"))
+            index, weight = space.corners(line_points_m(*(end_m[links] for end_m in self._ends_m)))
+            row, column = np.divmod(index, space.shape[1])
+            cells.append((number * ny + row) * nx + column)
+            weights.append(weight)
+        return (
+            np.stack(images),
+            np.concatenate(cells).astype(np.int32),
+            np.concatenate(weights).astype(np.float32),
+        )
 
 
-def turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
-    """Return one of the eight orientations of squares (K, S, S, C)."""
-    image = image[:, :, ::-1] if turn & 1 else image
-    image = image[:, ::-1] if turn & 2 else image
-    return image.transpose(0, 2, 1, 3) if turn & 4 else image
-
-
-def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
-    x, y = offsets_m.T
-    x = -x if turn & 1 else x
-    y = -y if turn & 2 else y
-    return np.stack([y, x] if turn & 4 else [x, y], axis=1)
-
-
-def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
+def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callable[..., Any]:
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer, ops = adam_w(weights, steps), import_keras().ops
 
-    def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
+    def step(columns: Any, images: Any = None, cells: Any = None, point_weights: Any = None) -> Any:
         with tf.GradientTape() as tape:
-            outputs = read_links(networks, read_maps(networks, windows, ops, training=True), links, offsets_m, ops)
-            log_p, means_db, log_variances = decode(outputs, free_db, ops)
-            loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
-            scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
-            states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)
-            linked = tf.cast(link_state[..., None] == states, tf.float32)
-            loss += GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db * linked, axis=-1))
-        optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
+            points = None
+            if images is not None:
+                features = tf.reshape(networks[MAP_NETWORK](images, training=True), (-1, MAP_FEATURES))
+                points = tf.reduce_sum(tf.gather(features, cells) * point_weights[..., None], axis=2)
+            outputs = link_outputs(networks, columns["inputs"], points, ops)
+            expert = expert_parts(outputs, columns["free_db"], columns["possible"], ops)
+            mixed = predicted(columns, expert, networks[GATE_NETWORK], ops)
+            truth = columns["true_state"], columns["true_gain_db"]
+            loss = _score(mixed, *truth) + EXPERT_WEIGHT * _score(expert, *truth)
+        slopes = [symmetric(slope) for slope in tape.gradient(loss, weights)]
+        optimizer.apply_gradients(zip(slopes, weights, strict=True))
         return loss
 
-    compiled: Callable[..., Any] = tf.function(step, autograph=False, jit_compile=False)
+    compiled: Callable[..., Any] = tf.function(step, autograph=False, jit_compile=False, reduce_retracing=True)
     return compiled
+
+
+def _score(parts: Parts, state: Any, gain_db: Any) -> Any:
+    """Return the cross-entropy of the link state, and the CRPS of the gain given the true state."""
+    chosen = tf.one_hot(state, len(LinkState), axis=0)
+    p_true = tf.reduce_sum(parts.probabilities * chosen, axis=0)
+    scores_db = _crps(gain_db - parts.means_db, tf.maximum(parts.stds_db, _LEAST_STD_DB))[1:] * chosen[1:]
+    entropy = -tf.reduce_mean(tf.math.log(tf.maximum(p_true, _LEAST_PROBABILITY)))
+    return entropy + GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db, axis=0))
 
 
 def adam_w(weights: Sequence[Any], steps: int) -> Any:

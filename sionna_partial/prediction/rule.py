@@ -11,14 +11,12 @@ walls). The prediction is their mixture. The trace has the weight 1 - doubt (1 -
 All functions take NumPy arrays, or tensors with `ops` = keras.ops.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.prediction.space import WALK_M
 
@@ -31,7 +29,7 @@ DOUBT_SCALE = 8.0
 _SHIFT_DB, _STDS_DB, _SPREAD_RANGE = 10.0, (1.0, 4.0), 2.5
 """Unit of shifts; standard deviations of an untrained gate; largest logarithm of a change of them."""
 
-_LEAST_PROBABILITY = 1e-30
+_LEAST_SHARE = 1e-20
 
 
 class Parts(NamedTuple):
@@ -42,43 +40,32 @@ class Parts(NamedTuple):
     stds_db: Any
 
 
-class Evidence(NamedTuple):
-    """What the rule knows about N links besides the experts.
-
-    Parameters
-    ----------
-    values : mapping
-        Features by name (`map_networks.feature_values`), with `free_db`, the free-space gain at the links' frequency.
-    traced : (N,) array of LinkState
-    """
-
-    values: Mapping[str, Any]
-    traced: States
-
-
 def doubt(values: Mapping[str, Any], ops: ModuleType = np) -> Any:
     """Return the doubt (N,) about the trace, 0 to 1."""
     exposure = values["exposure"]
     return 1.0 - ops.exp(-DOUBT_SCALE * (exposure[:, 0] + exposure[:, 1] + values["wall_noise"]))
 
 
-def traced_parts(traced: States, gain_db: Any, ops: ModuleType = np) -> Parts:
+def traced_parts(traced: Any, gain_db: Any, ops: ModuleType = np) -> Parts:
     """Return the trace without errors."""
-    states = np.array([traced == state for state in LinkState], dtype=np.float64)
+    one = ops.ones_like(gain_db)
+    states = ops.stack([ops.where(traced == state, one, 0.0 * one) for state in LinkState])
     means_db = ops.stack([gain_db] * len(LinkState))
-    return Parts(states, means_db, np.zeros_like(states))
+    return Parts(states, means_db, ops.zeros_like(means_db))
 
 
 def predicted(
-    evidence: Evidence, expert: Parts, gate: Callable[[Any], Any] | None = None, ops: ModuleType = np
+    values: Mapping[str, Any], expert: Parts, gate: Callable[[Any], Any] | None = None, ops: ModuleType = np
 ) -> Parts:
-    """Return the mixture of the trace and the expert for unobserved space."""
-    values, doubts = evidence.values, doubt(evidence.values, ops)
-    trace = traced_parts(evidence.traced, values["gain_db"], ops)
+    """Return the mixture of the trace and the expert for unobserved space.
+
+    `values` are features by name (`map_networks.rule_values`), with the free-space gain `free_db`.
+    """
+    doubts, trace = doubt(values, ops), traced_parts(values["link_state"], values["gain_db"], ops)
     if gate is None:
         return mixture((trace, expert), (1.0 - doubts, doubts), ops)
-    outputs = gate(gate_inputs(evidence, expert, ops))
-    possible = np.take_along_axis(values["possible"], evidence.traced[:, None].astype(np.intp), axis=1)[:, 0]
+    outputs = gate(gate_inputs(values, expert, ops))
+    possible = ops.sum(ops.where(ops.transpose(values["possible"]), trace.probabilities, 0.0), axis=0)
     trust = possible / (1.0 + ops.exp(-outputs[:, 0]))
     weight = 1.0 - doubts * (1.0 - trust)
     return mixture((with_errors(trace, outputs, doubts, ops), expert), (weight, 1.0 - weight), ops)
@@ -101,7 +88,7 @@ def mixture(parts: Sequence[Parts], weights: Sequence[Any], ops: ModuleType = np
     """Return the mixture of K distributions by weights (N,) or (), which sum to 1; gains given a state are Gaussian."""
     joint = [weight * part.probabilities for part, weight in zip(parts, weights, strict=True)]
     probabilities = sum(joint)
-    shares = [each + _LEAST_PROBABILITY * (weight + 1e-9) for each, weight in zip(joint, weights, strict=True)]
+    shares = [each + _LEAST_SHARE * (weight + 1e-6) for each, weight in zip(joint, weights, strict=True)]
     total = sum(shares)
     shares = [each / total for each in shares]
     mean_db = sum(share * part.means_db for share, part in zip(shares, parts, strict=True))
@@ -120,9 +107,13 @@ class _Links(NamedTuple):
     """Inputs of the gate's table: features, the expert, and the ops."""
 
     values: Mapping[str, Any]
-    traced: States
     expert: Parts
     ops: ModuleType
+
+    def flag(self, mask: Any) -> Any:
+        """Return 1 where a mask is True, else 0."""
+        one = self.ops.ones_like(self.values["gain_db"])
+        return self.ops.where(mask, one, 0.0 * one)
 
     def log_length(self, length_m: Any) -> Any:
         """Return a length, compressed."""
@@ -138,13 +129,13 @@ class _Links(NamedTuple):
 
     def apart(self, state: LinkState) -> Any:
         """Return the mean of the expert relative to the trace."""
-        return self.ops.clip((self.expert.means_db[state] - self.values["gain_db"]) / _SCALE_DB, -2.0, 3.0)
+        return self.ops.clip((self.expert.means_db[int(state)] - self.values["gain_db"]) / _SCALE_DB, -2.0, 3.0)
 
 
 GATE_INPUTS: dict[str, Callable[[_Links], Any]] = {
-    **{state.name.lower(): lambda of, state=state: 1.0 * (of.traced == state) for state in LinkState},  # type: ignore[misc]
-    "both_seen": lambda of: 1.0 * of.values["both_seen"],
-    "an_end_seen": lambda of: 1.0 * (of.values["tx_seen"] | of.values["rx_seen"]),
+    **{state.name.lower(): lambda of, state=state: of.flag(of.values["link_state"] == state) for state in LinkState},  # type: ignore[misc]
+    "both_seen": lambda of: of.flag(of.values["tx_seen"] & of.values["rx_seen"]),
+    "an_end_seen": lambda of: of.flag(of.values["tx_seen"] | of.values["rx_seen"]),
     "exposure": lambda of: of.values["exposure"][:, 0] + of.values["exposure"][:, 1],
     "both_exposed": lambda of: of.values["exposure"][:, 0] * of.values["exposure"][:, 1],
     "noise": lambda of: of.values["wall_noise"],
@@ -158,17 +149,17 @@ GATE_INPUTS: dict[str, Callable[[_Links], Any]] = {
     **{f"indirect_{column}": lambda of, column=column: of.indirect(column) for column in range(5)},  # type: ignore[misc]
     "hidden_power": lambda of: of.indirect(4) - of.indirect(0),
     **{
-        f"expert_p_{state.name.lower()}": lambda of, state=state: of.expert.probabilities[state]  # type: ignore[misc]
+        f"expert_p_{state.name.lower()}": lambda of, state=state: of.expert.probabilities[int(state)]  # type: ignore[misc]
         for state in LinkState
     },
     "expert_los_apart": lambda of: of.apart(LinkState.LOS),
     "expert_nlos_apart": lambda of: of.apart(LinkState.NLOS),
-    "expert_nlos_width": lambda of: of.ops.log(of.expert.stds_db[LinkState.NLOS] / 10.0),
+    "expert_nlos_width": lambda of: of.ops.log(of.expert.stds_db[int(LinkState.NLOS)] / 10.0),
 }
 """Inputs of the gate in order, dimensionless and symmetric in the ends of a link, if the expert is."""
 
 
-def gate_inputs(evidence: Evidence, expert: Parts, ops: ModuleType = np) -> Any:
+def gate_inputs(values: Mapping[str, Any], expert: Parts, ops: ModuleType = np) -> Any:
     """Return the inputs (N, len(GATE_INPUTS)) of the gate."""
-    links = _Links(evidence.values, evidence.traced, expert, ops)
+    links = _Links(values, expert, ops)
     return ops.stack([make(links) for make in GATE_INPUTS.values()], axis=1)

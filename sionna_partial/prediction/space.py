@@ -135,21 +135,21 @@ class MapSpace:
         return found
 
     def corners(self, points_m: Any, ops: ModuleType = np) -> tuple[Indices, Any]:
-        """Return the four cells (N, 4) around points (N, 2 or 3) [m], and their bilinear weights (N, 4)."""
-        limits = np.array(self.shape[::-1]) - 1.0
-        at = ops.clip((points_m[:, :2] - self.corner_m) / CELL_M - 0.5, 0.0, limits - 1e-6)
+        """Return the four cells (..., 4) around points (..., 2 or 3) [m], and their bilinear weights (..., 4)."""
+        limits = np.array(self.shape[::-1]) - 1.0 - 1e-6
+        at = ops.minimum(ops.maximum((points_m[..., :2] - self.corner_m) / CELL_M - 0.5, 0.0), limits)
         low = np.floor(np.asarray(at)).astype(np.intp)
         part = at - low
-        cells = low[:, 1:] * self.shape[1] + low[:, :1] + np.array([0, 1, self.shape[1], self.shape[1] + 1])
-        x, y = part[:, 0], part[:, 1]
-        weights = ops.stack([(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y], axis=1)
+        cells = low[..., 1:] * self.shape[1] + low[..., :1] + np.array([0, 1, self.shape[1], self.shape[1] + 1])
+        x, y = part[..., 0], part[..., 1]
+        weights = ops.stack([(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y], axis=-1)
         return cells, weights
 
     def read(self, values: Any, points_m: Any, ops: ModuleType = np) -> Any:
-        """Interpolate a field (H, W, C) at points (N, 2 or 3) [m]: return (N, C)."""
+        """Interpolate a field (H, W, C) at points (..., 2 or 3) [m]: return (..., C)."""
         cells, weights = self.corners(points_m, ops)
         flat = ops.reshape(values, (-1, values.shape[-1]))
-        return ops.sum(ops.take(flat, cells, axis=0) * weights[..., None], axis=1)
+        return ops.sum(ops.take(flat, cells, axis=0) * weights[..., None], axis=-2)
 
 
 def _entered(state: NDArray[np.uint8]) -> Bools:
@@ -176,7 +176,7 @@ def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
 def _overlaps(edges: Floats, count: int) -> Any:
     """Return the fractions (K, count), sparse, of intervals between `edges` (K + 1,) covered by unit cells."""
     low, high = np.clip(edges[:-1], 0.0, count), np.clip(edges[1:], 0.0, count)
-    widest = math.ceil(float((edges[1] - edges[0]))) + 1
+    widest = math.ceil(float(edges[1] - edges[0])) + 1
     cells = np.floor(low).astype(np.intp)[:, None] + np.arange(widest)
     part = np.minimum(high[:, None], cells + 1) - np.maximum(low[:, None], cells)
     part = np.where(cells < count, np.maximum(part, 0.0), 0.0) / (edges[1] - edges[0])
@@ -195,7 +195,7 @@ def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, .
     for up in (-_ASIDE_CELLS, _ASIDE_CELLS):
         for right in (-_ASIDE_CELLS, _ASIDE_CELLS):
             rows, columns = (np.floor(axis + aside).astype(np.intp) for axis, aside in zip(at, (up, right), strict=True))
-            inside = [(0 <= index) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
+            inside = [(index >= 0) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
             looked_up = wall[np.ix_(np.clip(rows, 0, wall.shape[0] - 1), np.clip(columns, 0, wall.shape[1] - 1))]
             sampled |= looked_up & np.logical_and.outer(*inside)
     return sampled

@@ -1,18 +1,15 @@
-"""Straight lines and windows on the cells of a map: d_unobs (paper, Section III-C), and the images of map networks."""
+"""Straight lines on the cells of a map: d_unobs (paper, Section III-C)."""
 
 import itertools
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 
-from sionna_partial.arrays import Bools, Floats, Indices, States, grid_edges
+from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, uniform_cells
+from sionna_partial.maps.partial_map import PartialMap, uniform_cells
 from sionna_partial.process import core_count, in_order, njit
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
@@ -27,27 +24,6 @@ _ALONG_CELLS = 1e-3
 """Extent along one axis below which a segment may follow the border of cells [cells]."""
 
 _SEGMENTS_PER_CORE = 20_000
-
-WINDOW_CELLS, CELLS_M = 64, (0.3, 1.2)
-"""Cells along each side, and their edges in the near and far window of a transmitter [m]."""
-
-CHANNELS = ("free", "wall", "seen", "hidden", "detour")
-"""Values of a cell of a window in 255ths, 0 where nothing was observed.
-
-free, wall: known fraction. seen: observed fraction of the direct line from the transmitter. hidden: 1 if that line
-meets a known wall. detour: see `_detours`.
-"""
-
-WINDOWS = (len(CELLS_M), WINDOW_CELLS, WINDOW_CELLS, len(CHANNELS))
-
-_FINEST = 4
-"""Largest number of map cells along a window cell; finer maps are coarsened once."""
-
-_WALL_COST = 100.0
-"""Cost of a walk through a cell of wall only [cells]."""
-
-_LONGEST_DETOUR = 40.0
-"""Detour with the value 1 [cells]."""
 
 
 def unobserved_lengths_m(partial: PartialMap, start_m: Floats, end_m: Floats) -> Floats:
@@ -238,91 +214,8 @@ def _freest(state: States, x: float, y: float) -> int:
     return found
 
 
-def transmitters(map_index: NDArray[np.int64], tx_m: Floats) -> tuple[Floats, Indices]:
-    """Return map, x and y (W, 3) of the transmitters of links, and the transmitter of each link (N,)."""
-    keys, index = np.unique(np.column_stack([map_index, tx_m[:, :2]]), axis=0, return_inverse=True)
-    return keys, index.reshape(-1)
-
-
-def draw_windows(maps: Sequence[PartialMap], keys: Floats) -> NDArray[np.uint8]:
-    windows = np.zeros((len(keys), *WINDOWS), dtype=np.uint8)
-    for number in np.unique(keys[:, 0]).astype(int):
-        here = keys[:, 0] == number
-        windows[here] = map_windows(maps[number], keys[here, 1:])
-    return windows
-
-
-def map_windows(partial: PartialMap, tx_m: Floats) -> NDArray[np.uint8]:
-    """Draw the windows (T, *WINDOWS) around transmitters (T, 2) [m]; row 0 has the smallest y."""
-    windows = np.zeros((len(tx_m), *WINDOWS), dtype=np.uint8)
-    if not (partial.state == CellState.UNKNOWN).all():
-        for scale, cell_m in enumerate(CELLS_M):
-            plan = _coarser(partial, cell_m / _FINEST)
-            for window, at_m in zip(windows[:, scale], tx_m, strict=True):
-                window[:] = _window(plan, at_m, cell_m, clear_around_tx=plan is not partial)
-    return windows
-
-
-def _coarser(partial: PartialMap, cell_m: float) -> PartialMap:
-    factor = math.floor(cell_m / partial.resolution_m + 1e-9)
-    if factor < 2:
-        return partial
-    blocks, (x_m, y_m) = aligned_blocks(partial, factor)
-    wall, free = (blocks == CellState.WALL).any(axis=(1, 3)), (blocks == CellState.FREE).mean(axis=(1, 3)) >= 0.5
-    coarse = np.select([wall, free], [CellState.WALL, CellState.FREE], CellState.UNKNOWN).astype(np.uint8)
-    return PartialMap(coarse, factor * partial.resolution_m, (float(x_m), float(y_m)))
-
-
-def _window(partial: PartialMap, tx_m: Floats, cell_m: float, *, clear_around_tx: bool) -> NDArray[np.uint8]:
-    """Draw the window around a transmitter, which may be in a coarsened wall."""
-    state, start = _surroundings(partial, tx_m, cell_m)
-    if clear_around_tx:
-        column, row = np.floor(start).astype(int)
-        beside = state[row - 1 : row + 2, column - 1 : column + 2]
-        beside[beside == CellState.WALL] = CellState.FREE
-    steps = cell_m / partial.resolution_m * (np.arange(WINDOW_CELLS + 1) - WINDOW_CELLS / 2)
-    edges = start[:, None] + steps
-    columns, rows = (overlaps(edge, len(state)) for edge in edges)
-    free, wall = (rows @ (state == kind) @ columns.T for kind in (CellState.FREE, CellState.WALL))
-    centres = np.stack(np.meshgrid(*0.5 * (edges[:, 1:] + edges[:, :-1])), axis=-1).reshape(-1, 2)
-    lines = line_fractions(state, np.tile(start, (len(centres), 1)), centres).reshape(*free.shape, -1)
-    hidden = lines[..., CellState.WALL] > GRAZE
-    layers = [free, wall, 1.0 - lines[..., CellState.UNKNOWN], hidden, _detours(wall)]
-    return np.round(255.0 * np.stack(layers, axis=-1)).astype(np.uint8)
-
-
-def _surroundings(partial: PartialMap, tx_m: Floats, cell_m: float) -> tuple[States, Floats]:
-    half = int(np.ceil(0.5 * WINDOW_CELLS * cell_m / partial.resolution_m)) + 1
-    start = in_cells(partial, tx_m)
-    column, row = np.floor(start).astype(int)
-    spans = [(low - half, low + half + 1) for low in (row, column)]
-    state = np.full((2 * half + 1, 2 * half + 1), CellState.UNKNOWN, dtype=np.uint8)
-    inner = [(max(low, 0), min(high, count)) for (low, high), count in zip(spans, partial.shape, strict=True)]
-    if all(low < high for low, high in inner):
-        known = partial.state[inner[0][0] : inner[0][1], inner[1][0] : inner[1][1]]
-        top, left = inner[0][0] - spans[0][0], inner[1][0] - spans[1][0]
-        state[top : top + known.shape[0], left : left + known.shape[1]] = known
-    return state, np.round(start - np.array([spans[1][0], spans[0][0]]), 6)  # independent of the grid's origin
-
-
 def overlaps(edges: Floats, count: int) -> Floats:
     """Return the fractions (K, count) of intervals between `edges` (K + 1,) covered by unit cells."""
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
     return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
-
-
-def _detours(wall: Floats) -> Floats:
-    """Return the excess length of routes around known walls, in [0, 1] of `_LONGEST_DETOUR`."""
-    half = WINDOW_CELLS // 2
-    middle = np.s_[half - 1 : half + 1, half - 1 : half + 1]
-    cost = 1.0 + _WALL_COST * wall
-    cost[middle] = 1.0
-    ends, steps = grid_edges(cost)
-    graph = csr_array((steps, ends), shape=(cost.size, cost.size))
-    start = np.arange(cost.size).reshape(cost.shape)[middle].ravel()
-    costs = dijkstra(graph, directed=False, indices=start, min_only=True).reshape(wall.shape)
-    offsets = np.abs(np.arange(WINDOW_CELLS) - half + 0.5) - 0.5
-    short, long = np.minimum.outer(offsets, offsets), np.maximum.outer(offsets, offsets)
-    straight = long + (math.sqrt(2.0) - 1.0) * short
-    return np.clip((costs - straight) / _LONGEST_DETOUR, 0.0, 1.0)
