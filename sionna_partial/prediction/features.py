@@ -559,6 +559,14 @@ def link_features(partial: PartialMap, links: TracedLinks, *, windows: bool = Tr
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
+def with_path_power(phi: LinkFeatures, partial: PartialMap, links: TracedLinks) -> LinkFeatures:
+    """Return the features (T N,) of traced links with their power by walls of unknown material."""
+    sums = LinkSums(len(phi) // max(1, len(links.rx)), len(links.rx), *_limits(partial, links.trace_settings))
+    paths = SolvedPaths(*(getattr(links, field.name) for field in fields(SolvedPaths)))
+    sums.add(paths, partial.wall_classes(links.vertices_m))
+    return replace(phi, path_power=sums.path_power)
+
+
 def features_of_paths(
     partial: PartialMap,
     tx_m: Floats,
@@ -573,9 +581,7 @@ def features_of_paths(
 
     `blocks` are from `Simulation.blocks`. Without `windows` there is no context.
     """
-    classes = partial.wall_class_count * material_unknown
-    limits = (settings[0].max_walls,) * classes + (settings[0].max_depth,) * material_unknown
-    sums = LinkSums(1, len(rx_m), *limits)
+    sums = LinkSums(1, len(rx_m), *(_limits(partial, settings[0]) if material_unknown else ()))
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
     for paths in blocks:
         sums.add(paths, partial.wall_classes(paths.vertices_m) if material_unknown else None)
@@ -585,6 +591,11 @@ def features_of_paths(
     phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz, context=windows is not None)
     phi = replace(phi, path_power=sums.path_power) if material_unknown else phi
     return phi if phi.context is None else replace(phi, context=replace(phi.context, windows=windows))
+
+
+def _limits(partial: PartialMap, settings: TraceSettings) -> tuple[int, ...]:
+    """Return the largest numbers of crossed walls of each class and of reflections."""
+    return (*(settings.max_walls,) * partial.wall_class_count, settings.max_depth)
 
 
 def _features(

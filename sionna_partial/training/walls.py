@@ -17,7 +17,7 @@ from sionna_partial.datasets.home_links import home_sensor, map_area, points_in
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.map_networks import adam_w, turned, turned_offsets
-from sionna_partial.prediction.paper_networks import tf
+from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
 from sionna_partial.process import core_count
@@ -117,13 +117,13 @@ def fit_unseen_walls(maps: list[Lines], steps: int = STEPS_OF_TRAINING, seed: in
     """Train by Poisson likelihood; equal lines and seed give equal weights."""
     networks = UnseenWalls.untrained(seed)
     weights = [weight for network in networks for weight in network.trainable_variables]
-    optimizer = adam_w(weights, steps)
+    optimizer, ops = adam_w(weights, steps), import_keras().ops
 
     @bind(tf.function, autograph=False)
     def step(batch: Lines) -> None:
         with tf.GradientTape() as tape:
-            integral = walls_met(walls_per_m(networks.cells, batch.image, training=True), batch.start, batch.end)
-            mean = corrected(networks.lines, integral, batch.unobserved_m, batch.distance_m, batch.known)
+            integral = walls_met(walls_per_m(networks.cells, batch.image, training=True), batch.start, batch.end, ops)
+            mean = corrected(networks.lines, integral, batch.unobserved_m, batch.distance_m, batch.known, ops)
             loss = tf.reduce_mean(mean - batch.unseen * tf.math.log(mean))
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
 
