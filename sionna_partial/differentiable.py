@@ -354,7 +354,8 @@ class DifferentiableScene:
 
     @cached_property
     def _walls(self) -> WallDensity:
-        return UnseenWalls.shipped().of_map(self.partial)
+        walls = UnseenWalls.shipped().of_map(self.partial)
+        return walls._replace(lines=UnseenWalls.keras_lines())
 
     def _losses_db(self, values: Mapping[str, Floats]) -> Floats:
         """Return the mean loss of traced walls, and the additional losses of candidates (2 K,) [dB]."""
@@ -506,7 +507,7 @@ class DifferentiableLinks:
             numeric |= self._indirect_features(numeric["distance_m"], tx_m, power, vertices_m)
             return self._by_context(tx_m, numeric, shift_db)
         inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
-        return distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db)
+        return distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db, import_keras().ops)
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""
@@ -546,16 +547,17 @@ class DifferentiableLinks:
         columns = link_inputs(numeric, frequency_hz, shift_db, ops)
         offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
         columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
-        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m)
+        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m, ops)
         free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops) - shift_db
-        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi))
+        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi), ops)
 
     def _maps(self, tx_m: Any) -> list[Any]:
         """Return the outputs (1, ...) of the map networks, linear around the traced transmitter."""
         networks = self._scene.networks
         if not reads_maps(networks):
             return []
-        maps = read_maps(networks, self._windows[:1] if tx_m is None else self._windows)
+        windows = self._windows[:1] if tx_m is None else self._windows
+        maps = read_maps(networks, windows, import_keras().ops)
         if tx_m is None:
             return maps
         steps = tf.cast(tx_m - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)

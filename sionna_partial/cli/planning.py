@@ -95,11 +95,11 @@ def place(
             result.save(folder / "placement.json")
             figure.savefig(folder / "placement.png")
     for x, y, z in positions_m:
-        typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m")
+        typer.echo(f"transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m")
     if objective == "coverage":
         typer.echo(f"{result.score:.1%} of the receivers are predicted above {threshold:g} dB")
     else:
-        typer.echo(f"the worst tenth of the receivers is predicted at {result.score:.1f} dB")
+        typer.echo(f"the worst tenth of the receivers is predicted at {result.score:z.1f} dB")
     opt.print_files(out, ["placement.json", "placement.png"])
 
 
@@ -152,8 +152,8 @@ def next_views(
     for view in views:
         x, y = view.position_m
         typer.echo(
-            f"({x:.2f}, {y:.2f}) m, heading {view.heading_deg:.0f} deg, after {view.path_length_m:.1f} m: "
-            f"{view.gain:.2f} {unit}, {view.gain_per_m:.2f} {unit}/m"
+            f"({x:z.2f}, {y:z.2f}) m, heading {view.heading_deg:z.0f} deg, after {view.path_length_m:.1f} m: "
+            f"{view.gain:z.2f} {unit}, {view.gain_per_m:z.2f} {unit}/m"
         )
     if not views:
         typer.echo("nothing unknown can be reached")
@@ -174,7 +174,7 @@ def _table(result: "sp.MaterialCalibration") -> str:
             note = "   CANNOT BE DETERMINED" if f"{name}{own}" in result.undetermined else ""
             lines.append(f"{name + own:<18}{value:.4g} +- {std:.2g}{unit} (start {before:.4g}{unit}){note}")
         losses = zip(*result.reflection_loss_db(TABLE_ANGLES_DEG, which=which), TABLE_ANGLES_DEG, strict=True)
-        texts = (f"{loss:.1f} +- {std:.1f} dB at {angle:g} deg" for loss, std, angle in losses)
+        texts = (f"{loss:z.1f} +- {std:.1f} dB at {angle:g} deg" for loss, std, angle in losses)
         lines.append(f"{'reflection' + own:<18}{', '.join(texts)}")
     left = ", ".join(f"{count} {reason}" for reason, count in result.left_out.items() if count) or "none"
     rmse = numbers["rmse_db"]

@@ -530,7 +530,7 @@ def transmitter_text(maps: Mapping[str, xr.Dataset]) -> str:
     if len(maps) > 1:
         return f"{len(maps)} transmitters"
     (coverage,) = maps.values()
-    position = ", ".join(f"{each:.2f}" for each in coverage.attrs["transmitter_m"])
+    position = ", ".join(f"{each:z.2f}" for each in coverage.attrs["transmitter_m"])
     antenna = str(coverage.attrs.get(ANTENNA, "iso"))
     if "p_transmitter" in coverage:
         position = f"near ({position}) m, ± {coverage.attrs['transmitter_std_m']:.1f} m"

@@ -146,7 +146,7 @@ def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tup
         chosen = [storey for storey in every if (storey.Name or "").casefold() == str(name).casefold()]
     if len(chosen) != 1:
         by_level = sorted(every, key=level_m.__getitem__)
-        named = ", ".join(f"'{storey.Name}' at {level_m[storey]:.2f} m" for storey in by_level)
+        named = ", ".join(f"'{storey.Name}' at {level_m[storey]:z.2f} m" for storey in by_level)
         what = f"storey = {shown(name)} is one of {len(chosen)} of path = '{path}'"
         raise MapError(f"{what}: give the name of one as storey; it has {named[:1000]}.")
     floor_m = level_m[chosen[0]]

@@ -151,4 +151,4 @@ def _note_entities(path: Path, entities: Any, frame: VacuumFrame, notes: ImportN
         points = entity.get("points")
         if entity.get("type") == "charger_location" and isinstance(points, list) and len(points) == 2:
             x, y = frame.world_m([[number_of(value) for value in points]])[0]
-            notes.notes.append(f"charger at ({x:.2f}, {y:.2f}) m")
+            notes.notes.append(f"charger at ({x:z.2f}, {y:z.2f}) m")

@@ -475,7 +475,7 @@ def _report_table(
     rows = [f"Observed floor / all floor above, with P = {_LIKELY:g}"]
     for (name, one), power_dbm in zip(maps.items(), powers_dbm, strict=True):
         x, y, z = one.attrs["transmitter_m"]
-        rows.append(f"{name[:_ROW_NAME]} at ({x:.2f}, {y:.2f}, {z:.2f}) m, {power_dbm:g} dBm")
+        rows.append(f"{name[:_ROW_NAME]} at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m, {power_dbm:g} dBm")
     rows += ["any transmitter"] if len(maps) > 1 else []
     rows = [row.ljust(max(map(len, rows))) for row in rows]
     for level_dbm in threshold_dbm + _REPORTED_DB:

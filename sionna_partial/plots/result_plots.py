@@ -153,8 +153,8 @@ def _headline(placement: TransmitterPlacement) -> str:
     x, y, z = placement.position_m
     score = placement.score
     if placement.settings.objective == "coverage":
-        return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, predicted coverage {score:.1%}"
-    return f"Transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m, worst tenth at {score:.1f} dB"
+        return f"Transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m, predicted coverage {score:.1%}"
+    return f"Transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m, worst tenth at {score:z.1f} dB"
 
 
 def _window_m(placement: TransmitterPlacement) -> tuple[float, float, float, float]:

@@ -5,7 +5,6 @@ the far window, less their output for an empty window: unobserved space adds not
 features of a link and these numbers at its receiver.
 """
 
-import functools
 import itertools
 import logging
 import math
@@ -20,6 +19,7 @@ from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.errors import PredictorError
+from sionna_partial.prediction.evaluate import array_ops
 from sionna_partial.prediction.features import (
     ATTENUATION_LENGTHS_M,
     LinkContext,
@@ -28,15 +28,21 @@ from sionna_partial.prediction.features import (
     excess_noise,
     shifted_gain_db,
 )
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, free_space_gain_db, import_keras, layer, tf
-from sionna_partial.prediction.unobserved import CELLS_M, CHANNELS, WINDOW_CELLS, WINDOWS
+from sionna_partial.prediction.paper_networks import (
+    STD_RANGE_DB,
+    Networks,
+    free_space_gain_db,
+    import_keras,
+    layer,
+    tf,
+)
+from sionna_partial.prediction.unobserved import CELLS_M, CHANNELS, WINDOW_CELLS
 from sionna_partial.settings import NetworkKind, PredictorSettings
 
 if TYPE_CHECKING:
     import keras
 
 Shapes = tuple[tuple[int | None, ...], tuple[int | None, ...]]
-Networks = Mapping[str, "keras.Model"]
 
 MAP_NETWORKS, LINK_NETWORK = ("near_map_network", "far_map_network"), "link_network"
 """Names of the networks; map networks in the order of `CELLS_M`."""
@@ -254,15 +260,17 @@ def reads_maps(networks: Networks) -> bool:
     return MAP_NETWORKS[0] in networks
 
 
-def read_maps(networks: Networks, windows: Any, *, training: bool = False) -> list[Any]:
+def read_maps(networks: Networks, windows: Any, ops: Any = array_ops, *, training: bool = False) -> list[Any]:
     """Return the outputs of the map networks for windows (B, *WINDOWS) in [0, 255], less those for an empty window.
 
-    In training, values are normalised by the statistics of this batch.
+    In training, values are normalised by the statistics of this batch. `ops` is `array_ops`, or keras.ops
+    for tensors.
     """
     if not reads_maps(networks):
         return []
-    windows = tf.concat([windows, tf.zeros_like(windows[:1])], axis=0)
-    maps = [networks[name](windows[:, scale], training=training) for scale, name in enumerate(MAP_NETWORKS)]
+    windows = ops.concatenate([windows, ops.zeros_like(windows[:1])], axis=0)
+    options = {"training": True} if training else {}
+    maps = [networks[name](windows[:, scale], **options) for scale, name in enumerate(MAP_NETWORKS)]
     return [each[:-1] - each[-1:] for each in maps]
 
 
@@ -270,49 +278,48 @@ class MapReader:
     """Reads windows by map networks, and keeps the latest results."""
 
     def __init__(self, networks: Networks) -> None:
+        self._networks = networks
         self._kept: dict[bytes, list[list[Any]]] = {}
-        self._read: Callable[[Any], list[Any]] = functools.partial(read_maps, networks)
-        signature = [tf.TensorSpec((None, *WINDOWS), tf.float32)]
-        self._compiled = tf.function(self._read, input_signature=signature, autograph=False)
 
     def __call__(self, windows: NDArray[np.uint8]) -> list[list[Any]]:
-        """Return `read_maps` of each window (W, *WINDOWS); the bytes depend on the windows read together."""
+        """Return `read_maps` of each window (W, *WINDOWS)."""
         key, kept = windows.tobytes(), self._kept
         if key not in kept:
-            maps = self._read(windows.astype(np.float32))
-            self._read = self._compiled  # from the second call on: compiling takes longer than one call
+            maps = read_maps(self._networks, windows.astype(np.float32))
             each_window = [[each[at : at + 1] for each in maps] for at in range(len(windows))]
             self._kept = kept = dict([*kept.items()][1 - _MAPS_KEPT :]) | {key: each_window}
         return kept[key]
 
 
-def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any) -> Any:
+def read_links(networks: Networks, maps: Sequence[Any], links: Any, offsets_m: Any, ops: Any = array_ops) -> Any:
     """Return the outputs (B, R, LINK_OUTPUTS) of the link network for R links of each of B transmitters."""
-    at_receivers = [_interpolated(each, offsets_m / cell_m) for each, cell_m in zip(maps, CELLS_M, strict=False)]
-    links = tf.concat([links, *at_receivers], axis=-1)
-    outputs = networks[LINK_NETWORK](tf.reshape(links, (-1, links.shape[-1])))
-    return tf.reshape(outputs, (tf.shape(offsets_m)[0], -1, LINK_OUTPUTS))
+    at_receivers = [_interpolated(each, offsets_m / cell_m, ops) for each, cell_m in zip(maps, CELLS_M, strict=False)]
+    links = ops.concatenate([links, *at_receivers], axis=-1)
+    outputs = networks[LINK_NETWORK](ops.reshape(links, (-1, links.shape[-1])))
+    return ops.reshape(outputs, (*offsets_m.shape[:2], LINK_OUTPUTS))
 
 
-def _interpolated(maps: Any, offsets: Any) -> Any:
+def _interpolated(maps: Any, offsets: Any, ops: Any) -> Any:
     """Interpolate maps (B, S, S, C) at offsets (B, R, 2) from their centres [cells], fading to 0 at the border."""
-    half = WINDOW_CELLS / 2
-    inside = tf.clip_by_value((half - tf.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
-    centres = tf.range(WINDOW_CELLS, dtype=tf.float32) + 0.5 - half
-    x, y = tf.unstack(inside[..., None] * tf.maximum(1.0 - tf.abs(offsets[..., None] - centres), 0.0), axis=2)
-    return tf.einsum("brx,brxc->brc", x, tf.einsum("bry,byxc->brxc", y, maps))
+    half, (receivers, features) = WINDOW_CELLS / 2, (offsets.shape[1], maps.shape[-1])
+    inside = ops.clip((half - ops.abs(offsets)) / _FADE_CELLS, 0.0, 1.0)
+    centres = np.arange(WINDOW_CELLS, dtype=np.float32) + np.float32(0.5 - half)
+    weights = inside[..., None] * ops.maximum(1.0 - ops.abs(offsets[..., None] - centres), 0.0)
+    rows = ops.matmul(weights[:, :, 1], ops.reshape(maps, (-1, WINDOW_CELLS, WINDOW_CELLS * features)))
+    rows = ops.reshape(rows, (-1, receivers, WINDOW_CELLS, features))
+    return ops.matmul(weights[:, :, :1], rows)[:, :, 0]
 
 
-def decode(outputs: Any, free_db: Any) -> tuple[Any, Any, Any]:
+def decode(outputs: Any, free_db: Any, ops: Any = array_ops) -> tuple[Any, Any, Any]:
     """Return log-probabilities (..., 3), and means [dB] and log-variances (..., 2) given LOS and NLOS."""
-    los_db = _LOS_MOST_DB * tf.sigmoid(_LOS_OFFSET + outputs[..., 3])
+    los_db = _LOS_MOST_DB * ops.sigmoid(_LOS_OFFSET + outputs[..., 3])
     nlos_db = _NLOS_DB + _NLOS_SCALE_DB * outputs[..., 4]
-    means_db = free_db[..., None] + tf.stack([los_db, nlos_db], axis=-1)
+    means_db = free_db[..., None] + ops.stack([los_db, nlos_db], axis=-1)
     low, high = (2.0 * math.log(std_db) for std_db in STD_RANGE_DB)
-    return tf.nn.log_softmax(outputs[..., :3]), means_db, low + (high - low) * tf.sigmoid(outputs[..., 5:])
+    return ops.log_softmax(outputs[..., :3]), means_db, low + (high - low) * ops.sigmoid(outputs[..., 5:])
 
 
-def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any, Any, Any]:
+def distribution(outputs: Any, free_db: Any, context: LinkContext, ops: Any = array_ops) -> tuple[Any, Any, Any]:
     """Return probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
 
     Standard deviations grow with the range noise of the map, which the networks do not notice.
@@ -320,13 +327,13 @@ def distribution(outputs: Any, free_db: Any, context: LinkContext) -> tuple[Any,
     widening = 1.0 + excess_noise(context.wall_noise) * np.where(
         context.tx_seen & context.rx_seen, SEEN_WIDENING, WIDENING
     )
-    states = tf.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
-    outputs = tf.concat([states, outputs[:, len(LinkState) :]], axis=1)
-    log_probabilities, gains_db, log_variances = decode(outputs, free_db)
-    outage = tf.fill([1, len(context)], tf.constant(GAIN_FLOOR_DB, tf.float64))
-    means_db = tf.concat([outage, tf.transpose(tf.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
-    stds_db = tf.concat([tf.zeros_like(outage), tf.transpose(tf.exp(0.5 * log_variances))], axis=0) * widening
-    return tf.transpose(tf.exp(log_probabilities)), means_db, stds_db
+    states = ops.where(context.possible, outputs[:, : len(LinkState)], _IMPOSSIBLE)
+    outputs = ops.concatenate([states, outputs[:, len(LinkState) :]], axis=1)
+    log_probabilities, gains_db, log_variances = decode(outputs, free_db, ops)
+    outage = np.full((1, len(context)), GAIN_FLOOR_DB)
+    means_db = ops.concatenate([outage, ops.transpose(ops.maximum(gains_db, GAIN_FLOOR_DB))], axis=0)
+    stds_db = ops.concatenate([np.zeros_like(outage), ops.transpose(ops.exp(0.5 * log_variances))], axis=0)
+    return ops.transpose(ops.exp(log_probabilities)), means_db, stds_db * widening
 
 
 def evaluate_context_networks(
@@ -340,8 +347,7 @@ def evaluate_context_networks(
             here = links[start : start + _LINKS_AT_ONCE]
             outputs[here] = read_links(networks, maps, inputs[None, here], offsets_m[None, here])[0]
     free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
-    probabilities, means_db, stds_db = distribution(outputs, free_db, context_of(phi))
-    return np.asarray(probabilities), np.asarray(means_db), np.asarray(stds_db)
+    return distribution(outputs, free_db, context_of(phi))
 
 
 def _by_window(networks: Networks, context: LinkContext, read: MapReader | None) -> Iterator[tuple[list[Any], Indices]]:
@@ -440,12 +446,12 @@ def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.floa
 
 def _gradient_step(networks: Networks, steps: int) -> Callable[..., Any]:
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
-    optimizer = adam_w(weights, steps)
+    optimizer, ops = adam_w(weights, steps), import_keras().ops
 
     def step(links: Any, offsets_m: Any, free_db: Any, link_state: Any, gain_db: Any, windows: Any = None) -> Any:
         with tf.GradientTape() as tape:
-            outputs = read_links(networks, read_maps(networks, windows, training=True), links, offsets_m)
-            log_p, means_db, log_variances = decode(outputs, free_db)
+            outputs = read_links(networks, read_maps(networks, windows, ops, training=True), links, offsets_m, ops)
+            log_p, means_db, log_variances = decode(outputs, free_db, ops)
             loss = -tf.reduce_mean(tf.gather(log_p, link_state, batch_dims=2))
             scores_db = _crps(gain_db[..., None] - means_db, tf.exp(0.5 * log_variances))
             states = tf.constant([LinkState.LOS, LinkState.NLOS], dtype=tf.int32)

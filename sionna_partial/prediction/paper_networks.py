@@ -22,6 +22,7 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
+from sionna_partial.prediction.evaluate import Network, array_ops
 from sionna_partial.prediction.features import LinkFeatures, shifted_gain_db
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
@@ -49,6 +50,8 @@ _INDOORS = 20.0
 _log = logging.getLogger(__name__)
 
 Ranges = Mapping[str, tuple[float, float]]
+Networks = Mapping[str, Any]
+"""Networks by name: a `Network` for arrays, or a Keras model for tensors."""
 
 
 def free_space_gain_db(distance_m: ArrayLike, frequency_hz: float, ops: ModuleType = np) -> Any:
@@ -211,36 +214,36 @@ def network_inputs(phi: LinkFeatures, names: tuple[str, ...] = GAIN_INPUTS) -> d
 
 
 def distribution_by_paper(
-    networks: Mapping[str, "keras.Model"], inputs: Mapping[str, Any], link_state: States, shift_db: Any = 0.0
+    networks: Networks, inputs: Mapping[str, Any], link_state: States, shift_db: Any = 0.0, ops: Any = array_ops
 ) -> tuple[Any, Any, Any]:
     """Evaluate the paper's networks on `inputs` (N, 1) of `GAIN_INPUTS` and partial link states (N,).
 
-    `shift_db` is the free-space gain at the networks' frequency less the one at the links' frequency. Return
-    probabilities, means and standard deviations of the gain [dB], each (3, N) by LinkState.
+    `shift_db` is the free-space gain at the networks' frequency less the one at the links' frequency; `ops` is
+    `array_ops`, or keras.ops for tensors. Return probabilities, means and standard deviations of the gain [dB], each
+    (3, N) by LinkState.
     """
-    inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, tf)}
-    inputs = {name: tf.cast(values, tf.float32) for name, values in inputs.items()}
+    inputs = {**inputs, "gain_db": shifted_gain_db(inputs["gain_db"], shift_db, ops)}
+    inputs = {name: ops.cast(values, "float32") for name, values in inputs.items()}
 
     def outputs(name: str) -> Any:
         network = networks[name]
-        return tf.cast(network({key: inputs[key] for key in network.input}, training=False), tf.float64)
+        return ops.cast(network({key: inputs[key] for key in network.input}), "float64")
 
-    states = tf.stack([outputs(STATE_NETWORKS[state]) for state in LinkState])
-    probabilities = tf.gather_nd(states, np.stack([link_state, np.arange(len(link_state))], axis=1))
-    outage = tf.fill([len(link_state)], tf.constant(GAIN_FLOOR_DB, tf.float64))
-    means_db, stds_db = [outage] * len(LinkState), [tf.zeros_like(outage)] * len(LinkState)
+    probabilities: Any = 0.0
+    for state, name in STATE_NETWORKS.items():
+        probabilities = ops.where((link_state == state)[:, None], outputs(name), probabilities)
+    nothing = np.zeros(len(link_state))
+    means_db, stds_db = [nothing + GAIN_FLOOR_DB] * len(LinkState), [nothing] * len(LinkState)
     for row in GAIN_NETWORKS:
-        served, (mean_db, log_variance) = np.isin(link_state, row.partial_states), tf.unstack(outputs(row.name), axis=1)
-        mean_db = tf.maximum(mean_db - shift_db, GAIN_FLOOR_DB)
-        means_db[row.link_state] = tf.where(served, mean_db, means_db[row.link_state])
-        stds_db[row.link_state] = tf.where(served, tf.exp(0.5 * log_variance), stds_db[row.link_state])
-    total = tf.reduce_sum(probabilities, axis=1, keepdims=True)
-    return tf.transpose(probabilities / total), tf.stack(means_db), tf.stack(stds_db)
+        served, found = np.isin(link_state, row.partial_states), outputs(row.name)
+        mean_db = ops.maximum(found[:, 0] - shift_db, GAIN_FLOOR_DB)
+        means_db[row.link_state] = ops.where(served, mean_db, means_db[row.link_state])
+        stds_db[row.link_state] = ops.where(served, ops.exp(0.5 * found[:, 1]), stds_db[row.link_state])
+    total = ops.sum(probabilities, axis=1, keepdims=True)
+    return ops.transpose(probabilities / total), ops.stack(means_db), ops.stack(stds_db)
 
 
-def evaluate_paper(
-    networks: Mapping[str, "keras.Model"], phi: LinkFeatures, frequency_hz: float
-) -> tuple[Floats, Floats, Floats]:
+def evaluate_paper(networks: Networks, phi: LinkFeatures, frequency_hz: float) -> tuple[Floats, Floats, Floats]:
     """Return `distribution_by_paper` for N links as arrays."""
     shift_db = phi.free_space_shift_db(frequency_hz)
     blocks = [
@@ -250,7 +253,7 @@ def evaluate_paper(
     return probabilities, means_db, stds_db
 
 
-def evaluate_indoor(networks: Mapping[str, "keras.Model"], phi: LinkFeatures) -> Floats:
+def evaluate_indoor(networks: Networks, phi: LinkFeatures) -> Floats:
     p_indoor = np.zeros(len(phi))
     for state, name in INDOOR_NETWORKS.items():
         served = phi.link_state == state
@@ -264,11 +267,11 @@ def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
         yield phi.take(slice(start, start + _LINKS_AT_ONCE))
 
 
-def network_ranges(model: "keras.Model") -> dict[str, dict[str, list[float]]]:
+def network_ranges(networks: Mapping[str, Network]) -> dict[str, dict[str, list[float]]]:
     ranges = {}
     for name in OUTPUT_WIDTHS:
-        network = model.get_layer(name)
-        scaling = network.get_layer("scaled").get_config()
+        network = networks[name]
+        scaling = network.options["scaled"]
         names = [key for key in GAIN_INPUTS if key in network.input]
         spans = zip(names, scaling["scale"], scaling["offset"], strict=True)
         ranges[name] = {key: [-offset / scale, (1.0 - offset) / scale] for key, scale, offset in spans}

@@ -21,6 +21,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.evaluate import Network
 from sionna_partial.prediction.features import (
     LinkFeatures,
     context_of,
@@ -48,7 +49,7 @@ from sionna_partial.prediction.paper_networks import (
     network_ranges,
     parts,
 )
-from sionna_partial.prediction.predictor_files import SUFFIX, digest, pack, read_files, write_files
+from sionna_partial.prediction.predictor_files import SUFFIX, digest, keras_model, pack, read_files, write_files
 from sionna_partial.prediction.unseen_walls import (
     WALL_LOSSES,
     DirectLines,
@@ -361,10 +362,10 @@ class Predictor(Shown):
 
     Parameters
     ----------
-    model : keras.Model
-        All networks.
+    network : Network
+        All networks, evaluated by NumPy.
     archive : bytes
-        The model as a `.keras` file.
+        The networks as a `.keras` file.
     settings : PredictorSettings
     homes : tuple of str
         Names of the training homes.
@@ -386,7 +387,7 @@ class Predictor(Shown):
     array([1., 0.])
     """
 
-    model: keras.Model = field(repr=False)
+    network: Network = field(repr=False)
     archive: bytes = field(repr=False)
     settings: PredictorSettings
     homes: tuple[str, ...] = ()
@@ -400,10 +401,19 @@ class Predictor(Shown):
         """SHA-256 of the `.keras` file, in hexadecimal."""
         return digest(self.archive)
 
+    @cached_property
+    def model(self) -> keras.Model:
+        """The networks as a Keras model, for training and derivatives."""
+        return keras_model(self.archive)
+
     @property
     def reads_maps(self) -> bool:
         """Return whether features need windows (`link_features`)."""
-        return reads_maps(parts(self.model))
+        return reads_maps(self.network.layers)
+
+    @cached_property
+    def _read_maps(self) -> MapReader:
+        return MapReader(self.network.layers)
 
     @classmethod
     def fit(
@@ -472,7 +482,8 @@ class Predictor(Shown):
         }
         keras = import_keras()
         versions = {"keras": keras.__version__, "backend": keras.backend.backend(), "numpy": np.__version__}
-        return cls(model, pack(model), settings, tuple(map(str, homes)), links, versions=versions)
+        archive = pack(model)
+        return cls(Network.from_keras(model), archive, settings, tuple(map(str, homes)), links, versions=versions)
 
     def fit_indoor(self, features: LinkFeatures, inside: ArrayLike) -> Predictor:
         """Return this predictor with P(indoor) trained (paper, "Indoor-Outdoor Estimation").
@@ -499,7 +510,7 @@ class Predictor(Shown):
         _require_features(features)
         indoors = link_numbers("inside", inside, features.shape).ravel() > 0.0
         model = fit_indoor_networks(self.model, features.flat(), indoors, self.settings)
-        return replace(self, model=model, archive=pack(model))
+        return replace(self, network=Network.from_keras(model), archive=pack(model))
 
     def predict(self, features: LinkFeatures) -> LinkPrediction:
         """Predict link state and path gain for receivers indoors.
@@ -522,7 +533,7 @@ class Predictor(Shown):
             For features with a context but without windows, if map networks read them.
         """
         _require_features(features)
-        networks = parts(self.model)
+        networks = self.network.layers
         if len(features.shape) == 2:
             return self.predict(features.flat()).reshaped(features.shape)
         if features.context is None or LINK_NETWORK not in networks:
@@ -530,7 +541,7 @@ class Predictor(Shown):
         if self.reads_maps:
             _require_windows(features)
         context = context_of(features)
-        read = _map_reader(self.model) if self.reads_maps else None
+        read = self._read_maps if self.reads_maps else None
         prediction = LinkPrediction.of_parts(
             *evaluate_context_networks(networks, features, self.settings.frequency_hz, read)
         )
@@ -545,7 +556,7 @@ class Predictor(Shown):
     def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Return the probability that each receiver is indoors; 1 before `fit_indoor`."""
         _require_features(features)
-        return evaluate_indoor(parts(self.model), features.flat()).reshape(features.shape)
+        return evaluate_indoor(self.network.layers, features.flat()).reshape(features.shape)
 
     def save(self, path: str | Path) -> None:
         """Write a `.keras` file, and a `.json` card of the same stem beside it.
@@ -565,7 +576,7 @@ class Predictor(Shown):
             If writing fails.
         """
         card = {
-            "scaling": network_ranges(self.model),
+            "scaling": network_ranges(self.network.layers),
             "settings": asdict(self.settings),
             "homes": list(self.homes),
             "links": dict(self.links),
@@ -604,7 +615,7 @@ class Predictor(Shown):
         path = predictor_path(name)
         if path.suffix != SUFFIX:
             raise PredictorError(f"path = '{path}' is no predictor: give {known}, or the path of a {SUFFIX} file.")
-        model, archive, card = read_files(path)
+        network, archive, card = read_files(path)
         try:
             settings = PredictorSettings(**card["settings"])
             homes, links = tuple(map(str, card["homes"])), {str(k): int(v) for k, v in card["links"].items()}
@@ -614,11 +625,11 @@ class Predictor(Shown):
             raise PredictorError(
                 f"path = '{card_path}' is damaged ({error!r}): copy it again, or train anew."
             ) from error
-        found = kind_of(parts(model))
+        found = kind_of(network.layers)
         if settings.networks != found:
             what = f"settings.networks = {settings.networks!r}, but the weights beside it are of {found!r} networks"
             raise PredictorError(f"path = '{path.with_suffix('.json')}': {what}: copy both files again, or train anew.")
-        return cls(model, archive, settings, homes, links, metrics, versions, name=str(name))
+        return cls(network, archive, settings, homes, links, metrics, versions, name=str(name))
 
 
 class OtherPredictor:
@@ -729,11 +740,6 @@ def _from_file(name_or_path: str | PathLike[str] | None) -> Predictor:
 @lru_cache(maxsize=4)
 def _read_once(name: str, *identity: object) -> Predictor:
     return Predictor.load(name)
-
-
-@lru_cache(maxsize=4)
-def _map_reader(model: keras.Model) -> MapReader:
-    return MapReader(parts(model))
 
 
 def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:

@@ -9,11 +9,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes, temporary_folder, unzipped
+from sionna_partial.prediction.evaluate import Network
 from sionna_partial.prediction.map_networks import CONTEXT_SHAPES
 from sionna_partial.prediction.paper_networks import GAIN_INPUTS, OUTPUT_WIDTHS, import_keras, own_input
 from sionna_partial.resources import PREDICTORS_FOLDER
@@ -78,7 +77,7 @@ def write_files(path: Path, archive: bytes, card: Mapping[str, Any]) -> None:
         stream.write(archive)
 
 
-def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
+def read_files(path: Path) -> tuple[Network, bytes, dict[str, Any]]:
     archive = _read(path)
     card = _read_card(path.with_suffix(".json"))
     if card["sha256"] != digest(archive):
@@ -86,8 +85,7 @@ def read_files(path: Path) -> tuple["keras.Model", bytes, dict[str, Any]]:
             f"path = '{path}' has SHA-256 {digest(archive)}, but its card has {card['sha256']!r}: the file is "
             "truncated, was changed, or belongs to another card; copy both files again, or train anew."
         )
-    _require_our_kind(path, archive)
-    return _unpack(path, archive), archive, card
+    return _unpack(path, archive, _checked_config(path, archive)), archive, card
 
 
 def shipped_bytes(path: Path, most: int = _MAX_BYTES) -> bytes:
@@ -128,7 +126,8 @@ def _read_card(path: Path) -> dict[str, Any]:
     return card
 
 
-def _require_our_kind(path: Path, archive: bytes) -> None:
+def _checked_config(path: Path, archive: bytes) -> dict[str, Any]:
+    """Return the configuration of a model if it has only layers of ours."""
     try:
         content = unzipped(archive, _MAX_BYTES)["config.json"]
         config, config_bytes = json.loads(content), len(content)
@@ -146,6 +145,7 @@ def _require_our_kind(path: Path, archive: bytes) -> None:
             f"path = '{path}' describes a network with a size of {largest:,}, in {config_bytes:,} bytes: no predictor "
             f"of ours has more than {_MAX_SIZE:,} and {_MAX_CONFIG_BYTES:,}; do not use it."
         )
+    return dict(config)
 
 
 def _sizes(entry: Any) -> Iterator[int]:
@@ -167,19 +167,21 @@ def _classes(entry: Any) -> Iterator[str]:
         yield from _classes(value)
 
 
-def _unpack(path: Path, archive: bytes) -> "keras.Model":
-    """Load the checked bytes: the file may change meanwhile."""
+def keras_model(archive: bytes) -> "keras.Model":
+    """Load a model for training or derivatives from bytes that were checked: a file may change meanwhile."""
     keras = import_keras()
     with temporary_folder() as folder:
         copy = folder / f"model{SUFFIX}"
         copy.write_bytes(archive)
-        try:
-            model = keras.saving.load_model(copy, compile=False, safe_mode=True)
-            inputs, outputs = (
-                {name: tuple(end.shape) for name, end in ends.items()} for ends in (model.input, model.output)
-            )
-        except Exception as error:
-            raise PredictorError(f"path = '{path}' cannot be loaded by Keras ({error}): train it anew.") from error
+        return keras.saving.load_model(copy, compile=False, safe_mode=True)
+
+
+def _unpack(path: Path, archive: bytes, config: dict[str, Any]) -> Network:
+    try:
+        weights = unzipped(archive, _MAX_BYTES)[WEIGHTS_FILE]
+        network = Network.read(config["config"], weights, _MAX_BYTES)
+    except Exception as error:  # HDF5 fails in many ways on damaged files
+        raise PredictorError(f"path = '{path}' cannot be evaluated ({error!r}): train it anew.") from error
     known = [
         (
             _INPUTS | {own_input(name): shapes[0] for name, shapes in more.items()},
@@ -187,8 +189,7 @@ def _unpack(path: Path, archive: bytes) -> "keras.Model":
         )
         for more in CONTEXT_SHAPES
     ]
-    if not all(np.isfinite(weights).all() for weights in model.get_weights()):
-        raise PredictorError(f"path = '{path}' has weights that are not finite: train it anew.")
-    if (inputs, outputs) not in known:
-        raise PredictorError(f"path = '{path}' has inputs {sorted(inputs)} and outputs {outputs}: train it anew.")
-    return model
+    if (network.input, network.output) not in known:
+        what = f"inputs {sorted(network.input)} and outputs {network.output}"
+        raise PredictorError(f"path = '{path}' has {what}: train it anew.")
+    return network

@@ -7,8 +7,10 @@ were fitted to procedural buildings with 3 to 26 dB per wall (`benchmarks/unseen
 
 import functools
 import io
+import itertools
+import json
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -20,10 +22,10 @@ from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.evaluate import array_ops
+from sionna_partial.prediction.evaluate import Network, array_ops
 from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
-from sionna_partial.prediction.paper_networks import import_keras, layer, tf
+from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.unobserved import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
@@ -127,10 +129,10 @@ class WallDensity(NamedTuple):
 
 
 class UnseenWalls(NamedTuple):
-    """Networks for the walls of cells and the corrections of lines."""
+    """Networks for the walls of cells and the corrections of lines: Keras models before training."""
 
-    cells: "keras.Model"
-    lines: "keras.Model"
+    cells: Any
+    lines: Any
 
     @classmethod
     def untrained(cls, seed: int = 0) -> Self:
@@ -140,18 +142,25 @@ class UnseenWalls(NamedTuple):
     @classmethod
     @functools.cache
     def shipped(cls) -> Self:
-        networks = cls.untrained()
+        """Return the trained networks as functions of arrays."""
         with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
-            for name, network in networks._asdict().items():
-                network.set_weights([stored[f"{name}_{number}"] for number in range(len(network.weights))])
-        return networks
+            return cls(*(Network(json.loads(str(stored[name])), _numbered(stored, name)) for name in cls._fields))
+
+    @staticmethod
+    @functools.cache
+    def keras_lines() -> "keras.Model":
+        """Return the trained corrections of lines as a Keras model, for derivatives."""
+        model = UnseenWalls.untrained().lines
+        with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
+            model.set_weights([*itertools.islice(_numbered(stored, "lines"), len(model.weights))])
+        return model
 
     def save(self, path: Path) -> None:
-        arrays = {
-            f"{name}_{number}": values
-            for name, network in self._asdict().items()
-            for number, values in enumerate(network.get_weights())
-        }
+        """Write the configuration and the weights of trained Keras models."""
+        arrays = {}
+        for name, model in self._asdict().items():
+            arrays[name] = np.array(json.dumps(json.loads(model.to_json())["config"]))
+            arrays |= {f"{name}_{number}": values for number, values in enumerate(model.get_weights())}
         with atomic_write(path) as stream:
             np.savez_compressed(stream, **arrays)
 
@@ -182,6 +191,10 @@ def _line_network(keras: Any, start: Callable[[], Any]) -> "keras.Model":
     return keras.Model(line, layer(keras, "Dense", "outputs", 2, kernel_initializer="zeros")(x), name="lines")
 
 
+def _numbered(stored: Mapping[str, Any], name: str) -> Iterator[Any]:
+    return (stored[f"{name}_{number}"] for number in itertools.count())
+
+
 def _known_part(partial: PartialMap) -> PartialMap:
     known = partial.state != CellState.UNKNOWN
     if not known.any():
@@ -207,11 +220,15 @@ def map_image(
     return np.round(255.0 * np.stack(fractions, axis=-1)).astype(np.uint8)
 
 
-def walls_per_m(cells: "keras.Model", images: Any, *, training: bool = False) -> Any:
-    """Return the walls per metre (B, ny, nx, 2) along x and y of images (B, ny, nx, 2) in [0, 255]."""
+def walls_per_m(cells: Any, images: Any, ops: Any = array_ops, *, training: bool = False) -> Any:
+    """Return the walls per metre (B, ny, nx, 2) along x and y of images (B, ny, nx, 2) in [0, 255].
+
+    `ops` is `array_ops` for a `Network`, or keras.ops for a Keras model.
+    """
     known = images / 255.0
-    unknown = tf.maximum(1.0 - tf.reduce_sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
-    return cells(tf.concat([known, unknown], axis=-1), training=training) * unknown
+    unknown = ops.maximum(1.0 - ops.sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
+    options = {"training": True} if training else {}
+    return cells(ops.concatenate([known, unknown], axis=-1), **options) * unknown
 
 
 def walls_met(per_m: Any, start: Any, end: Any, ops: Any = array_ops) -> Any:

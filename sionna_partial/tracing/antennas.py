@@ -229,7 +229,7 @@ class AntennaPattern(Shown):
         most_dbi = self.gain_dbi - 10.0 * math.log10(radiated)
         remedy = (
             f"antenna {self.name!r} with these cuts would radiate {radiated:.3g} times the power that it is fed: give "
-            f"narrower cuts, or at most {most_dbi:.1f} dBi."
+            f"narrower cuts, or at most {most_dbi:z.1f} dBi."
         )
         require(radiated <= MAX_RADIATED, "gain_dbi", self.gain_dbi, remedy)
         return self

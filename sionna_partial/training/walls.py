@@ -122,7 +122,8 @@ def fit_unseen_walls(maps: list[Lines], steps: int = STEPS_OF_TRAINING, seed: in
     @bind(tf.function, autograph=False)
     def step(batch: Lines) -> None:
         with tf.GradientTape() as tape:
-            integral = walls_met(walls_per_m(networks.cells, batch.image, training=True), batch.start, batch.end, ops)
+            per_m = walls_per_m(networks.cells, batch.image, ops, training=True)
+            integral = walls_met(per_m, batch.start, batch.end, ops)
             mean = corrected(networks.lines, integral, batch.unobserved_m, batch.distance_m, batch.known, ops)
             loss = tf.reduce_mean(mean - batch.unseen * tf.math.log(mean))
         optimizer.apply_gradients(zip(tape.gradient(loss, weights), weights, strict=True))
