@@ -1,7 +1,8 @@
 """Predicted distribution as a differentiable function of transmitter, materials, frequency and network weights.
 
-Paths and their derivatives are from `tracing`; features and networks are TensorFlow. Where links were traced, the
-distribution equals `Predictor.predict`. Limits of the gradients:
+Paths and their derivatives are from `tracing`; features, networks and mean losses are TensorFlow. Where links were
+traced, the distribution equals `LinkModel.predict`: its features change as the powers of all paths do. Limits of the
+gradients:
 
 - Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
   missing; one that becomes invalid loses its power in a step, which has no derivative.
@@ -14,7 +15,7 @@ distribution equals `Predictor.predict`. Limits of the gradients:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
@@ -24,13 +25,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of, link_features
+from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORKS,
@@ -56,17 +57,29 @@ from sionna_partial.prediction.unobserved import (
     CELLS_M,
     Segment,
     enter_grid,
+    is_enclosed,
     leave_cells,
     lengths_in_unknown_m,
     map_windows,
     segment_between,
 )
+from sionna_partial.prediction.unseen_walls import (
+    DirectLines,
+    Parts,
+    UnseenWalls,
+    WallDensity,
+    WallTrace,
+    by_mean_losses,
+    over_materials,
+)
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.process import njit
+from sionna_partial.scene.scene import power_laws
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
 from sionna_partial.tracing.links import unnamed_counts
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathSet
+from sionna_partial.tracing.power import mean_loss_db, wall_loss_db
 from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
@@ -79,6 +92,9 @@ STEEPEST = 4.0
 
 _NEAREST_M = 1e-6
 """Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
+
+_RELATIVE_STEP = 1e-5
+"""Step of central differences, relative to the value or to itself."""
 
 _LIMITS = {
     "tx_m": (-1e9, 1e9),
@@ -244,13 +260,12 @@ class DifferentiableScene:
     trace_settings : TraceSettings, optional
         Without diffuse reflection, and on meshes without diffraction.
     scene_settings : SceneSettings, optional
-        For an unknown material, complete links are averaged over candidates, unless a call gives constants.
+        For an unknown material, links are averaged over candidates, unless a call gives constants.
 
     Raises
     ------
     MapError, SettingsError, PredictorError, BackendError
-        As `predict_map`; also for paths that only rays find, or paths through walls on an incomplete map with a
-        predictor trained without them.
+        As `predict_map`; also for obstacles below the ceiling, and for paths that only rays find.
 
     Examples
     --------
@@ -286,14 +301,19 @@ class DifferentiableScene:
             raise MapError(
                 "scene has obstacles below the ceiling, which have no gradients: give it with obstacle=None."
             )
-        remedy = (
-            "on incomplete maps give TraceSettings(refraction=False), or a predictor trained on paths through walls."
-        )
-        require(self.partial.is_complete or not model.by_mean_losses, "refraction", True, remedy)
-        self.predictor = Predictor.load(model.asked)
-        if not self.partial.is_complete:
+        self.model = LinkModel(self.simulation, model.asked)
+        if not (self.partial.is_complete or model.by_mean_losses):
             warn_of_other_traces(self.predictor, *self.simulation.resolved)
-        self.networks = parts(self.predictor.model)
+
+    @cached_property
+    def predictor(self) -> Predictor:
+        """The predictor with its networks, which no other object shares."""
+        return Predictor.load(self.model.asked)
+
+    @cached_property
+    def networks(self) -> dict[str, Any]:
+        """The networks by name."""
+        return parts(self.predictor.model)
 
     @property
     def materials(self) -> tuple[str, ...]:
@@ -302,7 +322,9 @@ class DifferentiableScene:
 
     @property
     def weights(self) -> list[Any]:
-        """Variables of the networks."""
+        """Variables of the networks; none where mean losses predict."""
+        if self.model.by_mean_losses:
+            return []
         names = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
@@ -330,6 +352,29 @@ class DifferentiableScene:
     def _smooth(self) -> dict[CellState, SmoothLengths]:
         return {kind: SmoothLengths(self.partial, kind) for kind in (CellState.UNKNOWN, CellState.WALL)}
 
+    @cached_property
+    def _walls(self) -> WallDensity:
+        walls = UnseenWalls.shipped().of_map(self.partial)
+        return walls._replace(lines=UnseenWalls.keras_lines())
+
+    def _losses_db(self, values: Mapping[str, Floats]) -> Floats:
+        """Return the mean loss of traced walls, and the additional losses of candidates (2 K,) [dB]."""
+        at, resolved = self.simulation.parameters(np.zeros(3)), self.simulation.resolved
+        base_hz, at, total_db = float(at.frequency_hz), replace(at, **values), 0.0
+        frequency_hz, default = float(at.frequency_hz), resolved.scene_settings.traced_material
+        known = self.partial.environment.scene_materials(default)
+        traced = [known[name] for name in self.materials]
+        for named, fraction in self.partial.wall_fractions.items():
+            material = named or default
+            if material not in traced:
+                total_db += fraction * wall_loss_db(material, frequency_hz)
+                continue
+            slab = [getattr(at, name)[traced.index(material)] for name in MATERIAL_PARAMETERS]
+            grown = [(frequency_hz / base_hz) ** law.exponent for law in power_laws(material, base_hz)]
+            total_db += fraction * mean_loss_db(slab[0] * grown[0], slab[1] * grown[1], slab[2], frequency_hz)
+        candidates = WallMaterials.at(frequency_hz, self.partial.wall_class_count)
+        return np.append(total_db, candidates.crossing_db)
+
 
 class DifferentiableLinks:
     """Links from one transmitter to N receivers, traced once; a call returns their distribution.
@@ -342,7 +387,8 @@ class DifferentiableLinks:
 
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
-        self._phi = link_features(scene.partial, paths.links(), windows=False)
+        self._phi = scene.model.features(paths.base.tx_m, paths.rx_m)
+        self._complete = is_enclosed(scene.partial, np.broadcast_to(paths.base.tx_m, paths.rx_m.shape), paths.rx_m)
 
     def __call__(
         self,
@@ -362,7 +408,7 @@ class DifferentiableLinks:
         relative_permittivity, conductivity_s_m, thickness_m : (M,) tensors, optional
             Values of the scene's materials; [S/m] and [m].
         frequency_hz : () tensor, optional
-            Carrier frequency of the trace [Hz]; ITU materials follow it.
+            Carrier frequency of the trace [Hz]; materials follow it.
 
         Raises
         ------
@@ -372,28 +418,21 @@ class DifferentiableLinks:
         ops, values = import_keras().ops, (tx_m, relative_permittivity, conductivity_s_m, thickness_m, frequency_hz)
         pairs = zip(PARAMETERS, values, strict=True)
         given = {name: self._tensor(name, value) for name, value in pairs if value is not None}
-        power, vertices_m = moved_paths(self._paths, given)
-        gain_db = _gain_db(self._sum(power, self._paths.path_rx))
-        states = tf.cast([self._phi.link_state == state for state in LinkState], tf.float64)
-        mean_db, std_db = gain_db, tf.zeros_like(gain_db)
-        if self._scene.simulation.trace_settings.through_walls:
-            mean_db, std_db = self._over_materials(power, given)
-        trace = states, tf.stack([mean_db] * len(LinkState)), tf.stack([std_db] * len(LinkState))
-        complete = context_of(self._phi).complete
-        if complete.all():
-            return LinkDistribution.of_parts(*trace, ops=ops)
-        moved_m = given.get("tx_m")
-        numeric = self._moved_features(moved_m, gain_db)
-        carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
-        shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / self._scene.predictor.settings.frequency_hz)
-        if LINK_NETWORK in self._scene.networks:
-            numeric |= self._indirect_features(numeric["distance_m"], moved_m, power, vertices_m)
-            predicted = self._by_context(moved_m, numeric, shift_db)
-        else:
-            inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
-            predicted = distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db, ops)
-        pairs = zip(trace, predicted, strict=True)
-        return LinkDistribution.of_parts(*(tf.where(complete, traced, other) for traced, other in pairs), ops=ops)
+        moved = moved_paths(self._paths, given)
+        through_walls = self._scene.simulation.trace_settings.through_walls
+        traces, prior = self._traces(moved[0], given)
+        found = [self._of_trace(trace) for trace in traces]
+        if not self._complete.all():
+            if self._scene.model.by_mean_losses:
+                predicted = self._by_mean_losses(traces, given)
+            else:
+                predicted = [self._by_networks(given, *moved)] * len(traces)
+            found = [
+                tuple(tf.where(self._complete, *both) for both in zip(*each, strict=True))
+                for each in zip(found, predicted, strict=True)
+            ]
+        distribution = over_materials(found, prior, RESIDUAL_DB, ops) if through_walls else found[0]
+        return LinkDistribution.of_parts(*distribution, ops=ops)
 
     def _tensor(self, name: str, value: Any) -> Any:
         require(tf.executing_eagerly(), name, value, "call links eagerly, not within tf.function.")
@@ -412,17 +451,63 @@ class DifferentiableLinks:
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
-    def _over_materials(self, power: Any, given: Mapping[str, Any]) -> tuple[Any, Any]:
-        extra_db, prior, paths = np.zeros((1, 1)), np.ones(1), self._paths
-        if self._scene.simulation.material_unknown and not {*given} & {*MATERIAL_PARAMETERS}:
-            partial = self._scene.partial
-            materials = WallMaterials.at(float(self.base.frequency_hz), partial.wall_class_count)
-            thin, thick, reflections = unnamed_counts(paths.interactions, partial.wall_classes(paths.vertices_m))
-            extra_db = np.outer(materials.reflection_db, reflections) + materials.crossing_db @ [thin, thick]
-            prior = materials.prior
-        gains_db = tf.stack([_gain_db(self._sum(power * kept, paths.path_rx)) for kept in 10.0 ** (-extra_db / 10.0)])
-        mean_db = tf.tensordot(prior, gains_db, 1)
-        return mean_db, tf.sqrt(tf.tensordot(prior, (gains_db - mean_db) ** 2, 1) + RESIDUAL_DB**2)
+    def _traces(self, power: Any, given: Mapping[str, Any]) -> tuple[list[WallTrace], Floats]:
+        """Return the traced links under each candidate for the material of walls, and their probabilities."""
+        phi, scene, nothing = self._phi, self._scene, np.zeros(len(self._phi))
+        losses_db = by_differences(scene._losses_db, {name: each for name, each in given.items() if name != "tx_m"})
+        known = nothing if phi.context is None else phi.context.straight_walls
+        if phi.path_power is None or {*given} & {*MATERIAL_PARAMETERS}:
+            gain_db = self._changed_db(phi.gain_db, power, self._paths.power)
+            return [WallTrace(phi.link_state, gain_db, nothing + losses_db[0], known)], np.ones(1)
+        materials, fractions, traces = scene.model.wall_materials, scene.partial.unnamed_walls, []
+        crossings_db = tf.reshape(losses_db[1:], (-1, len(fractions)))
+        for number, under in enumerate(materials.under(phi, fractions)):
+            reflection_db, crossing_db = materials.reflection_db[number], crossings_db[number]
+            kept, first = (
+                10.0 ** (-0.1 * tf.linalg.matvec(self._unnamed, tf.concat([each_db, [reflection_db]], axis=0)))
+                for each_db in (crossing_db, materials.crossing_db[number])
+            )
+            gain_db = self._changed_db(under.gain_db, power * kept, self._paths.power * first)
+            loss_db = losses_db[0] + tf.reduce_sum(crossing_db * fractions)
+            traces.append(WallTrace(under.link_state, gain_db, nothing + loss_db, known))
+        return traces, materials.prior
+
+    @cached_property
+    def _unnamed(self) -> Floats:
+        """Crossings of thin and thick walls of unknown material, and reflections at them (P, 3)."""
+        classes = self._scene.partial.wall_classes(self._paths.vertices_m)
+        return np.stack(unnamed_counts(self._paths.interactions, classes), axis=1).astype(np.float64)
+
+    def _changed_db(self, gain_db: Floats, power: Any, first_power: Any, rx: Indices | None = None) -> Any:
+        """Return gains (N,) [dB] that change as the sums of the powers of paths, to `rx`, do; outages stay."""
+        rx = self._paths.path_rx if rx is None else rx
+        now_db, first_db = (_gain_db(self._sum(each, rx)) for each in (power, first_power))
+        changed_db = tf.maximum(gain_db + (now_db - first_db), GAIN_FLOOR_DB)
+        return tf.where(gain_db > GAIN_FLOOR_DB, changed_db, GAIN_FLOOR_DB)
+
+    @staticmethod
+    def _of_trace(trace: WallTrace) -> Parts:
+        states = tf.cast([trace.link_state == state for state in LinkState], tf.float64)
+        return states, tf.stack([trace.gain_db] * len(LinkState)), tf.zeros_like(states)
+
+    def _by_mean_losses(self, traces: Sequence[WallTrace], given: Mapping[str, Any]) -> list[Parts]:
+        ops, scene, rx_m, tx_m = import_keras().ops, self._scene, self._paths.rx_m, given.get("tx_m")
+        ends_m = [tf.broadcast_to(self.base.tx_m if tx_m is None else tx_m, rx_m.shape), tf.constant(rx_m)]
+        moved = self._moved_features(tx_m, self._phi.gain_db)
+        lengths_m = (tf.convert_to_tensor(moved[name]) for name in ("unobserved_distance_m", "distance_m"))
+        walls = scene._walls.counts(DirectLines(*ends_m, *lengths_m, traces[0].known), ops)
+        return [by_mean_losses(trace, walls, scene.simulation.trace_settings.max_walls, ops) for trace in traces]
+
+    def _by_networks(self, given: Mapping[str, Any], power: Any, vertices_m: Any) -> Parts:
+        tx_m, frequency_hz = given.get("tx_m"), self._scene.predictor.settings.frequency_hz
+        numeric = self._moved_features(tx_m, self._changed_db(self._phi.gain_db, power, self._paths.power))
+        carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
+        shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / frequency_hz)
+        if LINK_NETWORK in self._scene.networks:
+            numeric |= self._indirect_features(numeric["distance_m"], tx_m, power, vertices_m)
+            return self._by_context(tx_m, numeric, shift_db)
+        inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
+        return distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db, import_keras().ops)
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""
@@ -440,16 +525,21 @@ class DifferentiableLinks:
         }
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
-        legs = self._legs
+        legs, context, indirect = self._legs, context_of(self._phi), self._paths.power[self._legs.paths]
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
             unobserved_m = legs.moved_m(self._scene._smooth[CellState.UNKNOWN], tx_m, vertices_m)
-        indirect, gains_db = tf.gather(power, legs.paths), []
-        for length_m in ATTENUATION_LENGTHS_M:
-            kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else attenuation(legs.unobserved_m, 0.0)
-            gains_db.append(_gain_db(self._sum(indirect * kept, legs.rx)))
-        strongest_m = tf.gather(unobserved_m, np.maximum(legs.strongest, 0)) if len(legs.paths) else distance_m
-        strongest_m = tf.where(legs.strongest >= 0, strongest_m, distance_m)
+        gains_db = []
+        for column, length_m in enumerate(ATTENUATION_LENGTHS_M):
+            first = attenuation(legs.unobserved_m, length_m)
+            kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else first
+            of_paths = tf.gather(power, legs.paths) * kept, indirect * first
+            gains_db.append(self._changed_db(context.indirect_gain_db[:, column], *of_paths, legs.rx))
+        strongest_m = context.strongest_unobserved_m
+        grown_m = unobserved_m - legs.unobserved_m
+        if len(legs.paths):
+            grown_m = tf.gather(grown_m, np.maximum(legs.strongest, 0))
+            strongest_m = strongest_m + tf.where(legs.strongest >= 0, grown_m, distance_m - self._phi.distance_m)
         return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
 
     def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
@@ -548,6 +638,31 @@ def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
     if not given:
         return tf.constant(paths.power), tf.constant(np.nan_to_num(paths.vertices_m))
     return evaluate(*given.values())
+
+
+def by_differences(function: Callable[[dict[str, Floats]], Floats], given: Mapping[str, Any]) -> Any:
+    """Return a NumPy function (K,) of a few tensors, with derivatives by central differences."""
+
+    @tf.custom_gradient
+    def evaluate(*tensors: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
+        values = {name: tensor.numpy() for name, tensor in zip(given, tensors, strict=True)}
+
+        def slope(name: str, entry: int, upstream: Floats) -> float:
+            value, step = values[name], np.zeros(values[name].size)
+            step[entry] = _RELATIVE_STEP * max(abs(value.ravel()[entry]), _RELATIVE_STEP)
+            ends = [function(values | {name: value + way * step.reshape(value.shape)}) for way in (1, -1)]
+            return float((ends[0] - ends[1]) @ upstream) / (2.0 * step[entry])
+
+        def pull_back(upstream: Any) -> list[Any]:
+            pulled = []
+            for name, value in values.items():
+                slopes = [slope(name, entry, upstream.numpy()) for entry in range(value.size)]
+                pulled.append(_once_only(tf.constant(slopes, tf.float64, value.shape)))
+            return pulled
+
+        return tf.constant(function(values)), pull_back
+
+    return evaluate(*given.values()) if given else tf.constant(function({}))
 
 
 def _pulled(slopes: Floats, upstream: Any) -> Any:

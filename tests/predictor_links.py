@@ -138,7 +138,7 @@ def true_gain(phi, state):
 
 
 def arrays(prediction):
-    return {field.name: getattr(prediction, field.name) for field in dataclasses.fields(prediction)}
+    return {name: getattr(prediction, name) for name in prediction.COLUMNS}
 
 
 def assert_valid(prediction):

@@ -1,7 +1,7 @@
 """The prediction as TensorFlow functions: values of the predictor, slopes of its finite differences."""
 
 import functools
-from dataclasses import fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ RX_M = np.array(
     [[1.47, 2.51, 1.7], [3.05, 0.61, 1.2], [3.12, 2.52, 1.3], [3.7, 1.2, 1.1], [2.6, 2.45, 1.9], [0.7, 0.7, 1]]
 )
 STEPS = dict(zip(PARAMETERS, (1e-3, 2e-3, 5e-3, 1e-5, 1e7), strict=True))
-OUTPUTS = tuple(field.name for field in fields(LinkDistribution))
+OUTPUTS = LinkDistribution.COLUMNS
 
 
 def partial_room():
@@ -181,6 +181,54 @@ class TestSlopes:
             assert found == pytest.approx((ends[0] - ends[1]) / (2 * step), rel=0.03)
 
 
+WIFI = sp.TraceSettings(5e9, max_depth=1)
+
+
+def wifi_model(material, frequency_hz=5e9):
+    settings = sp.SceneSettings(material=material and sp.Material.named(material))
+    return sp.LinkModel(MAPS["partial"], None, replace(WIFI, frequency_hz=frequency_hz), settings)
+
+
+class TestThroughWalls:
+    """Mean losses, unseen walls and unknown material on an incomplete map."""
+
+    @pytest.mark.parametrize("material", [None, "brick"])
+    def test_unmoved_as_the_link_model(self, material):
+        model = wifi_model(material)
+        links, expected = sp.DifferentiableScene(model).links(TX_M, RX_M), model.predict(TX_M, RX_M)
+        assert {0.0, 1.0} < {*expected.p_los.tolist()}
+        assert_same(links(), expected, rtol=1e-6, atol=1e-6)
+        assert_same(
+            links(**{name: getattr(links.base, name) for name in ("tx_m", "frequency_hz")}), expected, atol=1e-4
+        )
+
+    @pytest.mark.parametrize(
+        ("material", "name"), [(None, "tx_m"), (None, "frequency_hz"), *(("brick", name) for name in PARAMETERS)]
+    )
+    def test_by_differences(self, material, name):
+        links = sp.DifferentiableScene(wifi_model(material)).links(TX_M, RX_M)
+        variable, step = tf.Variable(getattr(links.base, name)), STEPS[name]
+        with tf.GradientTape(persistent=True) as tape:
+            here = tf.unstack(tf.reduce_sum(TestSlopes.outputs(links(**{name: variable})), axis=1))
+        found, value = np.array([np.ravel(tape.gradient(each, variable)) for each in here]), variable.numpy()
+        for entry, along in enumerate(np.eye(value.size)):
+            ends = [value + sign * step * along.reshape(value.shape) for sign in (1, -1)]
+            moved = [TestSlopes.outputs(links(**{name: end})).numpy() for end in ends]
+            expected = (moved[0] - moved[1]) / (2 * step)
+            assert np.abs(found[:, entry] - expected.sum(axis=1)).max() <= 0.02 * np.abs(expected).sum() + 1e-4 / step
+
+    @pytest.mark.parametrize("material", [None, "brick"])
+    def test_frequency_as_other_models(self, material):
+        links, frequency_hz = (
+            sp.DifferentiableScene(wifi_model(material)).links(TX_M, RX_M),
+            tf.Variable(5e9, dtype=tf.float64),
+        )
+        with tf.GradientTape() as tape:
+            total_db = tf.reduce_sum(links(frequency_hz=frequency_hz).gain_mean_db)
+        ends = [wifi_model(material, 5e9 + step_hz).predict(TX_M, RX_M).gain_mean_db.sum() for step_hz in (1e7, -1e7)]
+        assert tape.gradient(total_db, frequency_hz).numpy() * 2e7 == pytest.approx(ends[0] - ends[1], rel=0.02)
+
+
 class TestErrors:
     @pytest.mark.parametrize(
         ("name", "value", "remedy"),
@@ -193,18 +241,10 @@ class TestErrors:
         with pytest.raises(SettingsError, match=rf"{name} = .* is not allowed: {remedy}"):
             links_of("partial", "paper")(**{name: value})
 
-    @pytest.mark.parametrize("predictor", [None, "map"])
-    def test_paths_through_walls_on_a_map_that_is_not_complete(self, predictor, caplog):
-        """The default prediction has no gradients there; a network that learnt from opaque walls is named."""
+    def test_networks_that_learnt_from_opaque_walls(self, caplog):
         settings = replace(TRACE, frequency_hz=5e9, max_depth=2)
-        if predictor is None:
-            with pytest.raises(SettingsError, match=r"refraction = True is not allowed: .*TraceSettings\(refraction=F"):
-                sp.DifferentiableScene(MAPS["partial"], trace_settings=settings)
-        else:
-            sp.DifferentiableScene(MAPS["partial"], predictor=predictor, trace_settings=settings)
-            assert "was trained on opaque walls, and is used through walls" in caplog.text
-        opaque = replace(settings, refraction=False)
-        assert sp.DifferentiableScene(MAPS["partial"], trace_settings=opaque).links(TX_M, RX_M)().p_los.shape == (6,)
+        sp.DifferentiableScene(MAPS["partial"], predictor="map", trace_settings=settings)
+        assert "was trained on opaque walls, and is used through walls" in caplog.text
 
     def test_functions_and_second_derivatives(self, links_of):
         links = links_of("partial", "paper")

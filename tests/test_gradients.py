@@ -12,6 +12,7 @@ from pillar_room import RX_M, TX_M, small_room
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.settings import WALL_MATERIALS
 from sionna_partial.tracing.gradients import GainGradients, gain_gradients
 from sionna_partial.tracing.power import reflection_loss_db
 
@@ -62,6 +63,24 @@ def test_gain_state_and_outage() -> None:
     assert found.link_state.tolist() == [LinkState.OUTAGE, LinkState.LOS]
     assert not all_slopes(found)[:, 0].any()
     assert all_slopes(found)[:, 1].all()
+
+
+def test_frequency_by_differences_for_every_named_material() -> None:
+    """One receiver behind a metre of wall of each material."""
+    count = len(WALL_MATERIALS)
+    state = np.zeros((30, 10 * count), dtype=np.uint8)
+    state[15] = CellState.WALL
+    kind = np.where(state == CellState.WALL, 1 + np.arange(10 * count) // 10, 0).astype(np.uint8)
+    walls = sp.PartialMap(state, 0.1, wall_material=kind, wall_materials=tuple(WALL_MATERIALS.values()))
+    tx, rx = (0.5 * count, 0.7, 1.5), [(0.5 + wall, 1.75, 1.5) for wall in range(count)]
+    settings = sp.TraceSettings(5.2e9, max_depth=0)
+    found = gain_gradients(walls, tx, rx, trace_settings=settings)
+    assert (found.link_state != LinkState.OUTAGE).sum() >= count - 1  # metal
+    ends = [dataclasses.replace(settings, frequency_hz=5.2e9 + step_hz) for step_hz in (5e6, -5e6)]
+    gains_db = [sp.trace_links(walls, tx, rx, trace_settings=each).gain_db for each in ends]
+    np.testing.assert_allclose(
+        found.frequency_db_per_hz * 1e9, (gains_db[0] - gains_db[1]) / 1e-2, rtol=0.01, atol=0.02
+    )
 
 
 def test_errors(tmp_path: Path) -> None:

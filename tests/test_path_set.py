@@ -14,6 +14,7 @@ from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.settings import DRYWALL
 from sionna_partial.tracing import path_set
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathParameters, PathSet
 
@@ -169,7 +170,8 @@ class TestAt:
         by = {"relative_permittivity": 1.7, "conductivity_s_m": -0.1, "thickness_m": -0.05}
         settings = replace(SETTINGS, frequency_hz=19e9, refraction=False)
         changes = {name: getattr(sp.Material(), name) + step for name, step in by.items()}
-        scene_settings = sp.SceneSettings(material=sp.Material(**changes))
+        material = sp.Material(**changes, conductivity_exponent=DRYWALL.conductivity_exponent)
+        scene_settings = sp.SceneSettings(material=material)
         links = sp.trace_links(small_room(), TX_M, RX_M, trace_settings=settings, scene_settings=scene_settings)
         power, _ = paths.at(changed(paths, **by, frequency_hz=-9e9))
         expected = as_traced(paths, links)[0]

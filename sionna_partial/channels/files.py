@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from numpy.typing import NDArray
 
+from sionna_partial.arrays import Floats, Indices
 from sionna_partial.channels.responses import ArrayPaths, require_memory
 from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
 from sionna_partial.constants import MEMORY_GB
@@ -36,11 +37,13 @@ SUFFIXES = (".zarr", ".nc", ".h5")
 
 _CHANNELS = "give links with paths, or what their cir, cfr or taps returned."
 
-_OF_LINKS, _OF_PATHS = ("tx", "rx", "tx_m", "rx_m"), ("a", "delay_s", "paths")
+_OF_ANTENNAS = ("tx_ant_m", "rx_ant_m")
+_OF_LINKS, _OF_PATHS = ("tx", "rx", "tx_m", "rx_m", *_OF_ANTENNAS), ("a", "delay_s", "paths")
 _LINK, _POINT, _PAIR = ("link",), ("link", "axis"), ("link", "rx_ant", "tx_ant")
 _AXES: dict[str, tuple[str, tuple[tuple[str, ...], ...]]] = {
     **dict.fromkeys(("tx", "rx", "paths"), ("iu", (_LINK,))),
     **dict.fromkeys(("tx_m", "rx_m"), ("f", (_POINT,))),
+    **{name: ("f", ((name[:6], "axis"),)) for name in _OF_ANTENNAS},
     **{"a": ("c", ((*_PAIR, "path"),)), "delay_s": ("f", (("link", "path"), (*_PAIR, "path")))},
     "h": ("c", ((*_PAIR, "frequency"), (*_PAIR, "tap"))),
 }
@@ -70,10 +73,11 @@ def save_channels(
                  where there is no path: as from a generator of Sionna's `CIRDataset`. Responses have `h` (rx,
                  rx_ant, tx, tx_ant, time, frequency or tap).
     `"deepmimo"` `channel` (rx, rx_ant, tx_ant, path, frequency or tap) and `delay` (rx, path) [s], NaN where there is
-                 no path, of one transmitter.
+                 no path, of one transmitter. Antennas are numbered row by row from the lowest, along y.
     ============ =================================================================================================
 
-    Files include the positions of both ends. A `.nc` or `.h5` file is NetCDF 4, which any HDF5 library reads.
+    Files include the positions of both ends and of their antennas. A `.nc` or `.h5` file is NetCDF 4, which any HDF5
+    library reads.
 
     Parameters
     ----------
@@ -222,7 +226,9 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
     return xr.Dataset(
         {"a": (every, da.stack(of_tx[0])), "delay_s": (delays, da.stack(of_tx[1])), "paths": (("tx", "rx"), paths)},
         attrs={name: getattr(each.trace_settings, name) for name in ("frequency_hz", "power_tolerance_db")},
-    ).assign(tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx))
+    ).assign(
+        tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx), **arrays.antenna_positions()
+    )
 
 
 def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
@@ -240,6 +246,9 @@ def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:
         if name in ("tx", "rx"):
             continue
         values = links[name].transpose(*dims).to_numpy()
+        if name in _OF_ANTENNAS:
+            found[name] = dims, values
+            continue
         values = values.reshape(len(tx), len(rx), *values.shape[1:])
         if name in ("tx_m", "rx_m"):
             found[name] = (name[:2], "axis"), values[:, 0] if name == "tx_m" else values[0]
@@ -265,6 +274,16 @@ def _checked_axes(channels: xr.Dataset) -> dict[str, tuple[str, ...]]:
     return axes
 
 
+def _by_rows(positions_m: Floats) -> Indices:
+    """Return DeepMIMO's order of antennas at (A, 3): y before z, both ascending; each polarisation by itself.
+
+    Sionna numbers column by column, from the top.
+    """
+    cells = np.round(positions_m / max(np.ptp(positions_m, axis=0).max(), 1e-9), 6)
+    polarisation = [int((cells[:at] == cell).all(axis=1).sum()) for at, cell in enumerate(cells)]
+    return np.lexsort((*cells.T, polarisation))
+
+
 def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:
     table = table.assign_attrs(layout=layout)
     last = next(name for name in ("path", "frequency", "tap") if name in table.dims)
@@ -273,7 +292,8 @@ def _laid_out(table: xr.Dataset, layout: Layout) -> xr.Dataset:
         require(table.sizes["tx"] == 1, "transmitters", table.sizes["tx"], remedy)
         names = {"a": "channel", "h": "channel", "delay_s": "delay"}
         table = table.rename({name: new for name, new in names.items() if name in table})
-        return table.assign(tx_m=("axis", table.tx_m.to_numpy()[0])).squeeze("tx")
+        orders = {name[:6]: _by_rows(table[name].to_numpy()) for name in _OF_ANTENNAS}
+        return table.assign(tx_m=("axis", table.tx_m.to_numpy()[0])).squeeze("tx").isel(orders)
     ends = ("rx", "rx_ant", "tx", "tx_ant")
     if last != "path":
         return table.assign(h=table.h.expand_dims("time").transpose(*ends, "time", last))

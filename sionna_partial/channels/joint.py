@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.special import ndtri
 
@@ -102,17 +103,35 @@ class JointLatents:
 
 
 def states_and_gains(links: LinkPrediction, of_state: Floats, of_gain: Floats) -> tuple[States, Floats]:
-    """Return states and gains (n, ...) [dB] of predicted links (...) at quantiles of both.
+    """Return states and gains (n, ...) [dB] of predicted links (...) at quantiles of both."""
+    state = drawn_states(links, of_state)
+    return state, drawn_gains(links, state, of_gain)
 
-    The lowest quantiles are outages, the highest LOS.
-    """
-    probabilities, means_db, stds_db = links.by_state
-    p_outage = probabilities[LinkState.OUTAGE]
-    state = np.where(of_state < p_outage + probabilities[LinkState.NLOS], LinkState.NLOS, LinkState.LOS)
-    state = np.where(of_state < p_outage, LinkState.OUTAGE, state).astype(np.uint8)
+
+def drawn_states(links: LinkPrediction, quantile: Floats) -> States:
+    """Return states (n, ...) of predicted links (...): the lowest quantiles are outages, the highest LOS."""
+    state = np.where(quantile < links.p_outage + links.p_nlos, LinkState.NLOS, LinkState.LOS)
+    return np.where(quantile < links.p_outage, LinkState.OUTAGE, state).astype(np.uint8)
+
+
+def drawn_gains(links: LinkPrediction, state: States, quantile: Floats, residual_db: Floats | float = 0.0) -> Floats:
+    """Return gains (n, ...) [dB] of predicted links (...) at quantiles given their states."""
+    _, means_db, stds_db = links.by_state
     mean_db, std_db = (np.take_along_axis(each, state.astype(np.intp), axis=0) for each in (means_db, stds_db))
-    gain_db = np.clip(mean_db + std_db * ndtri(of_gain), GAIN_FLOOR_DB, 0.0)
-    return state, np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+    gain_db = np.clip(mean_db + std_db * ndtri(quantile) + residual_db, GAIN_FLOOR_DB, 0.0)
+    return np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
+
+
+def evenly_within(groups: NDArray[np.integer], quantile: Floats, rng: np.random.Generator) -> Floats:
+    """Spread quantiles (n, L) evenly over (0, 1) within the draws of each group (n, L), in their order."""
+    index, order = np.arange(len(groups))[:, None], np.lexsort((quantile, groups), axis=0)
+    ordered = np.take_along_axis(groups, order, axis=0)
+    differs = np.diff(ordered, axis=0, prepend=ordered[:1] - 1, append=ordered[-1:] + 1) != 0
+    first = np.maximum.accumulate(np.where(differs[:-1], index, 0), axis=0)
+    last = np.minimum.accumulate(np.where(differs[1:], index + 1, len(groups))[::-1], axis=0)[::-1]
+    spread = np.empty(quantile.shape)
+    np.put_along_axis(spread, order, (index - first + rng.random(first.shape)) / (last - first), axis=0)
+    return spread
 
 
 def _evenly_spread(shared: Floats, rng: np.random.Generator, count: int) -> Floats:

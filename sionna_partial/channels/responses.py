@@ -107,6 +107,12 @@ class ArrayPaths:
         coefficients = max(BLOCK_BYTES // 16, len(self.rx) * len(self.tx) * self.most)
         return coefficients * (32 if self.synthetic_array else 80)
 
+    def antenna_positions(self) -> dict[str, Any]:
+        """Return the positions of antennas relative to their end, before it is turned [m]."""
+        metre = {"long_name": "antenna positions relative to the end, before it is turned", "units": "m"}
+        sides = {"tx_ant": self.tx, "rx_ant": self.rx}
+        return {f"{name}_m": ((name, "axis"), side.of_each_antenna_m, metre) for name, side in sides.items()}
+
     def empty(self, links: int) -> tuple[NDArray[np.complex64], Floats]:
         shape = links, self.most, len(self.rx), len(self.tx)
         return np.zeros(shape, np.complex64), np.full(shape[:2] if self.synthetic_array else shape, np.nan)
@@ -415,6 +421,8 @@ def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
     tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
     tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
     positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), each.rx[rx], metre)}
+    if any("tx_ant" in dims for dims, *_ in variables.values()):
+        positions |= arrays.antenna_positions()
     attributes = {
         **{"frequency_hz": each.trace_settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
         "power_tolerance_db": each.trace_settings.power_tolerance_db,

@@ -7,26 +7,33 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 from scipy.special import ndtri
 
-from sionna_partial.arrays import Floats, Indices, States, read_only
-from sionna_partial.channels.joint import JointLatents, states_and_gains
+from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
+from sionna_partial.channels.joint import JointLatents, drawn_gains, drawn_states, evenly_within
 from sionna_partial.checks import Progress, require_memory, require_whole
-from sionna_partial.constants import MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import SEEN_M, link_features, traced_unobserved_m
+from sionna_partial.prediction.features import (
+    SEEN_M,
+    context_of,
+    link_features,
+    traced_unobserved_m,
+    with_path_power,
+)
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.links import TracedLinks, path_gain_db
+from sionna_partial.tracing.links import TracedLinks, path_gain_db, unnamed_counts
 from sionna_partial.tracing.paths import SolvedPaths, path_order
 from sionna_partial.tracing.simulation import Simulation
 
@@ -44,8 +51,8 @@ RANGE_DB = 30.0
 _COLUMNS = tuple(name for name in SolvedPaths.__dataclass_fields__ if name != "vertices_m")
 _NO_VERTICES = np.zeros((0, 1, 3))
 _PATHS_AT_ONCE = 100_000
-_PATHS_OF_DRAW, _PATH_BYTES, _DRAW_BYTES = 20, 300, 130
-_STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST = range(5)
+_PATHS_OF_DRAW, _PATH_BYTES, _DRAW_BYTES = 20, 300, 170
+_STATE, _GAIN, _SURVIVAL, _ANALOGUE, _REST, _RESIDUAL, _MATERIAL, _EVEN = range(8)
 
 
 @read_only
@@ -166,11 +173,12 @@ def sample_channels(
 ) -> ChannelSamples:
     """Draw states, gains and paths of links on a partial map n times.
 
-    State and gain of each link are drawn from the distribution of `predict_map`; with 64 draws or more, states occur as
-    often as predicted. Shared spatial latents (`JointLatents`) make a
-    draw one possible building: links behind the same unseen wall fail together. Given state and gain, a draw contains
-    the traced paths in observed space, others with a learned probability, and analogues from procedural homes
-    (`PathModel`). On a complete map every draw is the trace.
+    State and gain of each link are drawn from the distribution of `LinkModel.predict`, and occur as often as predicted.
+    Shared spatial latents (`JointLatents`) make a draw one possible building: links behind the same unseen wall fail
+    together, and walls of unknown material have one material. Given state and gain, a draw contains the traced paths in
+    observed space, others with a learned probability, and analogues from procedural homes (`PathModel`). On a complete
+    map with opaque walls every draw is the trace; through walls, the gain deviates from the trace as predicted, by the
+    same factor for all paths of a link.
 
     Parameters
     ----------
@@ -227,29 +235,81 @@ def sample_channels(
         report(0.0, "tracing")
         traced = model.simulation.links(tx, rx, memory_gb=memory_gb, progress=False)
         phi = link_features(model.partial, traced).flat()
-        assert phi.context is not None
-        prediction = model.predict_features(phi, phi.context.complete)
+        if model.simulation.material_unknown:
+            phi = with_path_power(phi, model.partial, traced)
+        prediction = model.predict_features(phi, context_of(phi).complete)
         report(0.5, "drawing")
-        draws = _Draws(model.partial, traced, prediction, n, seed)
+        draws = _Draws(model.partial, traced, prediction, _Buildings.drawn(model, traced, prediction, n, seed), seed)
         report(1.0, "done")
     shape = (n, *traced.gain_db.shape)
     return ChannelSamples(draws.state.reshape(shape), draws.gain_db.reshape(shape), memory_gb, draws)
 
 
+class _Buildings(NamedTuple):
+    """Candidate for the material of walls in each draw (n,), and distributions of the links for the K candidates.
+
+    Each candidate adds `loss_db` (K, C) [dB] for the `counts` (P, C) of crossings and reflections of a path.
+    """
+
+    of_draw: Indices
+    parts: tuple[LinkPrediction, ...]
+    loss_db: Floats
+    counts: Floats
+
+    @classmethod
+    def drawn(
+        cls, model: LinkModel, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
+    ) -> _Buildings:
+        """Draw candidates as often as they are probable."""
+        (parts, weights), rng = prediction.materials, np.random.default_rng([seed, _MATERIAL])
+        quantile = (rng.permutation(count) + rng.random(count)) / count
+        of_draw = np.minimum(np.searchsorted(np.cumsum(weights), quantile, side="right"), len(parts) - 1)
+        if not model.simulation.material_unknown:
+            return cls(of_draw, parts, np.zeros((len(parts), 0)), np.zeros((len(traced.path_rx), 0)))
+        materials, classes = model.wall_materials, model.partial.wall_classes(traced.vertices_m)
+        loss_db = np.column_stack([materials.crossing_db, materials.reflection_db])
+        return cls(of_draw, parts, loss_db, np.stack(unnamed_counts(traced.interactions, classes), axis=1) + 0.0)
+
+    def kept(self, candidates: Indices, paths: Indices) -> Floats:
+        """Return the powers (D, Q) of paths (Q,) relative to the trace for candidates (D,)."""
+        kept: Floats = 10.0 ** (-0.1 * self.loss_db[candidates] @ self.counts[paths].T)
+        return kept
+
+    def states_and_gains(self, of_state: Floats, of_gain: Floats, seed: list[int]) -> tuple[States, Floats]:
+        """Return states and gains (n, L) [dB], at quantiles that are spread evenly for each candidate and state."""
+        rng, group = np.random.default_rng(seed), np.broadcast_to(self.of_draw[:, None], of_state.shape)
+        of_state = evenly_within(group, of_state, rng)
+        state, gain_db = np.zeros(of_state.shape, np.uint8), np.zeros(of_state.shape)
+        rows = [(self.of_draw == number, part) for number, part in enumerate(self.parts)]
+        for here, part in rows:
+            state[here] = drawn_states(part, of_state[here])
+        of_gain = evenly_within(len(LinkState) * group + state, of_gain, rng)
+        for here, part in rows:
+            gain_db[here] = drawn_gains(part, state[here], of_gain[here])
+        return state, gain_db
+
+
+def _is_certain(links: LinkPrediction) -> Bools:
+    probabilities, _, stds_db = links.by_state
+    return np.asarray((probabilities.max(axis=0) == 1.0) & (probabilities * stds_db == 0.0).all(axis=0))
+
+
 class _Draws:
+    """Draws of states, gains and paths; all paths of a link share the residual of its gain about the trace."""
+
     def __init__(
-        self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, count: int, seed: int
+        self, partial: PartialMap, traced: TracedLinks, prediction: LinkPrediction, buildings: _Buildings, seed: int
     ) -> None:
-        tx_m, rx_m = traced.tx.reshape(-1, 3), traced.rx
-        self.traced, self._seed, self._rx_count = traced, seed, len(rx_m)
+        tx_m, rx_m, count = traced.tx.reshape(-1, 3), traced.rx, len(buildings.of_draw)
+        self.traced, self._buildings, self._seed, self._rx_count = traced, buildings, seed, len(rx_m)
         self._link = traced.path_link
         ends = np.repeat(tx_m, len(rx_m), axis=0), np.tile(rx_m, (len(tx_m), 1))
         self._geometry = LinkGeometry.of(partial, *ends, traced.trace_settings.frequency_hz)
-        probabilities, _, stds_db = prediction.by_state
-        certain = (probabilities.max(axis=0) == 1.0) & ((probabilities > 0.0) * stds_db == 0.0).all(axis=0)
+        certain = np.logical_and.reduce([_is_certain(part) for part in buildings.parts])
         self._certain_paths, self._uncertain = np.flatnonzero(certain[self._link]), np.flatnonzero(~certain)
-        seeds = [[seed, each] for each in (_STATE, _GAIN, _SURVIVAL, _ANALOGUE)]
-        of_state, of_gain, of_survival, of_analogue = JointLatents(partial).quantiles(*ends, count, seeds)
+        deviates = prediction.by_material is not None
+        seeds = [[seed, each] for each in (_STATE, _GAIN, _SURVIVAL, _ANALOGUE, *[_RESIDUAL] * deviates)]
+        of_state, of_gain, of_survival, of_analogue, *others = JointLatents(partial).quantiles(*ends, count, seeds)
         self._survival_latent = ndtri(of_survival[:, self._uncertain])
         self._analogue_quantile = of_analogue[:, self._uncertain]
         self._model = PathModel.load()
@@ -258,12 +318,16 @@ class _Draws:
         self._power = csr_array((power, (np.arange(len(power)), self._of_link)), shape=shape)
         unobserved_m = traced_unobserved_m(partial, traced, self._paths)
         seen = unobserved_m < SEEN_M
+        self.state, within_db = buildings.states_and_gains(of_state, of_gain, [seed, _EVEN])
+        residual_db = RESIDUAL_DB * ndtri(others[0]) if deviates else np.zeros(())
+        has_path = self.state != LinkState.OUTAGE
+        self.gain_db = np.where(has_path, np.clip(within_db + residual_db, GAIN_FLOOR_DB, 0.0), GAIN_FLOOR_DB)
         # with LOS there are the direct path and all paths in observed space, at least
-        least = 10.0 ** (self._geometry.free_space_db / 10.0)
-        least[self._uncertain] += np.bincount(self._of_link, power * seen, shape[1])
-        state, gain_db = states_and_gains(prediction, of_state, of_gain)
-        gain_db = np.where(state == LinkState.LOS, np.maximum(gain_db, path_gain_db(least)), gain_db)
-        self.state, self.gain_db = state, np.where(certain, traced.gain_db.ravel(), gain_db)
+        least = np.tile(10.0 ** (self._geometry.free_space_db / 10.0), (len(buildings.parts), 1))
+        seen_power = buildings.kept(np.arange(len(least)), self._paths) * seen
+        least[:, self._uncertain] += seen_power @ self._power
+        raised_db = np.maximum(within_db, path_gain_db(least)[buildings.of_draw])
+        self._path_gain_db = np.where((self.state == LinkState.LOS) & ~certain, raised_db, within_db)
         self._crosses = np.zeros(len(self._link), dtype=bool)
         self._crosses[self._paths] = unobserved_m > 0.0
         inputs = survival_inputs(traced, self._paths, unobserved_m, self._geometry)
@@ -302,27 +366,34 @@ class _Draws:
 
     def _parts(self, draws: Indices, rng: np.random.Generator) -> Iterator[SolvedPaths]:
         certain, links, of_link = self._certain_paths, self._uncertain, self._of_link
-        yield self._copies(np.repeat(draws, len(certain)), np.tile(certain, len(draws)), None, None)
-        state, gain_db = self.state[draws][:, links], self.gain_db[draws][:, links]
+        factor = 10.0 ** ((self.gain_db[draws] - self._path_gain_db[draws]) / 10.0)
+        candidates = self._buildings.of_draw[draws]
+        scale = self._buildings.kept(candidates, certain) * factor[:, self._link[certain]]
+        row, path = np.nonzero(self.state[draws][:, self._link[certain]] != LinkState.OUTAGE)
+        yield self._copies(draws[row], certain[path], np.sqrt(scale[row, path]), None)
+        factor, kept = factor[:, links], self._buildings.kept(candidates, self._paths)
+        state, gain_db = self.state[draws][:, links], self._path_gain_db[draws][:, links]
         is_los, free_space = state == LinkState.LOS, 10.0 ** (self._geometry.free_space_db[links] / 10.0)
         rest = np.maximum(10.0 ** (gain_db / 10.0) - is_los * free_space, 0.0)
         latent = self._survival_latent[draws][:, of_link]
         latent += rng.standard_normal(latent.shape)
         survives = latent < np.where(is_los[:, of_link], *self._survives_below)
         survives &= (state != LinkState.OUTAGE)[:, of_link]
-        survivors = survives.astype(np.float64) @ self._power
+        survivors = (survives * kept) @ self._power
         analogue = self._analogues(draws, state, gain_db, survivors)
         has_paths = (np.diff(self._model.first)[analogue] > 0) & (analogue >= 0)
         # without an analogue's paths the survivors have all of the power
         scale = np.where((survivors > rest) | ~has_paths, rest / np.maximum(survivors, 1e-30), 1.0)
         row, path = np.nonzero(survives & (scale > 0.0)[:, of_link])
-        yield self._copies(draws[row], self._paths[path], np.sqrt(scale[row, of_link[path]]), rng)
+        amplitude = np.sqrt((scale * factor)[row, of_link[path]] * kept[row, path])
+        yield self._copies(draws[row], self._paths[path], amplitude, rng)
         alone = ~has_paths & (survivors == 0.0) & (state == LinkState.NLOS)
         row, link = np.nonzero(is_los | alone)
         kind = np.where(is_los[row, link], 0, UNSEEN)
-        direct, nothing = np.where(kind == 0, free_space[link], rest[row, link]), np.zeros((len(row), 2))
+        direct = factor[row, link] * np.where(kind == 0, free_space[link], rest[row, link])
+        nothing = np.zeros((len(row), 2))
         yield self._made(draws[row], links[link], direct, np.zeros(len(row)), nothing, nothing, kind, rng)
-        left = np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
+        left = factor * np.where(has_paths, np.maximum(rest - survivors, 0.0), 0.0)
         yield self._of_analogues(draws, analogue, left, rng)
 
     def _indirect(self) -> tuple[Indices, Indices, Floats]:
@@ -366,13 +437,12 @@ class _Draws:
             rng,
         )
 
-    def _copies(
-        self, draw: Indices, paths: Indices, scale: Floats | None, rng: np.random.Generator | None
-    ) -> SolvedPaths:
+    def _copies(self, draw: Indices, paths: Indices, amplitude: Floats, rng: np.random.Generator | None) -> SolvedPaths:
         columns = {name: getattr(self.traced, name).take(paths, axis=0) for name in _COLUMNS}
-        if rng is not None and scale is not None:
+        columns["transfer"] *= amplitude[:, None, None]
+        if rng is not None:
             turn = np.where(self._crosses[paths], rng.uniform(0.0, 2.0 * np.pi, len(paths)), 0.0)
-            columns["transfer"] *= (scale * np.exp(1j * turn))[:, None, None]
+            columns["transfer"] *= np.exp(1j * turn)[:, None, None]
         columns["path_tx"] += (draw * self._tx_count).astype(np.int32)
         return SolvedPaths(**columns, vertices_m=_NO_VERTICES)
 

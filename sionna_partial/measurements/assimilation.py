@@ -566,7 +566,7 @@ class Assimilation(Shown):
         p_powers: float,
         others: Sequence[Assimilation],
     ) -> Assimilation:
-        materials, weights = prior.by_material
+        materials, weights = prior.materials
         compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
         log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
         p = np.exp(log_p - logsumexp(log_p))
@@ -600,7 +600,7 @@ class Assimilation(Shown):
         require_type("prior", prior, LinkPrediction, "give what Predictor.predict returned of the links.")
         rx_m = np.atleast_2d(position_array("rx_m", rx_m, least=0))
         opaque = self._fits[0] is not None and self._fits[0].kind.exact
-        materials = (prior,) if opaque else prior.by_material[0]
+        materials = (prior,) if opaque else prior.materials[0]
         updated, across = [], None
         for fit, links in zip(self._fits, materials, strict=True):
             if fit is not None:

@@ -168,7 +168,7 @@ def _log_process(
     partial: PartialMap, measured: Measurements, links: Sequence[Links], points_m: Floats, frequency_hz: float
 ) -> Floats:
     """Return the log-likelihood (2, N) of gains and of powers through walls: residuals are a Gaussian process."""
-    materials, weights = zip(*(prediction.by_material for prediction, *_ in links), strict=True)
+    materials, weights = zip(*(prediction.materials for prediction, *_ in links), strict=True)
     mean_db, std_db = (
         np.array([[getattr(each, name) for each in of_link] for of_link in materials]).transpose(2, 1, 0)
         for name in ("gain_mean_db", "gain_std_db")

@@ -3,7 +3,7 @@
 import json
 import math
 import os
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ STARTS, REFINED = (6, 16, 3.5), (1, 4, 25.0)
 STEPS_M = (0.6, 0.25)
 """Distances of neighbours in the refinement [m]."""
 
-OUTAGE = {column.name: GAIN_FLOOR_DB if column.name.endswith("mean_db") else 0.0 for column in fields(LinkPrediction)}
+OUTAGE = {name: GAIN_FLOOR_DB if name.endswith("mean_db") else 0.0 for name in LinkPrediction.COLUMNS}
 
 OUTAGE["p_outage"] = 1.0
 """Prediction of a certain outage."""
@@ -413,11 +413,14 @@ class Search:
         far = np.linalg.norm(area.rx_m - positions_m[:, None], axis=2) >= nearest_m(frequency_hz)
         ends_m = [(tx_m, area.rx_m[kept]) for tx_m, kept in zip(positions_m, far, strict=True)]
         _, found, _ = self.model.predict_each(ends_m, report)
-        columns = {}
-        for column in fields(LinkPrediction):
-            columns[column.name] = np.full(far.shape, OUTAGE[column.name])
-            columns[column.name][far] = getattr(found, column.name)
-        return LinkPrediction(**columns), far
+
+        def placed(links: LinkPrediction) -> LinkPrediction:
+            columns = {name: np.full(far.shape, value) for name, value in OUTAGE.items()}
+            for name, column in columns.items():
+                column[far] = getattr(links, name)
+            return LinkPrediction(**columns)
+
+        return found.mapped(placed), far
 
     def values(self, positions_m: Floats, area: PlacementArea, report: Progress = no_progress) -> Floats:
         """Return values (P, N) for positions (P, 3) [m]; a receiver at the transmitter has 0 dB."""

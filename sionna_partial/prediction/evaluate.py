@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from scipy.special import expit, log_softmax
+from scipy.special import erf, expit, log_softmax
 
 if TYPE_CHECKING:
     import keras
@@ -122,6 +122,7 @@ class _ArrayOps:
 
     cast = staticmethod(np.asarray)
     sigmoid = staticmethod(expit)
+    erf = staticmethod(erf)
 
     @staticmethod
     def softplus(x: Any) -> Any:

@@ -543,6 +543,14 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     return replace(phi, **{name: getattr(phi, name).reshape(links.gain_db.shape) for name in _PAPER})
 
 
+def with_path_power(phi: LinkFeatures, partial: PartialMap, links: TracedLinks) -> LinkFeatures:
+    """Return the features (T N,) of traced links with their power by walls of unknown material."""
+    sums = LinkSums(len(phi) // max(1, len(links.rx)), len(links.rx), *_limits(partial, links.trace_settings))
+    paths = SolvedPaths(*(getattr(links, field.name) for field in fields(SolvedPaths)))
+    sums.add(paths, partial.wall_classes(links.vertices_m))
+    return replace(phi, path_power=sums.path_power)
+
+
 def features_of_paths(
     partial: PartialMap,
     tx_m: Floats,
@@ -556,9 +564,7 @@ def features_of_paths(
 
     `blocks` are from `Simulation.blocks`.
     """
-    classes = partial.wall_class_count * material_unknown
-    limits = (settings[0].max_walls,) * classes + (settings[0].max_depth,) * material_unknown
-    sums = LinkSums(1, len(rx_m), *limits)
+    sums = LinkSums(1, len(rx_m), *(_limits(partial, settings[0]) if material_unknown else ()))
     indirect = IndirectPaths(partial, tx_m[None], rx_m, mean_wall_loss_db(partial, *settings))
     for paths in blocks:
         sums.add(paths, partial.wall_classes(paths.vertices_m) if material_unknown else None)
@@ -566,6 +572,11 @@ def features_of_paths(
     link_state, gain_db = sums.states_and_gains()
     phi = _features(indirect, link_state[0], gain_db[0], settings[0].frequency_hz)
     return replace(phi, path_power=sums.path_power) if material_unknown else phi
+
+
+def _limits(partial: PartialMap, settings: TraceSettings) -> tuple[int, ...]:
+    """Return the largest numbers of crossed walls of each class and of reflections."""
+    return (*(settings.max_walls,) * partial.wall_class_count, settings.max_depth)
 
 
 def _features(

@@ -50,7 +50,16 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, keras_model, pack, read_files, write_files
-from sionna_partial.prediction.unseen_walls import WALL_LOSSES, UnseenWalls, WallDensity, by_mean_losses
+from sionna_partial.prediction.unseen_walls import (
+    WALL_LOSSES,
+    DirectLines,
+    UnseenWalls,
+    WallDensity,
+    WallTrace,
+    by_mean_losses,
+    mixture,
+    over_materials,
+)
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings, TraceSettings
 
@@ -120,6 +129,9 @@ class LinkPrediction(Shown):
         Mean and standard deviation over all link states, with -150 dB for an outage [dB].
     gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
         Mean and standard deviation given LOS, and given NLOS [dB].
+    by_material : (tuple of LinkPrediction, (K,) float64 array), optional
+        For walls of unknown material, the distributions for each candidate, without the residual of gains about a
+        trace, and the probabilities of the candidates.
 
     Examples
     --------
@@ -139,29 +151,37 @@ class LinkPrediction(Shown):
     gain_nlos_mean_db: Floats
     gain_nlos_std_db: Floats
 
-    _materials: ClassVar[tuple[tuple[LinkPrediction, ...], Floats] | None] = None
+    by_material: tuple[tuple[LinkPrediction, ...], Floats] | None = None
+
+    COLUMNS: ClassVar[tuple[str, ...]]
+    """Names of the arrays."""
 
     @property
-    def by_material(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
-        """Distributions by candidate wall material, without residuals, and their probabilities (K,)."""
-        return self._materials or ((self,), np.ones(1))
+    def materials(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
+        """`by_material`, or this distribution as the only one."""
+        return self.by_material or ((self,), np.ones(1))
 
     @classmethod
     def over_materials(cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float) -> LinkPrediction:
         """Return the mixture over materials; `residual_db` is the standard deviation about the true trace."""
-        probabilities, means_db, stds_db = cls.mixture(parts, weights).by_state
-        stds_db[1:] = np.hypot(stds_db[1:], residual_db)
-        mixed = cls.of_parts(probabilities, means_db, stds_db)
-        object.__setattr__(mixed, "_materials", (tuple(parts), weights))
-        return mixed
+        mixed = cls.of_parts(*over_materials([part.by_state for part in parts], weights, residual_db))
+        return replace(mixed, by_material=(tuple(parts), weights))
 
     def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
         """Apply `change` to this distribution and to its parts by material."""
-        changed = change(self)
-        if self._materials is not None:
-            parts, weights = self._materials
-            object.__setattr__(changed, "_materials", (tuple(map(change, parts)), weights))
-        return changed
+        return self._combined([self], lambda links: change(links[0]))
+
+    @classmethod
+    def _combined(
+        cls, some: Sequence[LinkPrediction], combine: Callable[[Sequence[LinkPrediction]], LinkPrediction]
+    ) -> LinkPrediction:
+        """Combine distributions, and their parts for each material; one without parts is the same for all."""
+        whole, found = combine(some), [links.by_material for links in some if links.by_material is not None]
+        if not found:
+            return whole
+        weights = found[0][1]
+        under = [(links,) * len(weights) if links.by_material is None else links.by_material[0] for links in some]
+        return replace(whole, by_material=(tuple(combine(parts) for parts in zip(*under, strict=True)), weights))
 
     @property
     def link_state(self) -> States:
@@ -207,7 +227,7 @@ class LinkPrediction(Shown):
         cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
     ) -> LinkPrediction:
         """Predict links by the mean loss of walls; `walls` (N,) are the expected numbers of unseen walls."""
-        return cls.of_parts(*by_mean_losses(phi, walls, max_walls))
+        return cls.of_parts(*by_mean_losses(WallTrace.of(phi), walls, max_walls))
 
     @classmethod
     def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
@@ -268,39 +288,34 @@ class LinkPrediction(Shown):
     @classmethod
     def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
         """Join links."""
-        joined = cls(*(np.concatenate([getattr(part, column.name) for part in parts]) for column in fields(cls)))
-        materials = [part._materials for part in parts if part._materials is not None]
-        if len(materials) == len(parts) > 0:
-            under = tuple(map(cls.concatenate, zip(*(part for part, _ in materials), strict=True)))
-            object.__setattr__(joined, "_materials", (under, materials[0][1]))
-        return joined
+
+        def join(parts: Sequence[LinkPrediction]) -> LinkPrediction:
+            return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.COLUMNS))
+
+        return cls._combined(parts, join)
 
     @classmethod
     def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
         """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1."""
         if len(parts) == 1:
             return parts[0]
-        p_all, means_db, stds_db = (np.stack(each) for each in zip(*(part.by_state for part in parts), strict=True))
-        weights = weights.reshape(len(parts), 1, -1)
-        joint = weights * p_all
-        probabilities = joint.sum(axis=0)
-        fractions = np.where(probabilities > 0.0, joint, weights)
-        fractions = fractions / fractions.sum(axis=0)
-        mean_db = (fractions * means_db).sum(axis=0)
-        variance = (fractions * (stds_db**2 + (means_db - mean_db) ** 2)).sum(axis=0)
-        return cls.of_parts(probabilities / probabilities.sum(axis=0), mean_db, np.sqrt(variance))
+        return cls._combined(parts, lambda some: cls.of_parts(*mixture([part.by_state for part in some], weights)))
 
     def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
         """Return the links in another shape."""
         return self._by_column(lambda column: column.reshape(shape))
 
     def _by_column(self, change: Callable[[Floats], Floats]) -> LinkPrediction:
-        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, part.name)) for part in fields(links))))
+        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, name)) for name in self.COLUMNS)))
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` where a mask (N,) is True, this distribution elsewhere."""
-        columns = (column.name for column in fields(self))
-        return LinkPrediction(*(np.where(taken, getattr(other, name), getattr(self, name)) for name in columns))
+
+        def choose(links: Sequence[LinkPrediction]) -> LinkPrediction:
+            columns = ((getattr(each, name) for each in links) for name in self.COLUMNS)
+            return LinkPrediction(*(np.where(taken, there, here) for here, there in columns))
+
+        return self._combined([self, other], choose)
 
     def anywhere(self, p_indoor: ArrayLike) -> LinkPrediction:
         """Return the distribution for receivers that may be outdoors, in outage (paper, "Indoor-Outdoor Estimation").
@@ -321,10 +336,17 @@ class LinkPrediction(Shown):
         """
         indoors = link_numbers("p_indoor", p_indoor, self.p_los.shape)
         require_each((indoors >= 0.0) & (indoors <= 1.0), "p_indoor", indoors, "it lies between 0 and 1.")
-        probabilities, means_db, stds_db = self.by_state
-        probabilities = indoors * probabilities
-        probabilities[LinkState.OUTAGE] += 1.0 - indoors
-        return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        def outdoors(links: LinkPrediction) -> LinkPrediction:
+            probabilities, means_db, stds_db = links.by_state
+            probabilities = indoors * probabilities
+            probabilities[LinkState.OUTAGE] += 1.0 - indoors
+            return LinkPrediction.of_parts(probabilities, means_db, stds_db)
+
+        return self.mapped(outdoors)
+
+
+LinkPrediction.COLUMNS = tuple(field.name for field in fields(LinkPrediction) if field.name != "by_material")
 
 
 @dataclass(frozen=True, eq=False)
@@ -630,7 +652,7 @@ class OtherPredictor:
         """Predict links; raise a PredictorError for arrays that are no distribution."""
         found = self._model.predict(phi)
         if isinstance(found, LinkPrediction):
-            found = {column.name: getattr(found, column.name) for column in fields(found)}
+            found = {name: getattr(found, name) for name in LinkPrediction.COLUMNS}
         if not isinstance(found, Mapping):
             raise PredictorError(f"{self.name}.predict returned {shown(found)}: give a LinkPrediction or a mapping.")
 
@@ -683,7 +705,7 @@ class MeanLosses:
 
     def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
         """Predict the same links for several wall losses."""
-        walls = self._walls.counts(features[0])
+        walls = self._walls.counts(DirectLines.of(features[0]))
         return [LinkPrediction.of_mean_losses(phi, walls, self._max_walls) for phi in features]
 
 

@@ -10,15 +10,15 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import expit, ndtr
+from scipy.special import expit
 
-from sionna_partial.arrays import Floats
+from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
@@ -51,7 +51,10 @@ _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
 cells joined by pooling. Images are aligned to the world by such groups, so that the result does not depend on the grid.
 """
 
-_LINES_AT_ONCE = 16_384
+_LINES_AT_ONCE = 4096
+_RARE = 1e-9
+"""Probability below which means and standard deviations given a link state are those of all parts."""
+
 _MAX_BYTES = 10_000_000
 
 WALL_LOSSES = "the mean loss of unobserved walls"
@@ -88,6 +91,21 @@ number of walls [dB]; and of other links, times the root of the number of walls,
 """
 
 
+class DirectLines(NamedTuple):
+    """Direct lines of N links: ends (N, 3), unobserved and whole lengths (N,) [m], and numbers of known walls (N,)."""
+
+    tx_m: Any
+    rx_m: Any
+    unobserved_m: Any
+    distance_m: Any
+    known: Any
+
+    @classmethod
+    def of(cls, phi: LinkFeatures) -> Self:
+        context = context_of(phi)
+        return cls(context.tx_m, context.rx_m, phi.unobserved_distance_m, phi.distance_m, context.straight_walls)
+
+
 class WallDensity(NamedTuple):
     """Estimated walls of unknown cells: walls per metre (1, ny, nx, 2) along x and y, and the corner [m]."""
 
@@ -95,18 +113,19 @@ class WallDensity(NamedTuple):
     origin_m: Floats
     lines: Any
 
-    def counts(self, phi: LinkFeatures) -> Floats:
-        context = context_of(phi)
-        ends = ((end_m[:, :2] - self.origin_m) / CELL_M for end_m in (context.tx_m, context.rx_m))
-        scale = np.minimum(1.0, LONGEST_M / phi.distance_m)
-        lengths = (scale * column for column in (phi.unobserved_distance_m, phi.distance_m, context.straight_walls))
-        start, end, part, *lines = (np.asarray(column, dtype=np.float32) for column in (*ends, scale, *lengths))
-        found = np.zeros(len(phi))
-        for first in range(0, len(phi), _LINES_AT_ONCE):
-            here = slice(first, first + _LINES_AT_ONCE)
-            integral = walls_met(self.per_m, start[None, here], end[None, here])[0]
-            found[here] = corrected(self.lines, part[here] * integral, *(column[here] for column in lines))
-        return np.where(phi.unobserved_distance_m > 0.0, found / scale, 0.0)
+    def counts(self, lines: DirectLines, ops: Any = array_ops) -> Any:
+        """Return the expected number of unseen walls on each line (N,); `ops` is `array_ops`, or keras.ops."""
+        starts = range(0, max(1, len(lines.known)), _LINES_AT_ONCE)
+        parts = (DirectLines(*(column[first : first + _LINES_AT_ONCE] for column in lines)) for first in starts)
+        return ops.concatenate([self._counts(part, ops) for part in parts])
+
+    def _counts(self, lines: DirectLines, ops: Any) -> Any:
+        start, end = ((end_m[:, :2] - self.origin_m)[None] / CELL_M for end_m in (lines.tx_m, lines.rx_m))
+        scale = LONGEST_M / ops.maximum(lines.distance_m, LONGEST_M)
+        integral = scale * walls_met(self.per_m, start, end, ops)[0]
+        lengths_m = scale * lines.unobserved_m, scale * lines.distance_m
+        found = corrected(self.lines, integral, *lengths_m, scale * lines.known, ops)
+        return ops.where(lines.unobserved_m > 0.0, found / scale, 0.0)
 
 
 class UnseenWalls(NamedTuple):
@@ -126,6 +145,15 @@ class UnseenWalls(NamedTuple):
         """Return the trained networks as functions of arrays."""
         with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
             return cls(*(Network(json.loads(str(stored[name])), _numbered(stored, name)) for name in cls._fields))
+
+    @staticmethod
+    @functools.cache
+    def keras_lines() -> "keras.Model":
+        """Return the trained corrections of lines as a Keras model, for derivatives."""
+        model = UnseenWalls.untrained().lines
+        with np.load(io.BytesIO(shipped_bytes(WEIGHTS_FILE, _MAX_BYTES)), allow_pickle=False) as stored:
+            model.set_weights([*itertools.islice(_numbered(stored, "lines"), len(model.weights))])
+        return model
 
     def save(self, path: Path) -> None:
         """Write the configuration and the weights of trained Keras models."""
@@ -204,73 +232,127 @@ def walls_per_m(cells: Any, images: Any, ops: Any = array_ops, *, training: bool
 
 
 def walls_met(per_m: Any, start: Any, end: Any, ops: Any = array_ops) -> Any:
-    """Integrate walls per metre (B, ny, nx, 2) over lines (B, R) from `start` to `end` (B, R, 2) [cells]."""
-    (images, ny, nx, _), receivers = per_m.shape, start.shape[1]
-    at = ((np.arange(_POINTS) + 0.5) / _POINTS).astype(np.float32)
-    points = start[..., None, :] + (end - start)[..., None, :] * at[:, None]
-    column, row = (
-        ops.clip(ops.cast(ops.floor(points[..., axis]), "int32"), 0, count - 1) for axis, count in enumerate((nx, ny))
-    )
-    cells = ops.reshape(row * nx + column, (images, -1)) + ny * nx * np.arange(images, dtype=np.int32)[:, None]
-    values = ops.take(ops.reshape(per_m, (-1, 2)), ops.reshape(cells, (images, receivers, _POINTS)), axis=0)
-    return ops.sum(ops.sum(values, axis=2) * ops.abs(end - start) * (CELL_M / _POINTS), axis=-1)
+    """Integrate walls per metre (B, ny, nx, 2) over lines (B, R) from `start` to `end` (B, R, 2) [cells].
+
+    Walls per metre are bilinear between the centres of cells, so that integrals have derivatives by the ends.
+    """
+    batch, ny, nx, _ = per_m.shape
+    at = ops.cast((np.arange(_POINTS) + 0.5) / _POINTS, start.dtype)
+    points = start[:, :, None] + (end - start)[:, :, None] * at[:, None] - 0.5
+    within = [ops.clip(points[..., axis], 0.0, count - 1.0) for axis, count in enumerate((nx, ny))]
+    first = [ops.minimum(ops.floor(x), count - 2.0) for x, count in zip(within, (nx, ny), strict=True)]
+    right, up = (ops.stack([1.0 - (x - low), x - low], axis=-1) for x, low in zip(within, first, strict=True))
+    column, row = (ops.cast(low, "int64") for low in first)
+    corners = [per_m[:, above : ny - 1 + above, aside : nx - 1 + aside] for above in (0, 1) for aside in (0, 1)]
+    patches = ops.reshape(ops.stack(corners, axis=-2), (-1, 2, 2, 2))
+    index = (np.arange(batch)[:, None, None] * (ny - 1) + row) * (nx - 1) + column
+    values = ops.cast(ops.take(patches, index, axis=0), start.dtype)
+    weights = up[..., None] * right[..., None, :] / _POINTS
+    return ops.sum(ops.sum(weights[..., None] * values, axis=(2, 3, 4)) * ops.abs(end - start), axis=-1) * CELL_M
 
 
 def corrected(lines: Any, integral: Any, unobserved_m: Any, distance_m: Any, known: Any, ops: Any = array_ops) -> Any:
     lengths = (ops.log(1.0 + each_m / _LENGTH_M) for each_m in (unobserved_m, distance_m))
-    share, none = unobserved_m / (distance_m + 0.1), ops.cast(known == 0.0, "float32")
+    share, none = unobserved_m / (distance_m + 0.1), ops.cast(known == 0.0, integral.dtype)
     inputs = ops.stack([ops.log(integral + 0.02), *lengths, ops.log(1.0 + known), share, none], axis=-1)
-    outputs = ops.reshape(lines(ops.reshape(inputs, (-1, _LINE_INPUTS))), (*integral.shape, 2))
+    outputs = lines(ops.cast(ops.reshape(inputs, (-1, _LINE_INPUTS)), "float32"))
+    outputs = ops.cast(ops.reshape(outputs, (*integral.shape, 2)), integral.dtype)
     return integral * ops.exp(outputs[..., 0]) + ops.softplus(outputs[..., 1] + _LEAST)
 
 
-def count_probabilities(walls: Floats) -> Floats:
+def count_probabilities(walls: Any, ops: Any = array_ops) -> Any:
     """Return the negative binomial probabilities (K, N) of 0, 1, ... and K - 1 or more walls, given the mean (N,)."""
     count, failures = np.arange(MOST_COUNTED)[:, None], 1.0 / DISPERSION
     ratios = (count + failures) / (count + 1.0) * (walls / (walls + failures))
     none = (1.0 + DISPERSION * walls) ** -failures
-    probabilities = none * np.concatenate([np.ones((1, len(walls))), np.cumprod(ratios, axis=0)])
-    probabilities[-1] = np.maximum(1.0 - probabilities[:-1].sum(axis=0), 0.0)
-    return probabilities
+    probabilities = none * ops.concatenate([ops.ones_like(ratios[:1]), ops.cumprod(ratios, axis=0)])
+    most = ops.maximum(1.0 - ops.sum(probabilities[:-1], axis=0, keepdims=True), 0.0)
+    return ops.concatenate([probabilities[:-1], most])
+
+
+class WallTrace(NamedTuple):
+    """Traced links through walls of one material: state, gain and loss of a wall [dB], known walls on the line (N,)."""
+
+    link_state: States
+    gain_db: Any
+    wall_loss_db: Any
+    known: Floats
+
+    @classmethod
+    def of(cls, phi: LinkFeatures) -> Self:
+        context = context_of(phi)
+        return cls(phi.link_state, phi.gain_db, context.wall_loss_db, context.straight_walls)
+
+
+Parts = tuple[Any, Any, Any]
+"""Probabilities, means and standard deviations of the gain [dB] by LinkState, each (3, N)."""
 
 
 def by_mean_losses(
-    phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
-) -> tuple[Floats, Floats, Floats]:
-    """Return probabilities, means and standard deviations of the gain [dB] of links through walls, each (3, N).
+    trace: WallTrace, walls: Any, max_walls: int = TraceSettings.max_walls, ops: Any = array_ops
+) -> Parts:
+    """Return the distributions of links through walls; `walls` (N,) are the expected unseen walls on the direct lines.
 
-    `walls` (N,) are the expected numbers of unseen walls on the direct lines.
+    `ops` is `array_ops`, or keras.ops for tensors.
     """
-    blocks = [slice(first, first + _LINES_AT_ONCE) for first in range(0, max(1, len(walls)), _LINES_AT_ONCE)]
-    found = [_by_mean_losses(phi.take(block), walls[block], max_walls) for block in blocks]
-    probabilities, means_db, stds_db = (np.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
+    starts = range(0, max(1, len(trace.known)), _LINES_AT_ONCE)
+    blocks = [slice(first, first + _LINES_AT_ONCE) for first in starts]
+    found = [_by_mean_losses(WallTrace(*(each[at] for each in trace)), walls[at], max_walls, ops) for at in blocks]
+    probabilities, means_db, stds_db = (ops.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
     return probabilities, means_db, stds_db
 
 
-def _by_mean_losses(phi: LinkFeatures, walls: Floats, max_walls: int) -> tuple[Floats, Floats, Floats]:
-    context, los = context_of(phi), phi.link_state == LinkState.LOS
-    probabilities = count_probabilities(walls)
-    count = np.arange(len(probabilities))[:, None]
-    loss_db = LOSS_OF_WALL * context.wall_loss_db * np.maximum(count - np.where(los, 0.0, FOUND_WALLS), 0.0)
+def _by_mean_losses(trace: WallTrace, walls: Any, max_walls: int, ops: Any) -> Parts:
+    los, reached = trace.link_state == LinkState.LOS, trace.gain_db > GAIN_FLOOR_DB
+    probabilities = count_probabilities(walls, ops)
+    count = np.arange(float(len(probabilities)))[:, None]
+    loss_db = LOSS_OF_WALL * trace.wall_loss_db * np.maximum(count - np.where(los, 0.0, FOUND_WALLS), 0.0)
     near = 1.0 / (1.0 + loss_db / LARGEST_LOSS_DB)
-    gain_db = phi.gain_db - loss_db * near
-    std_db = np.hypot(SEEN_STD_DB, UNSEEN_STD * context.wall_loss_db * np.sqrt(count) * near**2)
-    ratio = (context.straight_walls + count) / max_walls
+    gain_db = trace.gain_db - loss_db * near
+    std_db = ops.sqrt(SEEN_STD_DB**2 + (UNSEEN_STD * trace.wall_loss_db * near**2) ** 2 * count)
+    ratio = (trace.known + count) / max_walls
     around = np.where(ratio > 1.0, expit((AROUND_RATIO - ratio) / AROUND_SPREAD), 1.0)
-    around *= ndtr((gain_db - GAIN_FLOOR_DB) / std_db)
-    linked = np.where(count == 0, 1.0, around) * (phi.gain_db > GAIN_FLOOR_DB)
-    p_los = np.where(los, probabilities[0], 0.0)
-    joint = probabilities * linked * ((count > 0) | ~los)
-    p_nlos = joint.sum(axis=0)
-    weights = joint + np.finfo(float).tiny * (count == 1)
-    weights /= weights.sum(axis=0)
-    gain_db = np.maximum(gain_db, GAIN_FLOOR_DB)
-    mean_db = (weights * gain_db).sum(axis=0)
-    variance = (weights * (std_db**2 + (gain_db - mean_db) ** 2)).sum(axis=0)
-    nothing, root = np.zeros(len(walls)), np.sqrt(walls)
-    los_db = np.minimum(phi.gain_db + LOS_GAIN_DB * root, 0.0)
+    around = around * (0.5 + 0.5 * ops.erf((gain_db - GAIN_FLOOR_DB) / (math.sqrt(2.0) * std_db)))
+    linked = ops.where((count == 0) & reached, 1.0, ops.where(reached, around, 0.0))
+    p_los = ops.where(los, probabilities[0], 0.0)
+    joint = ops.where((count > 0) | ~los, probabilities * linked, 0.0)
+    p_nlos = ops.sum(joint, axis=0)
+    weights = joint + _RARE * (count == 1)
+    weights = weights / ops.sum(weights, axis=0)
+    gain_db = ops.maximum(gain_db, GAIN_FLOOR_DB)
+    mean_db = ops.sum(weights * gain_db, axis=0)
+    variance = ops.sum(weights * (std_db**2 + (gain_db - mean_db) ** 2), axis=0)
+    nothing, some = ops.zeros_like(walls), walls > 0.0
+    root = ops.where(some, ops.sqrt(ops.where(some, walls, 1.0)), 0.0)
+    los_db = ops.minimum(trace.gain_db + LOS_GAIN_DB * root, 0.0)
     return (
-        np.stack([np.maximum(1.0 - p_los - p_nlos, 0.0), p_los, p_nlos]),
-        np.stack([nothing + GAIN_FLOOR_DB, los_db, mean_db]),
-        np.stack([nothing, np.hypot(SEEN_STD_DB, LOS_STD_DB * root), np.sqrt(variance)]),
+        ops.stack([ops.maximum(1.0 - p_los - p_nlos, 0.0), p_los, p_nlos]),
+        ops.stack([nothing + GAIN_FLOOR_DB, los_db, mean_db]),
+        ops.stack([nothing, ops.sqrt(SEEN_STD_DB**2 + LOS_STD_DB**2 * walls), ops.sqrt(variance)]),
     )
+
+
+def mixture(parts: Sequence[Parts], weights: Any, ops: Any = array_ops) -> Parts:
+    """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1.
+
+    `ops` is `array_ops`, or keras.ops for tensors.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    p_all, means_db, stds_db = (ops.stack(each) for each in zip(*parts, strict=True))
+    weights = ops.reshape(weights, (len(parts), 1, -1))
+    probabilities = ops.sum(weights * p_all, axis=0)
+    fractions = weights * (p_all + _RARE)  # states that no part allows have the mean of all
+    fractions = fractions / ops.sum(fractions, axis=0)
+    mean_db = ops.sum(fractions * means_db, axis=0)
+    variance = ops.sum(fractions * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
+    spread = variance > 0.0
+    std_db = ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0)
+    return probabilities / ops.sum(probabilities, axis=0), mean_db, std_db
+
+
+def over_materials(parts: Sequence[Parts], prior: Any, residual_db: float, ops: Any = array_ops) -> Parts:
+    """Return the mixture over wall materials; `residual_db` is the standard deviation about the true trace."""
+    probabilities, means_db, stds_db = mixture(parts, prior, ops)
+    has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
+    return probabilities, means_db, ops.where(has_path, ops.sqrt(stds_db**2 + residual_db**2), 0.0)

@@ -316,18 +316,32 @@ def write_mesh_scene(
     return _write_xml(scene, folder)
 
 
-def constants_of(material: Material, frequency_hz: float) -> tuple[float, float]:
-    """Return relative permittivity and conductivity [S/m] at a frequency (ITU-R P.2040-3, eq. 28 and 29)."""
+class PowerLaw(NamedTuple):
+    """A constant of a material near one frequency: ``value * (frequency ratio) ** exponent``."""
+
+    value: float
+    exponent: float
+
+
+def power_laws(material: Material, frequency_hz: float) -> tuple[PowerLaw, PowerLaw]:
+    """Return relative permittivity and conductivity [S/m] around a frequency (ITU-R P.2040-3, eq. 28 and 29)."""
     if material.itu is None:
         grown = (frequency_hz / CARRIER_FREQUENCY_HZ) ** material.conductivity_exponent
-        return material.relative_permittivity, material.conductivity_s_m * grown
+        conductivity = PowerLaw(material.conductivity_s_m * grown, material.conductivity_exponent)
+        return PowerLaw(material.relative_permittivity, 0.0), conductivity
     load_llvm()
     from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
     frequency_ghz = frequency_hz / 1e9
     bands = ITU_MATERIALS_PROPERTIES[material.itu].items()
     a, b, c, d = next(factors for (low, high), factors in bands if low <= frequency_ghz <= high)
-    return a * frequency_ghz**b, c * frequency_ghz**d
+    return PowerLaw(a * frequency_ghz**b, b), PowerLaw(c * frequency_ghz**d, d)
+
+
+def constants_of(material: Material, frequency_hz: float) -> tuple[float, float]:
+    """Return relative permittivity and conductivity [S/m] at a frequency."""
+    permittivity, conductivity = power_laws(material, frequency_hz)
+    return permittivity.value, conductivity.value
 
 
 def _new_scene(folder: Path) -> ET.Element:

@@ -137,6 +137,11 @@ class Antennas:
     def __len__(self) -> int:
         return len(self.patterns) * len(self.positions_m)
 
+    @property
+    def of_each_antenna_m(self) -> Floats:
+        """Positions [m] of each antenna, all of the first polarisation first."""
+        return np.tile(self.positions_m, (len(self.patterns), 1))
+
     def rotations(self, end: NDArray[np.integer[Any]]) -> Floats:
         """Return (P, 3, 3) for the ends (P,) of paths, or (1, 3, 3) if all are the same."""
         return self.rotation if len(self.rotation) == 1 else self.rotation[end]

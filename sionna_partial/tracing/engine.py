@@ -7,7 +7,7 @@ is avoided. Symbolic loops are fastest, but Dr.Jit differentiates evaluated loop
 import functools
 import gc
 import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -23,7 +23,8 @@ from sionna_partial.arrays import Floats, Indices
 from sionna_partial.errors import BackendError
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import signals_held
-from sionna_partial.settings import TraceSettings
+from sionna_partial.scene.scene import PowerLaw, power_laws
+from sionna_partial.settings import Material, TraceSettings
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
 
 MITSUBA_VARIANT = "llvm_ad_mono_polarized"
@@ -89,6 +90,18 @@ def set_antennas(scene: Any, polarisations: int) -> None:
     array = load_sionna().PlanarArray
     polarization = "V" if polarisations == 1 else "VH"
     scene.tx_array = scene.rx_array = array(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+
+
+def _follow_frequency(scene: Any, materials: Mapping[str, Material], frequency_hz: float) -> None:
+    """Give materials that Sionna RT does not load by an ITU name their dependence on frequency."""
+
+    def update(laws: Sequence[PowerLaw], at_hz: Any) -> tuple[Any, ...]:
+        return tuple(law.value * (at_hz / frequency_hz) ** law.exponent for law in laws)
+
+    for name, material in scene.radio_materials.items():
+        laws = power_laws(materials[name], frequency_hz) if name in materials else ()
+        if material.frequency_update_callback is None and any(law.exponent for law in laws):
+            material.frequency_update_callback = functools.partial(update, laws)
 
 
 class _IncoherentScene:
@@ -213,7 +226,7 @@ class Variables:
 
     `shift_m` is added to x, y, z of the transmitters, each with 1 or T entries [m], `frequency_hz` to the carrier
     frequency. The others are values for each of `SceneSolver.materials`, not changes, which would drown in a metal's
-    conductivity; ITU materials add their change with the frequency.
+    conductivity; they are multiplied by the materials' change with the frequency.
     """
 
     shift_m: tuple[Any, ...]
@@ -237,14 +250,22 @@ class HeldPaths:
 class SceneSolver:
     """Solver of candidates in one exported scene, with vertical antennas except after `polarised`.
 
-    `shapes` are names in face order; shapes that the scene lacks have no faces.
+    `shapes` are names in face order; shapes that the scene lacks have no faces. `materials`, by their names in the
+    scene, follow the frequency.
     """
 
-    def __init__(self, scene_xml: Path, shapes: tuple[str, ...], settings: TraceSettings) -> None:
+    def __init__(
+        self,
+        scene_xml: Path,
+        shapes: tuple[str, ...],
+        settings: TraceSettings,
+        materials: Mapping[str, Material] | None = None,
+    ) -> None:
         load_sionna()
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
 
         self._scene = open_scene(scene_xml, settings.frequency_hz)
+        _follow_frequency(self._scene, materials or {}, settings.frequency_hz)
         self._field = settings.samples_per_tx, self._scene.tx_array.antenna_pattern.patterns
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
@@ -368,15 +389,18 @@ class SceneSolver:
 
     @contextmanager
     def _changed(self, variables: Variables) -> Iterator[None]:
+        import drjit as dr
+
         materials = self._scene.radio_materials.values()
         kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
         frequency = self._scene.frequency
         try:
-            self._scene.frequency = frequency + variables.frequency_hz  # ITU materials follow
+            self._scene.frequency = frequency + variables.frequency_hz  # materials follow
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
             for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
-                material.relative_permittivity = new[0] + (material.relative_permittivity - permittivity)
-                material.conductivity = new[1] + (material.conductivity - conductivity)
+                material.relative_permittivity = new[0] * (material.relative_permittivity / permittivity)
+                grown = dr.select(conductivity > 0.0, material.conductivity / dr.maximum(conductivity, 1e-30), 1.0)
+                material.conductivity = new[1] * grown
                 material.thickness = new[2]
             yield
         finally:

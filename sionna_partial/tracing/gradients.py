@@ -52,8 +52,7 @@ class GainGradients(Shown):
     thickness_db_per_m : (N,) float64 array
         With respect to their thickness [dB/m].
     frequency_db_per_hz : (N,) float64 array
-        With respect to the carrier frequency [dB/Hz]. ITU materials follow it, except `vacuum`, which Sionna RT does
-        not load by name.
+        With respect to the carrier frequency [dB/Hz], which the constants of materials follow.
     trace_settings : TraceSettings
     scene_settings : SceneSettings
 

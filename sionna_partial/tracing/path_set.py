@@ -37,8 +37,8 @@ class PathParameters(Shown):
     tx_m : (3,) or (T, 3) float64 array
         Transmitter positions [m].
     relative_permittivity, conductivity_s_m, thickness_m : (M,) float64 arrays
-        Real relative permittivity, conductivity [S/m] and thickness [m] of each material. ITU materials also follow
-        the frequency.
+        Real relative permittivity, conductivity [S/m] and thickness [m] of each material at the traced frequency; the
+        first two follow the frequency.
     frequency_hz : () float64 array
         Carrier frequency [Hz].
     """

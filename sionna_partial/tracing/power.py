@@ -100,9 +100,13 @@ def transmission_coefficients(
 
 def wall_loss_db(material: Material, frequency_hz: float) -> float:
     """Return the transmission loss [dB] of a wall, averaged over angles of incidence up to 60 degrees."""
-    permittivity, conductivity_s_m = constants_of(material, frequency_hz)
+    return mean_loss_db(*constants_of(material, frequency_hz), material.thickness_m, frequency_hz)
+
+
+def mean_loss_db(permittivity: float, conductivity_s_m: float, thickness_m: float, frequency_hz: float) -> float:
+    """Return the loss of `wall_loss_db` for a slab [dB]."""
     cosine = np.cos(np.radians(_ANGLES_DEG))
-    te, _ = transmission_coefficients(permittivity, conductivity_s_m, material.thickness_m, frequency_hz, cosine)
+    te, _ = transmission_coefficients(permittivity, conductivity_s_m, thickness_m, frequency_hz, cosine)
     return float(np.mean(np.minimum(-20.0 * np.log10(np.maximum(np.abs(te), 1e-8)), MOST_LOSS_DB)))
 
 

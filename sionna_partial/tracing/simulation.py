@@ -313,7 +313,8 @@ class Simulation:
             scene = write_scene_of(self.partial, folder, settings, scene_settings, draw)
             if self._only_by_rays or engine_fault():
                 return RayFinder(scene)
-            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, settings))
+            materials = self.partial.environment.scene_materials(scene_settings.traced_material)
+            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, settings, materials))
 
     def _groups(
         self,
