@@ -8,7 +8,7 @@ gradients:
   missing; one that becomes invalid loses its power in a step, which has no derivative.
 - When the transmitter moves, lengths in unknown cells and in walls are the traced lengths times the ratio of
   `SmoothLengths`, as exact lengths have derivatives that jump; a length of 0 remains 0.
-- The outputs of the map networks are linear between positions 15 cm to each side of the transmitter.
+- Map features, exposure and routes are bilinear between cells of 0.3 m.
 - On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
 
@@ -27,20 +27,19 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import Progress, require
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
-    MAP_NETWORKS,
-    distribution,
+    MAP_NETWORK,
+    expert_parts,
     feature_values,
+    line_points_m,
     link_inputs,
-    read_links,
-    read_maps,
-    reads_maps,
+    link_outputs,
 )
 from sionna_partial.prediction.paper_networks import (
     GAIN_INPUTS,
@@ -53,24 +52,21 @@ from sionna_partial.prediction.paper_networks import (
     tf,
 )
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.rule import GATE_NETWORK, Parts, doubt, over_materials, predicted, traced_parts
+from sionna_partial.prediction.space import MapSpace
 from sionna_partial.prediction.unobserved import (
-    CELLS_M,
     Segment,
     enter_grid,
-    is_enclosed,
     leave_cells,
     lengths_in_unknown_m,
-    map_windows,
     segment_between,
 )
 from sionna_partial.prediction.unseen_walls import (
     DirectLines,
-    Parts,
     UnseenWalls,
     WallDensity,
     WallTrace,
     by_mean_losses,
-    over_materials,
 )
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.process import njit
@@ -84,8 +80,6 @@ from sionna_partial.tracing.simulation import Simulation
 
 _BORDER_CELLS = 1e-6
 """Distance from a border of patches at which a segment runs along it [cells]."""
-
-WINDOW_STEP_M = CELLS_M[0] / 2
 
 STEEPEST = 4.0
 """Largest ratio of the growth of a length and its smooth surrogate, for lines that touch a corner."""
@@ -325,7 +319,7 @@ class DifferentiableScene:
         """Variables of the networks; none where mean losses predict."""
         if self.model.by_mean_losses:
             return []
-        names = [name for name in (*MAP_NETWORKS, LINK_NETWORK) if name in self.networks]
+        names = [name for name in (MAP_NETWORK, LINK_NETWORK, GATE_NETWORK) if name in self.networks]
         names = names or [*STATE_NETWORKS.values(), *(row.name for row in GAIN_NETWORKS)]
         return [weight.value for name in names for weight in self.networks[name].trainable_variables]
 
@@ -388,7 +382,6 @@ class DifferentiableLinks:
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
         self._phi = scene.model.features(paths.base.tx_m, paths.rx_m)
-        self._complete = is_enclosed(scene.partial, np.broadcast_to(paths.base.tx_m, paths.rx_m.shape), paths.rx_m)
 
     def __call__(
         self,
@@ -421,16 +414,9 @@ class DifferentiableLinks:
         moved = moved_paths(self._paths, given)
         through_walls = self._scene.simulation.trace_settings.through_walls
         traces, prior = self._traces(moved[0], given)
-        found = [self._of_trace(trace) for trace in traces]
-        if not self._complete.all():
-            if self._scene.model.by_mean_losses:
-                predicted = self._by_mean_losses(traces, given)
-            else:
-                predicted = [self._by_networks(given, *moved)] * len(traces)
-            found = [
-                tuple(tf.where(self._complete, *both) for both in zip(*each, strict=True))
-                for each in zip(found, predicted, strict=True)
-            ]
+        found = [traced_parts(trace.link_state, trace.gain_db, ops) for trace in traces]
+        if doubt(feature_values(self._phi)).any():
+            found = self._by_rule(traces, given, *moved)
         distribution = over_materials(found, prior, RESIDUAL_DB, ops) if through_walls else found[0]
         return LinkDistribution.of_parts(*distribution, ops=ops)
 
@@ -485,10 +471,22 @@ class DifferentiableLinks:
         changed_db = tf.maximum(gain_db + (now_db - first_db), GAIN_FLOOR_DB)
         return tf.where(gain_db > GAIN_FLOOR_DB, changed_db, GAIN_FLOOR_DB)
 
-    @staticmethod
-    def _of_trace(trace: WallTrace) -> Parts:
-        states = tf.cast([trace.link_state == state for state in LinkState], tf.float64)
-        return states, tf.stack([trace.gain_db] * len(LinkState)), tf.zeros_like(states)
+    def _by_rule(
+        self, traces: Sequence[WallTrace], given: Mapping[str, Any], power: Any, vertices_m: Any
+    ) -> list[Parts]:
+        """Return the prediction under each candidate for the material of walls (`LinkModel.predict_features`)."""
+        ops, tx_m, scene = import_keras().ops, given.get("tx_m"), self._scene
+        values = self._moved_features(tx_m, self._changed_db(self._phi.gain_db, power, self._paths.power))
+        values |= self._indirect_features(values["distance_m"], tx_m, power, vertices_m)
+        if scene.model.by_mean_losses:
+            experts = self._by_mean_losses(traces, given)
+        else:
+            values["free_db"], expert = self._by_networks(values, given)
+            if LINK_NETWORK in scene.networks:
+                return [predicted(values, expert, _doubled(scene.networks[GATE_NETWORK]), ops)] * len(traces)
+            experts = [expert] * len(traces)
+        under = [{"gain_db": trace.gain_db, "link_state": trace.link_state} for trace in traces]
+        return [predicted(values | own, expert, ops=ops) for own, expert in zip(under, experts, strict=True)]
 
     def _by_mean_losses(self, traces: Sequence[WallTrace], given: Mapping[str, Any]) -> list[Parts]:
         ops, scene, rx_m, tx_m = import_keras().ops, self._scene, self._paths.rx_m, given.get("tx_m")
@@ -498,16 +496,29 @@ class DifferentiableLinks:
         walls = scene._walls.counts(DirectLines(*ends_m, *lengths_m, traces[0].known), ops)
         return [by_mean_losses(trace, walls, scene.simulation.trace_settings.max_walls, ops) for trace in traces]
 
-    def _by_networks(self, given: Mapping[str, Any], power: Any, vertices_m: Any) -> Parts:
+    def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:
+        """Return the free-space gain (N,) [dB], and the distribution of the networks."""
+        ops, networks, context = import_keras().ops, self._scene.networks, self._phi.context
         tx_m, frequency_hz = given.get("tx_m"), self._scene.predictor.settings.frequency_hz
-        numeric = self._moved_features(tx_m, self._changed_db(self._phi.gain_db, power, self._paths.power))
         carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
         shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / frequency_hz)
-        if LINK_NETWORK in self._scene.networks:
-            numeric |= self._indirect_features(numeric["distance_m"], tx_m, power, vertices_m)
-            return self._by_context(tx_m, numeric, shift_db)
-        inputs = {name: numeric[name][:, None] for name in GAIN_INPUTS}
-        return distribution_by_paper(self._scene.networks, inputs, self._phi.link_state, shift_db, import_keras().ops)
+        free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops) - shift_db
+        if LINK_NETWORK not in networks:
+            inputs = {name: values[name][:, None] for name in GAIN_INPUTS}
+            return free_db, distribution_by_paper(networks, inputs, self._phi.link_state, shift_db, ops)
+        inputs, points = tf.cast(link_inputs(values, frequency_hz, shift_db, ops), tf.float32), None
+        if self._map_features is not None:
+            ends_m = self.base.tx_m if tx_m is None else tx_m, self._paths.rx_m
+            ends_m = tuple(tf.broadcast_to(end_m, self._paths.rx_m.shape) for end_m in ends_m)
+            points = MapSpace.of(self._scene.partial).read(self._map_features, line_points_m(*ends_m), ops)
+        outputs = tf.cast(link_outputs(networks, inputs, points, ops), tf.float64)
+        return free_db, expert_parts(outputs, free_db, context_of(self._phi).possible, ops)
+
+    @cached_property
+    def _map_features(self) -> Any:
+        """Features (H, W, F) of the map, or None."""
+        networks, image = self._scene.networks, MapSpace.of(self._scene.partial).image
+        return networks[MAP_NETWORK](image[None])[0] if MAP_NETWORK in networks else None
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""
@@ -518,7 +529,12 @@ class DifferentiableLinks:
         scene, base = self._scene, (first, self._paths.rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
         unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
+        ops, space, base_m = import_keras().ops, MapSpace.of(scene.partial), self.base.tx_m
+        exposed = space.exposure_at(tx_m[None], ops) - space.exposure_at(base_m[None])
         return numeric | {
+            "exposure": numeric["exposure"] + exposed[:, None] * np.array([1.0, 0.0]),
+            "route": numeric["route"]
+            + (space.routes(tx_m, self._paths.rx_m, ops) - space.routes(base_m, self._paths.rx_m)),
             "distance_m": distance_m,
             "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
             "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
@@ -541,32 +557,6 @@ class DifferentiableLinks:
             grown_m = tf.gather(grown_m, np.maximum(legs.strongest, 0))
             strongest_m = strongest_m + tf.where(legs.strongest >= 0, grown_m, distance_m - self._phi.distance_m)
         return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
-
-    def _by_context(self, tx_m: Any, numeric: dict[str, Any], shift_db: Any) -> tuple[Any, Any, Any]:
-        ops, frequency_hz = import_keras().ops, self._scene.predictor.settings.frequency_hz
-        columns = link_inputs(numeric, frequency_hz, shift_db, ops)
-        offsets_m = tf.constant(self._paths.rx_m) - (self.base.tx_m if tx_m is None else tx_m)
-        columns, offsets_m = (tf.cast(each, tf.float32)[None] for each in (columns, offsets_m[:, :2]))
-        outputs = read_links(self._scene.networks, self._maps(tx_m), columns, offsets_m, ops)
-        free_db = free_space_gain_db(numeric["distance_m"], frequency_hz, ops) - shift_db
-        return distribution(tf.cast(outputs[0], tf.float64), free_db, context_of(self._phi), ops)
-
-    def _maps(self, tx_m: Any) -> list[Any]:
-        """Return the outputs (1, ...) of the map networks, linear around the traced transmitter."""
-        networks = self._scene.networks
-        if not reads_maps(networks):
-            return []
-        windows = self._windows[:1] if tx_m is None else self._windows
-        maps = read_maps(networks, windows, import_keras().ops)
-        if tx_m is None:
-            return maps
-        steps = tf.cast(tx_m - self.base.tx_m, tf.float32)[:2] / (2.0 * WINDOW_STEP_M)
-        return [each[:1] + steps[0] * (each[1:2] - each[2:3]) + steps[1] * (each[3:4] - each[4:5]) for each in maps]
-
-    @cached_property
-    def _windows(self) -> NDArray[np.float32]:
-        steps_m = WINDOW_STEP_M * np.array([[0, 0], [1, 0], [-1, 0], [0, 1], [0, -1]])
-        return map_windows(self._scene.partial, self.base.tx_m[:2] + steps_m).astype(np.float32)
 
 
 class _Legs:
@@ -602,6 +592,11 @@ class _Legs:
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
         moved_m = moved_lengths_m(lengths, self._exact_m, self._base, ends)
         return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
+
+
+def _doubled(network: Any) -> Any:
+    """Return a network that takes and returns double precision."""
+    return lambda inputs: tf.cast(network(tf.cast(inputs, tf.float32)), tf.float64)
 
 
 def _gain_db(power: Any) -> Any:

@@ -445,7 +445,7 @@ def evaluate(
         for index, (name, stage) in enumerate(parts):
             report(index / len(parts), f"measuring on {name} homes at {stage_name(stage)}")
             part = links.take(np.isin(links.home, homes[name]) & (links.stage == stage))
-            prediction = model.predict(part.phi if model.reads_maps else part.features)
+            prediction = model.predict(part.features)
             for receivers in ("indoor", "anywhere"):
                 drawn = part.anywhere == (receivers == "anywhere")
                 if not drawn.any():

@@ -12,14 +12,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.prediction.features import LinkFeatures, features_of_paths
+from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths
+from sionna_partial.prediction.map_networks import feature_values
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import (
     AnyPredictor,
@@ -29,7 +30,7 @@ from sionna_partial.prediction.predictor import (
     Predictor,
     warm_predictor,
 )
-from sionna_partial.prediction.unobserved import is_enclosed, map_windows
+from sionna_partial.prediction.rule import doubt
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
@@ -37,7 +38,7 @@ from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
 
 KEPT_BLOCKS = 8
-"""Number of cached blocks of links, and of windows of transmitters."""
+"""Number of cached blocks of links."""
 
 _LEAST_DEPTH = 2
 """Smallest `max_depth` for which the networks were trained."""
@@ -114,7 +115,6 @@ class LinkModel:
         self.simulation = simulation_of(scene, trace_settings, scene_settings)
         self.asked = predictor
         self._latest: dict[tuple[bytes, bytes, Antenna, bool], PredictedLinks] = {}
-        self._windows: dict[bytes, NDArray[np.uint8]] = {}
         if predictor is not None:
             warm_predictor(predictor)
 
@@ -164,7 +164,6 @@ class LinkModel:
             for of_map in ("_every_path", "predictor"):
                 self.__dict__.pop(of_map, None)
             self._latest.clear()
-            self._windows.clear()
 
     @cached_property
     def _every_path(self) -> Simulation:
@@ -218,29 +217,16 @@ class LinkModel:
     def _predict_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        complete = np.concatenate([self._complete(*link_m) for link_m in ends_m])
-        settings, found = None if complete.all() else self.predictor.settings, []
-        context = not complete.all() and (settings is None or settings.networks != "paper")
-        for (tx_m, rx_m), paths in zip(ends_m, found_paths, strict=True):
-            windows = self._windows_around(tx_m) if context else None
-            ends, unknown = (tx_m, rx_m), self.simulation.material_unknown
-            found.append(
-                features_of_paths(
-                    self.partial, *ends, paths, self.simulation.resolved, windows, material_unknown=unknown
-                )
-            )
+        settings, unknown = self.simulation.resolved, self.simulation.material_unknown
+        found = [
+            features_of_paths(self.partial, *link_m, paths, settings, material_unknown=unknown)
+            for link_m, paths in zip(ends_m, found_paths, strict=True)
+        ]
         phi = LinkFeatures.concatenate(found)
-        return phi, self.predict_features(phi, complete), complete
+        return phi, self.predict_features(phi), context_of(phi).complete
 
-    def _windows_around(self, tx_m: Floats) -> NDArray[np.uint8]:
-        key = tx_m.tobytes()
-        if key not in self._windows:
-            self._windows[key] = map_windows(self.partial, tx_m[None, :2])
-            _drop_oldest(self._windows)
-        return self._windows[key]
-
-    def predict_features(self, phi: LinkFeatures, complete: Bools) -> LinkPrediction:
-        """Predict links from their features; complete links keep their trace.
+    def predict_features(self, phi: LinkFeatures) -> LinkPrediction:
+        """Predict links from their features (`rule.predicted`).
 
         For an unknown material of walls, the result is the mixture over its candidates.
         """
@@ -248,23 +234,25 @@ class LinkModel:
         if phi.path_power is not None:
             features = self.wall_materials.under(phi, self.partial.unnamed_walls)
             prior = self.wall_materials.prior
-        parts = self._predict_under(features, complete, phi)
+        parts = self._predict_under(features, phi)
         if not self.simulation.trace_settings.through_walls:
             return parts[0]
         return LinkPrediction.over_materials(parts, prior, RESIDUAL_DB)
 
-    def _predict_under(
-        self, features: Sequence[LinkFeatures], complete: Bools, traced: LinkFeatures
-    ) -> list[LinkPrediction]:
-        """Predict links under each candidate; networks use the traced features."""
-        traces = [LinkPrediction.of_trace(phi) for phi in features]
-        if complete.all():
-            return traces
+    def _predict_under(self, features: Sequence[LinkFeatures], traced: LinkFeatures) -> list[LinkPrediction]:
+        """Predict links under each candidate; networks use the traced features.
+
+        Networks are not loaded where the trace is certain.
+        """
+        if not doubt(feature_values(traced)).any():
+            return [LinkPrediction.of_trace(phi) for phi in features]
         if isinstance(self.predictor, MeanLosses):
-            predicted = self.predictor.predict_each(features)
+            experts = self.predictor.predict_each(features)
+        elif self.predictor.has_gate:
+            return [self.predictor.predict(traced)] * len(features)
         else:
-            predicted = [self.predictor.predict(traced)] * len(features)
-        return [one.where(complete, trace) for one, trace in zip(predicted, traces, strict=True)]
+            experts = [self.predictor.predict(traced)] * len(features)
+        return [expert.by_rule(phi) for expert, phi in zip(experts, features, strict=True)]
 
     @property
     def wall_materials(self) -> WallMaterials:
@@ -308,10 +296,6 @@ class LinkModel:
         """Predict links everywhere on the map, with the options of `predict_map`."""
         found: xr.Dataset = later("coverage.job:predict_map")(self, tx, **options)
         return found
-
-    def _complete(self, tx_m: Floats, rx_m: Floats) -> Bools:
-        """Return whether each link meets nothing unknown."""
-        return is_enclosed(self.partial, np.broadcast_to(tx_m, rx_m.shape), rx_m)
 
 
 def _drop_oldest(kept: dict[Any, Any]) -> None:

@@ -24,7 +24,6 @@ from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import (
     SEEN_M,
-    context_of,
     link_features,
     traced_unobserved_m,
     with_path_power,
@@ -237,7 +236,7 @@ def sample_channels(
         phi = link_features(model.partial, traced).flat()
         if model.simulation.material_unknown:
             phi = with_path_power(phi, model.partial, traced)
-        prediction = model.predict_features(phi, context_of(phi).complete)
+        prediction = model.predict_features(phi)
         report(0.5, "drawing")
         draws = _Draws(model.partial, traced, prediction, _Buildings.drawn(model, traced, prediction, n, seed), seed)
         report(1.0, "done")

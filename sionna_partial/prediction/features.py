@@ -66,10 +66,6 @@ class LinkContext(Shown):
         True in observed cells.
     complete : (N,) bool array
         The map is complete and one end is observed: the trace is the truth.
-    both_seen : (N,) bool array
-        Both ends are observed, on a floor plan.
-    nearly_complete : (N,) bool array
-        The map is nearly complete too: the trace is close to the truth.
     walled_m : (N,) float64 array
         Length of the direct line in known wall cells [m]; traced outlines may have gaps there.
     wall_noise : (N,) float64 array
@@ -101,8 +97,6 @@ class LinkContext(Shown):
     tx_seen: Bools
     rx_seen: Bools
     complete: Bools
-    both_seen: Bools
-    nearly_complete: Bools
     walled_m: Floats
     wall_noise: Floats
     exposure: Floats
@@ -133,7 +127,7 @@ class LinkContext(Shown):
     ) -> "LinkContext":
         """Compute the context of links on the maps `map_index` (N,)."""
         count = len(map_index)
-        tx_seen, rx_seen, complete, both_seen, nearly = (np.zeros(count, dtype=bool) for _ in range(5))
+        tx_seen, rx_seen, complete = (np.zeros(count, dtype=bool) for _ in range(3))
         walled_m, wall_noise, possible = np.zeros(count), np.zeros(count), np.ones((count, len(LinkState)), dtype=bool)
         exposure, route, spaces = np.zeros((count, 2)), np.zeros(count), tuple(map(MapSpace.of, maps))
         for number in np.unique(map_index):
@@ -141,8 +135,6 @@ class LinkContext(Shown):
             ends = tx_m[here], rx_m[here]
             tx_seen[here], rx_seen[here] = (partial.state_at(end_m) != CellState.UNKNOWN for end_m in ends)
             complete[here] = is_enclosed(partial, *ends)
-            both_seen[here] = tx_seen[here] & rx_seen[here] & partial.environment.is_extruded
-            nearly[here] = both_seen[here] & partial.is_nearly_complete
             walled_m[here] = walled_lengths_m(partial, *ends)
             wall_noise[here] = 0.5 * sum(partial.noise_near(end_m) for end_m in ends)
             space = spaces[number]
@@ -151,7 +143,7 @@ class LinkContext(Shown):
             seen = unobserved_distance_m[here] == 0.0
             lines = seen, walled_m[here], wall_noise[here]
             possible[here] = _possible_states(partial, ends, link_state[here], lines)
-        found = (tx_seen, rx_seen, complete, both_seen, nearly, walled_m, wall_noise, exposure, route, possible)
+        found = (tx_seen, rx_seen, complete, walled_m, wall_noise, exposure, route, possible)
         return cls(tx_m, rx_m, *found, map_index=map_index, spaces=spaces, **traced)
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkContext":
@@ -579,9 +571,7 @@ def _limits(partial: PartialMap, settings: TraceSettings) -> tuple[int, ...]:
     return (*(settings.max_walls,) * partial.wall_class_count, settings.max_depth)
 
 
-def _features(
-    paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float
-) -> LinkFeatures:
+def _features(paths: IndirectPaths, link_state: States, gain_db: Floats, frequency_hz: float) -> LinkFeatures:
     unobserved_m = np.concatenate([unobserved_lengths_m(paths.partial, tx_m, paths.rx_m) for tx_m in paths.tx_m])
     distance_m = np.linalg.norm(paths.rx_m - paths.tx_m[:, None], axis=-1).ravel()
     context = paths.context(link_state, unobserved_m)

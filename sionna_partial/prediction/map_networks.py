@@ -295,7 +295,7 @@ def expert_parts(outputs: Any, free_db: Any, possible: Any, ops: Any = array_ops
     low, high = (math.log(std_db) for std_db in STD_RANGE_DB)
     stds_db = [ops.exp(low + (high - low) * ops.sigmoid(outputs[:, column])) for column in (5, 6)]
     outage = ops.zeros_like(free_db)
-    return Parts(
+    return (
         ops.transpose(ops.exp(ops.log_softmax(states))),
         ops.maximum(ops.stack([outage + GAIN_FLOOR_DB, *means_db]), GAIN_FLOOR_DB),
         ops.stack([outage, *stds_db]),
@@ -446,8 +446,9 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
 def _score(parts: Parts, state: Any, gain_db: Any) -> Any:
     """Return the cross-entropy of the link state, and the CRPS of the gain given the true state."""
     chosen = tf.one_hot(state, len(LinkState), axis=0)
-    p_true = tf.reduce_sum(parts.probabilities * chosen, axis=0)
-    scores_db = _crps(gain_db - parts.means_db, tf.maximum(parts.stds_db, _LEAST_STD_DB))[1:] * chosen[1:]
+    probabilities, means_db, stds_db = parts
+    p_true = tf.reduce_sum(probabilities * chosen, axis=0)
+    scores_db = _crps(gain_db - means_db, tf.maximum(stds_db, _LEAST_STD_DB))[1:] * chosen[1:]
     entropy = -tf.reduce_mean(tf.math.log(tf.maximum(p_true, _LEAST_PROBABILITY)))
     return entropy + GAIN_WEIGHT * tf.reduce_mean(tf.reduce_sum(scores_db, axis=0))
 

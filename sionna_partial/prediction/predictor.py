@@ -9,7 +9,7 @@ from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,26 +17,24 @@ from scipy.special import ndtr
 
 from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import Progress, shown
-from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.evaluate import Network
 from sionna_partial.prediction.features import (
     LinkFeatures,
-    context_of,
-    excess_noise,
     link_numbers,
     link_states,
     require_each,
 )
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
-    MapReader,
-    evaluate_context_networks,
+    MapFeatures,
     fit_context_networks,
     kind_of,
-    reads_maps,
+    predict_by_context,
+    rule_values,
 )
 from sionna_partial.prediction.paper_networks import (
     assemble,
@@ -44,12 +42,12 @@ from sionna_partial.prediction.paper_networks import (
     evaluate_paper,
     fit_indoor_networks,
     fit_networks,
-    free_space_gain_db,
     import_keras,
     network_ranges,
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, keras_model, pack, read_files, write_files
+from sionna_partial.prediction.rule import mixture, over_materials, predicted, traced_parts
 from sionna_partial.prediction.unseen_walls import (
     WALL_LOSSES,
     DirectLines,
@@ -57,8 +55,6 @@ from sionna_partial.prediction.unseen_walls import (
     WallDensity,
     WallTrace,
     by_mean_losses,
-    mixture,
-    over_materials,
 )
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings, TraceSettings
@@ -68,50 +64,6 @@ if TYPE_CHECKING:
 
 SHIPPED = ("map", "paper")
 """Names of the shipped predictors, the default first."""
-
-
-class TraceErrors(NamedTuple):
-    """Errors of the trace of a nearly complete map, or of its seen part, against the trace of the building.
-
-    The depth of a link is its traced gain below free space [dB].
-
-    Parameters
-    ----------
-    p_missed, missed_db, missed_std_db : float
-        P(NLOS) of a traced outage, falling as exp(-distance / `MISSED_RANGE_M`); its gain above -150 dB [dB].
-    p_blocked, blocked_db, blocked_std_db : float
-        P(NLOS) of traced LOS; change of its gain [dB].
-    p_opened : float
-        P(LOS) of traced NLOS, falling as exp(-depth / `OPENED_DB`).
-    p_lost : float
-        P(outage) of traced NLOS, rising linearly from 0 over the depths `LOST_DB`.
-    los_std_db, nlos_std_db, nlos_std_slope, nlos_slope : float
-        Standard deviations for an unchanged link state; growth of deviation and gain with depth.
-    """
-
-    p_missed: float
-    missed_db: float
-    missed_std_db: float
-    p_blocked: float
-    blocked_db: float
-    blocked_std_db: float
-    p_opened: float
-    p_lost: float
-    los_std_db: float
-    nlos_std_db: float
-    nlos_std_slope: float
-    nlos_slope: float
-
-
-EXACT = TraceErrors(0.03, 18.0, 10.0, 0.001, -12.0, 7.0, 0.01, 0.2, 0.2, 1.3, 0.085, 0.06)
-NOISY = TraceErrors(0.25, 15.0, 16.0, 0.01, -6.0, 5.0, 0.9, 0.4, 0.4, 3.8, 0.13, 0.1)
-"""Errors on maps without and with full noise; measured on procedural homes, floors, halls and warehouses."""
-
-NARROWER, MOST_UNSEEN_DB = 0.85, 10.0
-"""Limits below which the trace predicts an NLOS link of an incomplete map: ratio of its standard deviation to the
-networks', and indirect power over the power through observed space [dB]."""
-
-MISSED_RANGE_M, OPENED_DB, LOST_DB = 14.0, 8.0, (30.0, 70.0)
 
 
 @read_only
@@ -219,8 +171,12 @@ class LinkPrediction(Shown):
     @classmethod
     def of_trace(cls, phi: LinkFeatures) -> LinkPrediction:
         """Return the trace as a prediction without uncertainty, as on a complete map (paper, eq. 9)."""
-        probabilities = np.array([phi.link_state == state for state in LinkState], dtype=np.float64)
-        return cls.of_parts(probabilities, np.stack([phi.gain_db] * len(LinkState)), np.zeros_like(probabilities))
+        return cls.of_parts(*traced_parts(phi.link_state, phi.gain_db))
+
+    def by_rule(self, phi: LinkFeatures) -> LinkPrediction:
+        """Return the mixture of this distribution, as the expert for unobserved space, with the trace."""
+        values = rule_values(phi, phi.frequency_hz or CARRIER_FREQUENCY_HZ)
+        return LinkPrediction.of_parts(*predicted(values, self.by_state))
 
     @classmethod
     def of_mean_losses(
@@ -228,28 +184,6 @@ class LinkPrediction(Shown):
     ) -> LinkPrediction:
         """Predict links by the mean loss of walls; `walls` (N,) are the expected numbers of unseen walls."""
         return cls.of_parts(*by_mean_losses(WallTrace.of(phi), walls, max_walls))
-
-    @classmethod
-    def of_nearly_complete(cls, phi: LinkFeatures, frequency_hz: float) -> LinkPrediction:
-        """Return the trace with its uncertainty (`TraceErrors`), for links with observed ends."""
-        context, traced = context_of(phi), phi.link_state
-        exact, noisy = np.array([EXACT, NOISY])[..., None]
-        of = TraceErrors(*(exact + (noisy - exact) * excess_noise(context.wall_noise)))
-        free_db = free_space_gain_db(phi.distance_m, phi.frequency_hz or frequency_hz)
-        depth_db, (low_db, high_db) = np.maximum(free_db - phi.gain_db, 0.0), LOST_DB
-        deep = np.clip((depth_db - low_db) / (high_db - low_db), 0.0, 1.0)
-        cases = [traced == state for state in LinkState]
-        outage = np.select(cases, [1.0 - of.p_missed * np.exp(-phi.distance_m / MISSED_RANGE_M), 0.0, of.p_lost * deep])
-        los = np.select(cases, [0.0, 1.0 - of.p_blocked, of.p_opened * np.exp(-depth_db / OPENED_DB)])
-        los = los * context.possible[:, LinkState.LOS]
-        rise_db = of.nlos_slope * np.maximum(depth_db - low_db, 0.0)
-        nlos_db = phi.gain_db + np.select(cases, [of.missed_db, of.blocked_db, rise_db])
-        spread_db = of.nlos_std_db + of.nlos_std_slope * depth_db
-        nlos_std_db = np.select(cases, [of.missed_std_db, of.blocked_std_db, spread_db])
-        los_db, nothing = np.where(cases[LinkState.LOS], phi.gain_db, free_db), np.zeros_like(free_db)
-        means_db = np.stack([nothing + GAIN_FLOOR_DB, los_db, nlos_db])
-        stds_db = np.stack([nothing, of.los_std_db, nlos_std_db])
-        return cls.of_parts(np.stack([outage, los, 1.0 - outage - los]), np.maximum(means_db, GAIN_FLOOR_DB), stds_db)
 
     def probability_above(self, threshold_db: float | Floats) -> Floats:
         """Return the probability (N,) that the path gain exceeds a threshold t [dB]; an outage has -150 dB.
@@ -407,13 +341,13 @@ class Predictor(Shown):
         return keras_model(self.archive)
 
     @property
-    def reads_maps(self) -> bool:
-        """Return whether features need windows (`link_features`)."""
-        return reads_maps(self.network.layers)
+    def has_gate(self) -> bool:
+        """Return whether predictions of features with a context follow the rule (`rule.predicted`)."""
+        return LINK_NETWORK in self.network.layers
 
     @cached_property
-    def _read_maps(self) -> MapReader:
-        return MapReader(self.network.layers)
+    def _map_features(self) -> MapFeatures:
+        return MapFeatures(self.network.layers)
 
     @classmethod
     def fit(
@@ -470,8 +404,6 @@ class Predictor(Shown):
             if features.context is None:
                 remedy = "give the LinkFeatures of link_features, or PredictorSettings(networks='paper')."
                 raise PredictorError(f"features has no context, which all networks but the paper's need: {remedy}")
-            if settings.networks == "map":
-                _require_windows(features)
             with reporting(progress) as report:
                 context_networks = fit_context_networks(features, states, gains_db, settings, progress=report)
         model = assemble(parts(fit_networks(features, states, gains_db, settings)) | context_networks)
@@ -536,22 +468,10 @@ class Predictor(Shown):
         networks = self.network.layers
         if len(features.shape) == 2:
             return self.predict(features.flat()).reshaped(features.shape)
-        if features.context is None or LINK_NETWORK not in networks:
-            return LinkPrediction.of_parts(*evaluate_paper(networks, features, self.settings.frequency_hz))
-        if self.reads_maps:
-            _require_windows(features)
-        context = context_of(features)
-        read = self._read_maps if self.reads_maps else None
-        prediction = LinkPrediction.of_parts(
-            *evaluate_context_networks(networks, features, self.settings.frequency_hz, read)
-        )
-        if context.both_seen.any() and not self.settings.through_walls:
-            traced = LinkPrediction.of_nearly_complete(features, self.settings.frequency_hz)
-            indirect_db, seen_db = context.indirect_gain_db[:, 0], context.indirect_gain_db[:, -1]
-            reached = (features.link_state == LinkState.NLOS) & (indirect_db - seen_db < MOST_UNSEEN_DB)
-            reached &= traced.gain_std_db < NARROWER * prediction.gain_std_db
-            prediction = prediction.where(context.both_seen & (context.nearly_complete | reached), traced)
-        return prediction.where(context.complete, LinkPrediction.of_trace(features))
+        frequency_hz = self.settings.frequency_hz
+        if features.context is None or not self.has_gate:
+            return LinkPrediction.of_parts(*evaluate_paper(networks, features, frequency_hz))
+        return LinkPrediction.of_parts(*predict_by_context(networks, features, frequency_hz, self._map_features))
 
     def predict_indoor(self, features: LinkFeatures) -> Floats:
         """Return the probability that each receiver is indoors; 1 before `fit_indoor`."""
@@ -642,6 +562,7 @@ class OtherPredictor:
     """
 
     settings: PredictorSettings | None = None
+    has_gate = False
 
     def __init__(self, model: Any) -> None:
         self._model = model
@@ -689,6 +610,7 @@ class MeanLosses:
     """Predictor of links through walls by mean losses; `networks` predict P(indoor)."""
 
     name = WALL_LOSSES
+    has_gate = False
 
     def __init__(self, networks: Predictor | OtherPredictor, partial: PartialMap, max_walls: int) -> None:
         self._networks, self._partial, self._max_walls = networks, partial, max_walls
@@ -745,11 +667,6 @@ def _read_once(name: str, *identity: object) -> Predictor:
 def predictor_path(name_or_path: str | PathLike[str] | None) -> Path:
     name = SHIPPED[0] if name_or_path is None else name_or_path
     return PREDICTORS_FOLDER / f"{name}{SUFFIX}" if name in SHIPPED else Path(name)
-
-
-def _require_windows(features: LinkFeatures) -> None:
-    if features.context is None or features.context.windows is None:
-        raise PredictorError("features has no windows, which map networks read: call link_features with windows=True.")
 
 
 def _require_features(features: object) -> None:

@@ -12,12 +12,12 @@ All functions take NumPy arrays, or tensors with `ops` = keras.ops.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from types import ModuleType
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.prediction.evaluate import array_ops
 from sionna_partial.prediction.space import WALK_M
 
 GATE_NETWORK, GATE_OUTPUTS = "gate_network", 5
@@ -29,33 +29,30 @@ DOUBT_SCALE = 8.0
 _SHIFT_DB, _STDS_DB, _SPREAD_RANGE = 10.0, (1.0, 4.0), 2.5
 """Unit of shifts; standard deviations of an untrained gate; largest logarithm of a change of them."""
 
-_LEAST_SHARE = 1e-20
+RARE = 1e-9
+"""Probability below which means and standard deviations given a link state are those of all parts."""
 
 
-class Parts(NamedTuple):
-    """Probabilities of link states, and mean and standard deviation of the gain given each [dB]: (3, N) by LinkState."""
-
-    probabilities: Any
-    means_db: Any
-    stds_db: Any
+Parts = tuple[Any, Any, Any]
+"""Probabilities, means and standard deviations of the gain [dB] by LinkState, each (3, N)."""
 
 
-def doubt(values: Mapping[str, Any], ops: ModuleType = np) -> Any:
+def doubt(values: Mapping[str, Any], ops: Any = array_ops) -> Any:
     """Return the doubt (N,) about the trace, 0 to 1."""
     exposure = values["exposure"]
     return 1.0 - ops.exp(-DOUBT_SCALE * (exposure[:, 0] + exposure[:, 1] + values["wall_noise"]))
 
 
-def traced_parts(traced: Any, gain_db: Any, ops: ModuleType = np) -> Parts:
+def traced_parts(traced: Any, gain_db: Any, ops: Any = array_ops) -> Parts:
     """Return the trace without errors."""
     one = ops.ones_like(gain_db)
     states = ops.stack([ops.where(traced == state, one, 0.0 * one) for state in LinkState])
     means_db = ops.stack([gain_db] * len(LinkState))
-    return Parts(states, means_db, ops.zeros_like(means_db))
+    return states, means_db, ops.zeros_like(means_db)
 
 
 def predicted(
-    values: Mapping[str, Any], expert: Parts, gate: Callable[[Any], Any] | None = None, ops: ModuleType = np
+    values: Mapping[str, Any], expert: Parts, gate: Callable[[Any], Any] | None = None, ops: Any = array_ops
 ) -> Parts:
     """Return the mixture of the trace and the expert for unobserved space.
 
@@ -63,15 +60,16 @@ def predicted(
     """
     doubts, trace = doubt(values, ops), traced_parts(values["link_state"], values["gain_db"], ops)
     if gate is None:
-        return mixture((trace, expert), (1.0 - doubts, doubts), ops)
+        return mixture((trace, expert), ops.stack([1.0 - doubts, doubts]), ops)
     outputs = gate(gate_inputs(values, expert, ops))
-    possible = ops.sum(ops.where(ops.transpose(values["possible"]), trace.probabilities, 0.0), axis=0)
-    trust = possible / (1.0 + ops.exp(-outputs[:, 0]))
+    possible = ops.sum(ops.where(ops.transpose(values["possible"]), trace[0], 0.0), axis=0)
+    trust = possible * ops.sigmoid(outputs[:, 0])
     weight = 1.0 - doubts * (1.0 - trust)
-    return mixture((with_errors(trace, outputs, doubts, ops), expert), (weight, 1.0 - weight), ops)
+    weights = ops.stack([weight, 1.0 - weight])
+    return mixture((with_errors(trace, outputs, doubts, ops), expert), weights, ops)
 
 
-def with_errors(trace: Parts, outputs: Any, doubts: Any, ops: ModuleType = np) -> Parts:
+def with_errors(trace: Parts, outputs: Any, doubts: Any, ops: Any = array_ops) -> Parts:
     """Return the trace with the errors of the gate, which vanish with the doubt."""
     shifts_db = [doubts * _SHIFT_DB * outputs[:, column] for column in (1, 3)]
     root = ops.sqrt(ops.maximum(doubts, 1e-12))
@@ -80,24 +78,34 @@ def with_errors(trace: Parts, outputs: Any, doubts: Any, ops: ModuleType = np) -
         for column, std_db in zip((2, 4), _STDS_DB, strict=True)
     ]
     nothing = ops.zeros_like(shifts_db[0])
-    means_db = trace.means_db + ops.stack([nothing, *shifts_db])
-    return Parts(trace.probabilities, ops.maximum(means_db, GAIN_FLOOR_DB), ops.stack([nothing, *stds_db]))
+    means_db = ops.maximum(trace[1] + ops.stack([nothing, *shifts_db]), GAIN_FLOOR_DB)
+    return trace[0], means_db, ops.stack([nothing, *stds_db])
 
 
-def mixture(parts: Sequence[Parts], weights: Sequence[Any], ops: ModuleType = np) -> Parts:
-    """Return the mixture of K distributions by weights (N,) or (), which sum to 1; gains given a state are Gaussian."""
-    joint = [weight * part.probabilities for part, weight in zip(parts, weights, strict=True)]
-    probabilities = sum(joint)
-    shares = [each + _LEAST_SHARE * (weight + 1e-6) for each, weight in zip(joint, weights, strict=True)]
-    total = sum(shares)
-    shares = [each / total for each in shares]
-    mean_db = sum(share * part.means_db for share, part in zip(shares, parts, strict=True))
-    variance = sum(
-        share * (part.stds_db**2 + (part.means_db - mean_db) ** 2) for share, part in zip(shares, parts, strict=True)
-    )
+def mixture(parts: Sequence[Parts], weights: Any, ops: Any = array_ops) -> Parts:
+    """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1.
+
+    `ops` is `array_ops`, or keras.ops for tensors.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    p_all, means_db, stds_db = (ops.stack(each) for each in zip(*parts, strict=True))
+    weights = ops.reshape(weights, (len(parts), 1, -1))
+    probabilities = ops.sum(weights * p_all, axis=0)
+    fractions = weights * (p_all + RARE)  # states that no part allows have the mean of all
+    fractions = fractions / ops.sum(fractions, axis=0)
+    mean_db = ops.sum(fractions * means_db, axis=0)
+    variance = ops.sum(fractions * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
     spread = variance > 0.0
     std_db = ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0)
-    return Parts(probabilities / ops.sum(probabilities, axis=0), mean_db, std_db)
+    return probabilities / ops.sum(probabilities, axis=0), mean_db, std_db
+
+
+def over_materials(parts: Sequence[Parts], prior: Any, residual_db: float, ops: Any = array_ops) -> Parts:
+    """Return the mixture over wall materials; `residual_db` is the standard deviation about the true trace."""
+    probabilities, means_db, stds_db = mixture(parts, prior, ops)
+    has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
+    return probabilities, means_db, ops.where(has_path, ops.sqrt(stds_db**2 + residual_db**2), 0.0)
 
 
 _SCALE_M, _SCALE_DB = 3.0, 30.0
@@ -108,7 +116,7 @@ class _Links(NamedTuple):
 
     values: Mapping[str, Any]
     expert: Parts
-    ops: ModuleType
+    ops: Any
 
     def flag(self, mask: Any) -> Any:
         """Return 1 where a mask is True, else 0."""
@@ -129,7 +137,7 @@ class _Links(NamedTuple):
 
     def apart(self, state: LinkState) -> Any:
         """Return the mean of the expert relative to the trace."""
-        return self.ops.clip((self.expert.means_db[int(state)] - self.values["gain_db"]) / _SCALE_DB, -2.0, 3.0)
+        return self.ops.clip((self.expert[1][int(state)] - self.values["gain_db"]) / _SCALE_DB, -2.0, 3.0)
 
 
 GATE_INPUTS: dict[str, Callable[[_Links], Any]] = {
@@ -149,17 +157,17 @@ GATE_INPUTS: dict[str, Callable[[_Links], Any]] = {
     **{f"indirect_{column}": lambda of, column=column: of.indirect(column) for column in range(5)},  # type: ignore[misc]
     "hidden_power": lambda of: of.indirect(4) - of.indirect(0),
     **{
-        f"expert_p_{state.name.lower()}": lambda of, state=state: of.expert.probabilities[int(state)]  # type: ignore[misc]
+        f"expert_p_{state.name.lower()}": lambda of, state=state: of.expert[0][int(state)]  # type: ignore[misc]
         for state in LinkState
     },
     "expert_los_apart": lambda of: of.apart(LinkState.LOS),
     "expert_nlos_apart": lambda of: of.apart(LinkState.NLOS),
-    "expert_nlos_width": lambda of: of.ops.log(of.expert.stds_db[int(LinkState.NLOS)] / 10.0),
+    "expert_nlos_width": lambda of: of.ops.log(of.expert[2][int(LinkState.NLOS)] / 10.0),
 }
 """Inputs of the gate in order, dimensionless and symmetric in the ends of a link, if the expert is."""
 
 
-def gate_inputs(values: Mapping[str, Any], expert: Parts, ops: ModuleType = np) -> Any:
+def gate_inputs(values: Mapping[str, Any], expert: Parts, ops: Any = array_ops) -> Any:
     """Return the inputs (N, len(GATE_INPUTS)) of the gate."""
     links = _Links(values, expert, ops)
     return ops.stack([make(links) for make in GATE_INPUTS.values()], axis=1)

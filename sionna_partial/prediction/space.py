@@ -11,7 +11,6 @@ its origin or orientation matter. A random walk, whose steps known walls stop, d
 import math
 import weakref
 from functools import cached_property
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -22,6 +21,7 @@ from scipy.sparse.linalg import splu
 from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.prediction.evaluate import array_ops
 
 CELL_M = 0.3
 WALK_M = 2.0
@@ -111,14 +111,13 @@ class MapSpace:
             return np.zeros(self.shape)
         return np.clip(self._walk.solve(unobserved.ravel()), 0.0, 1.0).reshape(self.shape)
 
-    def exposure_at(self, points_m: Any, ops: ModuleType = np) -> Any:
+    def exposure_at(self, points_m: Any, ops: Any = array_ops) -> Any:
         """Return the exposure (N,) of points (N, 2 or 3) [m]."""
         return self.read(self.exposure[..., None], points_m, ops)[:, 0]
 
-    def routes(self, tx_m: Any, rx_m: Floats, ops: ModuleType = np) -> Any:
+    def routes(self, tx_m: Any, rx_m: Floats, ops: Any = array_ops) -> Any:
         """Return the routes (N,), in `WALK_M`, from a transmitter (3,) to receivers (N, 3) [m]."""
-        tx_cells, tx_weights = self.corners(tx_m[None], ops)
-        rx_cells, rx_weights = self.corners(rx_m)
+        (tx_cells, tx_weights), (rx_cells, rx_weights) = self.corners(tx_m[None], ops), self.corners(rx_m)
         start = np.zeros((math.prod(self.shape), 4))
         start[tx_cells[0], np.arange(4)] = 1.0
         density = np.maximum(self._walk.solve(start)[rx_cells.ravel()], math.exp(-LONGEST_ROUTE))
@@ -134,7 +133,7 @@ class MapSpace:
             found[here] = self.routes(source_m, rx_m[here])
         return found
 
-    def corners(self, points_m: Any, ops: ModuleType = np) -> tuple[Indices, Any]:
+    def corners(self, points_m: Any, ops: Any = array_ops) -> tuple[Indices, Any]:
         """Return the four cells (..., 4) around points (..., 2 or 3) [m], and their bilinear weights (..., 4)."""
         limits = np.array(self.shape[::-1]) - 1.0 - 1e-6
         at = ops.minimum(ops.maximum((points_m[..., :2] - self.corner_m) / CELL_M - 0.5, 0.0), limits)
@@ -145,11 +144,11 @@ class MapSpace:
         weights = ops.stack([(1.0 - x) * (1.0 - y), x * (1.0 - y), (1.0 - x) * y, x * y], axis=-1)
         return cells, weights
 
-    def read(self, values: Any, points_m: Any, ops: ModuleType = np) -> Any:
+    def read(self, values: Any, points_m: Any, ops: Any = array_ops) -> Any:
         """Interpolate a field (H, W, C) at points (..., 2 or 3) [m]: return (..., C)."""
         cells, weights = self.corners(points_m, ops)
         flat = ops.reshape(values, (-1, values.shape[-1]))
-        return ops.sum(ops.take(flat, cells, axis=0) * weights[..., None], axis=-2)
+        return ops.sum(ops.take(flat, cells, axis=0) * ops.cast(weights, flat.dtype)[..., None], axis=-2)
 
 
 def _entered(state: NDArray[np.uint8]) -> Bools:
@@ -170,7 +169,9 @@ def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
     """Return 1 if the space beyond the grid can be entered, else 0."""
     rim = np.ones(state.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
-    return float((entered & rim).any() or (rim & (state == CellState.FREE)).any() or not (state != CellState.UNKNOWN).any())
+    return float(
+        (entered & rim).any() or (rim & (state == CellState.FREE)).any() or not (state != CellState.UNKNOWN).any()
+    )
 
 
 def _overlaps(edges: Floats, count: int) -> Any:
@@ -194,7 +195,9 @@ def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, .
     at = [first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
     for up in (-_ASIDE_CELLS, _ASIDE_CELLS):
         for right in (-_ASIDE_CELLS, _ASIDE_CELLS):
-            rows, columns = (np.floor(axis + aside).astype(np.intp) for axis, aside in zip(at, (up, right), strict=True))
+            rows, columns = (
+                np.floor(axis + aside).astype(np.intp) for axis, aside in zip(at, (up, right), strict=True)
+            )
             inside = [(index >= 0) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
             looked_up = wall[np.ix_(np.clip(rows, 0, wall.shape[0] - 1), np.clip(columns, 0, wall.shape[1] - 1))]
             sampled |= looked_up & np.logical_and.outer(*inside)

@@ -10,7 +10,7 @@ import io
 import itertools
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
@@ -27,6 +27,7 @@ from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
+from sionna_partial.prediction.rule import RARE, Parts
 from sionna_partial.prediction.unobserved import overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import TraceSettings
@@ -52,8 +53,6 @@ cells joined by pooling. Images are aligned to the world by such groups, so that
 """
 
 _LINES_AT_ONCE = 4096
-_RARE = 1e-9
-"""Probability below which means and standard deviations given a link state are those of all parts."""
 
 _MAX_BYTES = 10_000_000
 
@@ -284,10 +283,6 @@ class WallTrace(NamedTuple):
         return cls(phi.link_state, phi.gain_db, context.wall_loss_db, context.straight_walls)
 
 
-Parts = tuple[Any, Any, Any]
-"""Probabilities, means and standard deviations of the gain [dB] by LinkState, each (3, N)."""
-
-
 def by_mean_losses(
     trace: WallTrace, walls: Any, max_walls: int = TraceSettings.max_walls, ops: Any = array_ops
 ) -> Parts:
@@ -317,7 +312,7 @@ def _by_mean_losses(trace: WallTrace, walls: Any, max_walls: int, ops: Any) -> P
     p_los = ops.where(los, probabilities[0], 0.0)
     joint = ops.where((count > 0) | ~los, probabilities * linked, 0.0)
     p_nlos = ops.sum(joint, axis=0)
-    weights = joint + _RARE * (count == 1)
+    weights = joint + RARE * (count == 1)
     weights = weights / ops.sum(weights, axis=0)
     gain_db = ops.maximum(gain_db, GAIN_FLOOR_DB)
     mean_db = ops.sum(weights * gain_db, axis=0)
@@ -330,29 +325,3 @@ def _by_mean_losses(trace: WallTrace, walls: Any, max_walls: int, ops: Any) -> P
         ops.stack([nothing + GAIN_FLOOR_DB, los_db, mean_db]),
         ops.stack([nothing, ops.sqrt(SEEN_STD_DB**2 + LOS_STD_DB**2 * walls), ops.sqrt(variance)]),
     )
-
-
-def mixture(parts: Sequence[Parts], weights: Any, ops: Any = array_ops) -> Parts:
-    """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1.
-
-    `ops` is `array_ops`, or keras.ops for tensors.
-    """
-    if len(parts) == 1:
-        return parts[0]
-    p_all, means_db, stds_db = (ops.stack(each) for each in zip(*parts, strict=True))
-    weights = ops.reshape(weights, (len(parts), 1, -1))
-    probabilities = ops.sum(weights * p_all, axis=0)
-    fractions = weights * (p_all + _RARE)  # states that no part allows have the mean of all
-    fractions = fractions / ops.sum(fractions, axis=0)
-    mean_db = ops.sum(fractions * means_db, axis=0)
-    variance = ops.sum(fractions * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
-    spread = variance > 0.0
-    std_db = ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0)
-    return probabilities / ops.sum(probabilities, axis=0), mean_db, std_db
-
-
-def over_materials(parts: Sequence[Parts], prior: Any, residual_db: float, ops: Any = array_ops) -> Parts:
-    """Return the mixture over wall materials; `residual_db` is the standard deviation about the true trace."""
-    probabilities, means_db, stds_db = mixture(parts, prior, ops)
-    has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
-    return probabilities, means_db, ops.where(has_path, ops.sqrt(stds_db**2 + residual_db**2), 0.0)
