@@ -498,7 +498,7 @@ class DifferentiableLinks:
 
     def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:
         """Return the free-space gain (N,) [dB], and the distribution of the networks."""
-        ops, networks, context = import_keras().ops, self._scene.networks, self._phi.context
+        ops, networks = import_keras().ops, self._scene.networks
         tx_m, frequency_hz = given.get("tx_m"), self._scene.predictor.settings.frequency_hz
         carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
         shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / frequency_hz)

@@ -383,8 +383,8 @@ class DatasetSettings(Checked):
     transmitters_per_home : int
         Number of transmitters in free cells of the complete home.
     stages : tuple of int, or of float
-        Increasing exploration steps; or, in [0, 1], observed fractions of the home's free area. At 1, the robot drove to
-        the end, and unknown cells that touch free ones are walls: the map is complete, with the robot's errors.
+        Increasing exploration steps; or, in [0, 1], observed fractions of the home's free area. At 1, the robot drove
+        to the end, and unknown cells that touch free ones are walls: the map is complete, with the robot's errors.
     seed : int
         Seed of positions and robot, combined with the home's name.
     tx_height_m, rx_height_m : float

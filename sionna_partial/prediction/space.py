@@ -1,13 +1,14 @@
-"""Fields of the known and unknown space of a map: reach of unobserved space, routes between points, images.
+"""Fields of the known and unknown space of a map: exposure to unobserved space, routes between points, images.
 
-Fields live on cells of about 0.3 m that are centred on the known part of the map, so that neither the grid of the map nor
-its origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
+Fields live on cells of 0.3 m that are centred on the known part of the map, so that neither the grid of the map nor its
+origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
 
 - exposure: probability that a walk from a point, of mean length `WALK_M`, ends in unobserved space.
 - route: negative logarithm of the density of walks between two points, which grows like the length of the way around
   known walls. It is symmetric in its ends.
 """
 
+import itertools
 import math
 import weakref
 from functools import cached_property
@@ -42,6 +43,9 @@ _ASIDE_CELLS = 1e-3
 _SEPARATE = 1e-9
 """Smallest conductance between neighbouring cells."""
 
+_FREE_ROUTE = math.log(2.0 * math.pi * (WALK_M / CELL_M) ** 2) - 0.5 * math.log(math.pi / 2.0)
+"""Route in unobserved space without walls, less distance and half of its logarithm, in `WALK_M` (asymptote of K0)."""
+
 _kept: dict[int, tuple[Any, "MapSpace"]] = {}
 
 
@@ -52,12 +56,15 @@ class MapSpace:
     ----------
     image : (H, W, 3) float32 array
         Fractions of free and wall, and of unobserved space that can be entered.
-    exposure : (H, W) float64 array
+    shape : tuple of int
+        H and W, multiples of `POOLED_CELLS`.
+    corner_m : (2,) float64 array
+        Corner of the first cell [m].
     """
 
     def __init__(self, partial: PartialMap) -> None:
-        self._resolution_m = partial.resolution_m
         known = np.argwhere(partial.state != CellState.UNKNOWN)
+        self._is_empty = len(known) == 0
         ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
         centre = 0.5 * (ends[0] + ends[1])
         self._cells = CELL_M / partial.resolution_m
@@ -72,9 +79,8 @@ class MapSpace:
         edges = [first[axis] + np.arange(self.shape[axis] + 1) * self._cells for axis in (0, 1)]
         rows, columns = (_overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
         fractions = [rows @ mask.astype(np.float64) @ columns.T for mask in masks]
-        if entered.any() or not len(known):  # the space beyond the grid, too
-            inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
-            fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
+        inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
+        fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
         self.image = np.stack(fractions, axis=-1).astype(np.float32)
         self._walls = _sampled_walls(state == CellState.WALL, first, self._cells, self.shape)
 
@@ -106,6 +112,7 @@ class MapSpace:
 
     @cached_property
     def exposure(self) -> Floats:
+        """Exposure of the cells (H, W)."""
         unobserved = self.image[..., 2].astype(np.float64)
         if not unobserved.any():
             return np.zeros(self.shape)
@@ -117,6 +124,9 @@ class MapSpace:
 
     def routes(self, tx_m: Any, rx_m: Floats, ops: Any = array_ops) -> Any:
         """Return the routes (N,), in `WALK_M`, from a transmitter (3,) to receivers (N, 3) [m]."""
+        if self._is_empty:
+            distance_m = ops.sqrt(ops.sum((rx_m[:, :2] - tx_m[:2]) ** 2, axis=1) + CELL_M**2)
+            return distance_m / WALK_M + 0.5 * ops.log(distance_m / WALK_M) + _FREE_ROUTE
         (tx_cells, tx_weights), (rx_cells, rx_weights) = self.corners(tx_m[None], ops), self.corners(rx_m)
         start = np.zeros((math.prod(self.shape), 4))
         start[tx_cells[0], np.arange(4)] = 1.0
@@ -169,9 +179,7 @@ def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
     """Return 1 if the space beyond the grid can be entered, else 0."""
     rim = np.ones(state.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
-    return float(
-        (entered & rim).any() or (rim & (state == CellState.FREE)).any() or not (state != CellState.UNKNOWN).any()
-    )
+    return float((rim & (entered | (state == CellState.FREE))).any() or (state == CellState.UNKNOWN).all())
 
 
 def _overlaps(edges: Floats, count: int) -> Any:
@@ -193,14 +201,11 @@ def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, .
         wall = ndimage.maximum_filter(wall, size=math.ceil(step))
     sampled = np.zeros(tuple(_PARTS * count for count in shape), dtype=bool)
     at = [first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
-    for up in (-_ASIDE_CELLS, _ASIDE_CELLS):
-        for right in (-_ASIDE_CELLS, _ASIDE_CELLS):
-            rows, columns = (
-                np.floor(axis + aside).astype(np.intp) for axis, aside in zip(at, (up, right), strict=True)
-            )
-            inside = [(index >= 0) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
-            looked_up = wall[np.ix_(np.clip(rows, 0, wall.shape[0] - 1), np.clip(columns, 0, wall.shape[1] - 1))]
-            sampled |= looked_up & np.logical_and.outer(*inside)
+    for aside in itertools.product((-_ASIDE_CELLS, _ASIDE_CELLS), repeat=2):
+        rows, columns = (np.floor(axis + move).astype(np.intp) for axis, move in zip(at, aside, strict=True))
+        inside = [(index >= 0) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
+        looked_up = wall[np.ix_(np.clip(rows, 0, wall.shape[0] - 1), np.clip(columns, 0, wall.shape[1] - 1))]
+        sampled |= looked_up & np.logical_and.outer(*inside)
     return sampled
 
 
