@@ -21,7 +21,9 @@ import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.live import topics as topics_module
 from sionna_partial.live.topics import (
+    FILTER_TYPE,
     GRID_TYPE,
+    POSE_TYPE,
     VIEWS_TYPE,
     Dds,
     Listener,
@@ -44,7 +46,7 @@ LOOPBACK = (
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
     "<Peers><Peer Address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
 )
-LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25"]
+LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25", "--frequency", "28GHz"]
 
 ROBOT = """
 import sys, time
@@ -71,13 +73,24 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
 class TestDds:
     @pytest.mark.parametrize(
-        ("kind", "values"), [(GRID_TYPE, GRID), (VIEWS_TYPE, {"header": HEADER, "poses": [POSE, POSE]})]
+        ("kind", "values"),
+        [
+            (GRID_TYPE, GRID),
+            (VIEWS_TYPE, {"header": HEADER, "poses": [POSE, POSE]}),
+            (POSE_TYPE, {"header": HEADER, "pose": {"pose": POSE, "covariance": [0.0] * 36}}),
+        ],
     )
     def test_wire_format_is_that_of_ros(self, kind: str, values: dict[str, Any]) -> None:
         store = get_typestore(Stores.ROS2_HUMBLE)
         message = store.deserialize_cdr(filled(kind, values).serialize(), kind)
         assert (message.header.frame_id, message.header.stamp.nanosec) == ("map", 8)
         assert struct(kind).deserialize(bytes(store.serialize_cdr(message, kind))) == filled(kind, values)
+
+    def test_messages_that_no_type_store_has(self) -> None:
+        info = {"header": HEADER, "type": 0, "filter_mask_topic": "/radio/tx", "base": 0.0, "multiplier": 1.0}
+        message = struct(FILTER_TYPE).deserialize(filled(FILTER_TYPE, info).serialize())
+        assert (message.filter_mask_topic, message.multiplier) == ("/radio/tx", 1.0)
+        assert struct(FILTER_TYPE).__idl_typename__ == "nav2_msgs.msg.dds_.CostmapFilterInfo_"
 
     def test_robot_in_another_process(self, domain: dict[str, str]) -> None:
         command = [sys.executable, "-m", "sionna_partial", "live", *LIVE]
@@ -206,3 +219,9 @@ class TestCommand:
     def test_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(cli.app, ["live", *LIVE, "--name", "a", "--name", "b"])
         assert (result.exit_code, "2 --name for 1 --tx" in result.stderr) == (2, True)
+        for words, line in (
+            (LIVE[:-2], "--frequency is missing: give for example 5.2GHz, or a --connection with it."),
+            (LIVE[-2:], "--tx is missing: give X Y Z, or --power, --key-values or --connection."),
+        ):
+            result = CliRunner().invoke(cli.app, ["live", *words])
+            assert (result.exit_code, line in " ".join(result.stderr.split())) == (2, True)
