@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
@@ -43,13 +44,16 @@ def grown(cells: Any = ROOM) -> list[list[int]]:
 
 
 class TestOrder:
-    def test_coarse_then_fine_as_predict_map(self) -> None:
+    def test_coarse_then_fine_as_predict_map(self, tmp_path: Path) -> None:
         heard = Heard()
         heard.live.on_map(message())
         assert heard.step() == [(1, False), (1, True)]
         assert heard[0].coverage.attrs["spacing_m"] == 0.8
         expected = sp.predict_map(sp.map_from_occupancy(message()), TX, spacing_m=0.2)
         assert heard[-1].coverage.identical(expected)
+        sp.save_coverage(expected, tmp_path / "cost.yaml", scene=sp.map_from_occupancy(message()))
+        percent = np.flipud(np.asarray(Image.open(tmp_path / "cost.pgm"))).astype(int)
+        np.testing.assert_array_equal(np.where(percent == 255, -1, percent), heard[-1].cost)
         assert heard.step() == []
         heard.live.on_map(message(sec=6))
         assert heard.step() == []
@@ -153,7 +157,7 @@ class TestTransmitters:
 
     def test_coarse_costs_are_upper_bounds(self) -> None:
         partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
-        for threshold_db in (-100.0, -85.0):
+        for threshold_db in (-110.0, -100.0):
             heard = Heard((7.0, 9.8, 1.5), spacing_m=0.3, threshold_db=threshold_db)
             sent = message(np.array([0, 100, -1])[partial.state], at=partial.origin_m)
             sent.info.resolution = partial.resolution_m

@@ -36,7 +36,7 @@ from sionna_partial.exploration.next_views import NextViews, next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
-from sionna_partial.measurements.localisation import BEYOND_M, likely_region
+from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -59,6 +59,9 @@ LEAST_POWERS = 5
 
 MOST_ACCESS_POINTS = 8
 """Number of access points that are located by themselves."""
+
+SEARCH_M = 5.0
+"""Distance outside the map at which access points are searched: they may be where the robot has not been yet [m]."""
 
 FARTHEST_M = 200.0
 """Distance from the map up to which the map is extended with unknown cells to a transmitter [m]."""
@@ -549,9 +552,9 @@ class LiveCoverage:
         """Return the map with unknown cells up to the transmitters: space outside a map is unknown."""
         low, high = bounds_m = np.reshape(partial.bounds_m, (2, 2))
         for tx_m in self.tx_m.values():
-            if tx_m is None:  # an access point may be where the robot has not been yet
-                low, high = np.minimum(low, bounds_m[0] - BEYOND_M), np.maximum(high, bounds_m[1] + BEYOND_M)
-            elif _beyond_m(partial, tx_m) <= FARTHEST_M:
+            if tx_m is None and not partial.is_nearly_complete:
+                low, high = np.minimum(low, bounds_m[0] - SEARCH_M), np.maximum(high, bounds_m[1] + SEARCH_M)
+            elif tx_m is not None and _beyond_m(partial, tx_m) <= FARTHEST_M:
                 low, high = np.minimum(low, tx_m[:2]), np.maximum(high, tx_m[:2])
         cells = np.ceil(np.array([bounds_m[0] - low, high - bounds_m[1]]) / partial.resolution_m - 1e-6).astype(int)
         if not cells.any():
