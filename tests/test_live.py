@@ -13,7 +13,7 @@ from PIL import Image
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
-from sionna_partial.live.coverage import LiveGrid, LiveTransmitter, LiveViews
+from sionna_partial.live.answers import LiveGrid, LiveTransmitter, LiveViews
 from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
@@ -155,18 +155,21 @@ class TestTransmitters:
         with pytest.raises(SettingsError, match=r"area_m = .* is not allowed: give x and y of two corners on the map"):
             sp.predict_map(wide, tx, spacing_m=0.2, area_m=(0.0, 0.0, 50.0, 4.0))
 
-    def test_coarse_costs_are_upper_bounds(self) -> None:
+    @pytest.mark.parametrize(("frequency_hz", "threshold_db"), [(28e9, -100.0), (5.2e9, -80.0)])
+    def test_coarse_costs_are_upper_bounds(self, frequency_hz: float, threshold_db: float) -> None:
         partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
-        for threshold_db in (-110.0, -100.0):
-            heard = Heard((7.0, 9.8, 1.5), spacing_m=0.3, threshold_db=threshold_db)
-            sent = message(np.array([0, 100, -1])[partial.state], at=partial.origin_m)
-            sent.info.resolution = partial.resolution_m
-            heard.live.on_map(sent)
-            heard.step()
-            coarse, final = (grid.cost.astype(int) for grid in heard)
-            assert ((coarse >= 0) == (final >= 0)).mean() > 0.999
-            assert (final - coarse)[(final >= 0) & (coarse >= 0)].max() <= 1
-            assert coarse[final >= 0].min() < 50  # they still tell something
+        grids: list[Any] = []
+        settings = sp.LiveSettings(spacing_m=0.3, threshold_db=threshold_db)
+        trace_settings = sp.TraceSettings(frequency_hz=frequency_hz)
+        live = sp.LiveCoverage((7.0, 9.8, 1.5), grids.append, settings, trace_settings=trace_settings)
+        sent = message(np.array([0, 100, -1])[partial.state], at=partial.origin_m)
+        sent.info.resolution = partial.resolution_m
+        live.on_map(sent)
+        live.step()
+        coarse, final = (grid.cost.astype(int) for grid in grids)
+        assert ((coarse >= 0) == (final >= 0)).mean() > 0.999
+        assert (final - coarse)[(final >= 0) & (coarse >= 0)].max() <= 4
+        assert coarse[final >= 0].min() < 50  # they still tell something
 
     def test_by_name(self, caplog: pytest.LogCaptureFixture) -> None:
         heard = Heard({"desk": TX, "door": (3.4, 2.4, 2.0), "far": (290.0, 1.0, 1.0)})
@@ -222,7 +225,7 @@ def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     assert grid.cost.max() == grid.unknown_cost.max() == 98  # nav2 reads 99 and 100 as obstacles
     assert len({*grid.cost.ravel().tolist()}) > 10
     assert (grid.unknown_cost >= 0).sum() > 0.9 * (percent == -1).sum()
-    assert list(Topics(unknown=True).messages(grid, ["/radio/tx/filter_info"])) == ["/radio/tx", "/radio/tx/unknown"]
+    assert [*Topics(unknown=True).messages(grid)][:2] == ["/radio/tx", "/radio/tx/unknown"]
     assert list(Topics().messages(grid)) == ["/radio/tx", "/radio/tx/filter_info"]
     assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
 

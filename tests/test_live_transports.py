@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -21,6 +22,7 @@ import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.live import topics as topics_module
 from sionna_partial.live.topics import (
+    CONNECTION_TYPE,
     FILTER_TYPE,
     GRID_TYPE,
     POSE_TYPE,
@@ -90,6 +92,14 @@ class TestDds:
         info = {"header": HEADER, "type": 0, "filter_mask_topic": "/radio/tx", "base": 0.0, "multiplier": 1.0}
         message = struct(FILTER_TYPE).deserialize(filled(FILTER_TYPE, info).serialize())
         assert (message.filter_mask_topic, message.multiplier) == ("/radio/tx", 1.0)
+        strings = dict.fromkeys(("link_quality_raw", "essid", "bssid"), "AA:00:00:00:00:01")
+        numbers = dict.fromkeys(("bitrate", "txpower", "link_quality", "signal_level", "noise_level"), -60)
+        connection = filled(CONNECTION_TYPE, {**strings, **numbers, "frequency": 5.18})
+        live = sp.LiveCoverage({}, print, await_frequency=True)
+        live.on_map(struct(GRID_TYPE).deserialize(filled(GRID_TYPE, GRID).serialize()))
+        live.on_pose(1.5, 1.5, 0.0)
+        live.on_connection(struct(CONNECTION_TYPE).deserialize(connection.serialize()), 0.0)
+        assert [len(powers) for powers in live._powers.values()] == [1]
         assert struct(FILTER_TYPE).__idl_typename__ == "nav2_msgs.msg.dds_.CostmapFilterInfo_"
 
     def test_robot_in_another_process(self, domain: dict[str, str]) -> None:
@@ -215,6 +225,24 @@ class TestCommand:
         ]
         expected = sp.predict_map(sp.map_from_bag(path), (1.5, 1.5, 1.5), spacing_m=0.25)
         assert sp.load_coverage(out / "tx.nc").equals(expected)
+
+    def test_a_transmitter_is_located_at_the_end_of_a_recording(self, tmp_path: Path) -> None:
+        make, cells = Messages(2), np.pad(np.zeros((10, 12), dtype=int), 1, constant_values=100)
+        rows = [("/map", 0.0, make.grid(cells, (0.0, 0.0, 0.0)))]
+        for number, x in enumerate((1.2, 2.3, 3.4, 4.6, 5.2, 6.1), 1):
+            rows.append(("/tf", float(number), make.transform(number, "map", "base_link", x, 1.3, 0.0)))
+            rows.append(("/rssi", number + 0.1, make.power(-30.0 - 4.0 * abs(x - 5.0))))
+        bag, options = write_bag(tmp_path / "drive_mcap", rows), ["--frequency", "5.2GHz", "--spacing", "0.5"]
+        result = CliRunner().invoke(
+            cli.app, ["live", "--power", "/rssi", *options, "--bag", str(bag), "--rate", "0", "--out", str(tmp_path)]
+        )
+        assert result.exit_code == 0, result.output
+        final, found, _ = result.stdout.splitlines()
+        assert final.startswith("map 1, tx: final after")
+        x_m = re.fullmatch(r"tx: at \((.*), .*\) m, .* m2 hold 90 %", found)
+        assert x_m is not None
+        assert float(x_m[1]) == pytest.approx(5.0, abs=1.5)
+        assert "p_transmitter" in sp.load_coverage(tmp_path / "tx.nc")
 
     def test_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(cli.app, ["live", *LIVE, "--name", "a", "--name", "b"])

@@ -15,7 +15,7 @@ from test_live import Heard, message
 from typer.testing import CliRunner
 
 from sionna_partial import cli
-from sionna_partial.live.coverage import LiveGrid
+from sionna_partial.live.answers import LiveGrid
 from sionna_partial.live.topics import Topics
 
 NAV2 = Path(__file__).parents[1] / "examples" / "nav2"

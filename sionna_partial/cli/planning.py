@@ -318,6 +318,8 @@ def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
     coverage.close()
     if thread:
         thread.join()
+    else:
+        coverage.run()
 
 
 def _save(last: dict[str, Any], out: Path | None) -> None:

@@ -8,14 +8,14 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, NamedTuple, TypeAlias
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import (
     Checked,
     Progress,
@@ -29,14 +29,14 @@ from sionna_partial.checks import (
     shown,
 )
 from sionna_partial.constants import COARSER, COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
-from sionna_partial.coverage.dataset import cost_grid, probability_above
+from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.coverage.job import grid_axes
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
-from sionna_partial.exploration.next_views import NextViews, next_views
+from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
+from sionna_partial.live.answers import LiveAnswer, LiveGrid, LiveTransmitter, LiveViews, MapMessage
 from sionna_partial.maps.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
-from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -45,6 +45,9 @@ LATE_S = 30.0
 """Maps older than the last by less are dropped; by more, the clock was restarted [s]."""
 
 POSE_AGE_S = 2.0
+
+BETWEEN_DB = 6.0
+"""Difference of gains behind walls that paths go through, within two receivers of a coarse grid [dB]."""
 
 SAME_BAND = 0.15
 """Relative difference of frequencies up to which powers are used."""
@@ -110,164 +113,6 @@ class LiveSettings(Checked):
     max_cost: Annotated[int, Within(1, 100)] = MAX_COST
 
 
-class LiveGrid(NamedTuple):
-    """The coverage of one transmitter on one map.
-
-    Parameters
-    ----------
-    name : str
-    map_number : int
-        Number of the predicted map, from 1.
-    is_final : bool
-        False for the coarse answer, whose costs are upper bounds.
-    coverage : xarray.Dataset
-        From `predict_map`.
-    cost : (ny, nx) int8 array
-        P(path gain <= threshold) [percent], at most `LiveSettings.max_cost`, on the cells of the newest map; -1 in
-        walls and unknown cells.
-    unknown_cost : (ny, nx) int8 array
-        Values of the unknown cells; -1 in all others.
-    header, info : dict
-        Fields of the `nav_msgs/OccupancyGrid` of the newest map.
-    age_s : float
-        Time since the predicted map arrived [s].
-    """
-
-    name: str
-    map_number: int
-    is_final: bool
-    coverage: xr.Dataset
-    cost: NDArray[np.int8]
-    unknown_cost: NDArray[np.int8]
-    header: dict[str, Any]
-    info: dict[str, Any]
-    age_s: float
-
-    def message(self, *, unknown: bool = False) -> dict[str, Any]:
-        """Return a `nav_msgs/OccupancyGrid` of `cost` or `unknown_cost` as a dict."""
-        data = self.unknown_cost if unknown else self.cost
-        return {"header": self.header, "info": self.info, "data": data.ravel().tolist()}
-
-
-class LiveTransmitter(NamedTuple):
-    """Position of a transmitter that was located by measured powers.
-
-    Parameters
-    ----------
-    name : str
-    position_m : (3,) array
-        Position with the smallest expected distance [m].
-    x_m, y_m : (nx,) and (ny,) arrays
-        Centres of cells [m].
-    probability : (ny, nx) array
-        Probability of each cell.
-    header : dict
-        Header of the newest map.
-    """
-
-    name: str
-    position_m: Floats
-    x_m: Floats
-    y_m: Floats
-    probability: Floats
-    header: dict[str, Any]
-
-    @property
-    def region(self) -> Bools:
-        """The smallest set of cells (ny, nx) with 90 % probability."""
-        return likely_region(self.probability)
-
-    @property
-    def area_m2(self) -> float:
-        """Area of the region [m2]."""
-        return float(self.region.sum()) * self._step_m**2
-
-    @property
-    def _step_m(self) -> float:
-        return next((float(axis_m[1] - axis_m[0]) for axis_m in (self.x_m, self.y_m) if len(axis_m) > 1), 1.0)
-
-    def message(self) -> dict[str, Any]:
-        """Return a `geometry_msgs/PoseWithCovarianceStamped` as a dict."""
-        apart_m = np.stack(np.meshgrid(self.x_m, self.y_m), axis=-1) - self.position_m[:2]
-        covariance = np.zeros((6, 6))
-        covariance[:2, :2] = np.einsum("yx,yxi,yxj->ij", self.probability, apart_m, apart_m)
-        pose = {"position": _named(*self.position_m.tolist()), "orientation": _named(0.0, 0.0, 0.0, 1.0)}
-        return {"header": self.header, "pose": {"pose": pose, "covariance": covariance.ravel().tolist()}}
-
-    def region_message(self) -> dict[str, Any]:
-        """Return a `nav_msgs/OccupancyGrid` as a dict: 100 in the region, 0 around it."""
-        step_m = self._step_m
-        origin = (float(self.x_m[0]) - step_m / 2, float(self.y_m[0]) - step_m / 2, 0.0)
-        info = _grid_info(self.probability.shape, step_m, origin, self.header["stamp"])
-        return {"header": self.header, "info": info, "data": (100 * self.region).ravel().tolist()}
-
-
-class LiveViews(NamedTuple):
-    """Next views on one map."""
-
-    views: NextViews
-    header: dict[str, Any]
-
-    def message(self) -> dict[str, Any]:
-        """Return a `geometry_msgs/PoseArray` as a dict."""
-        return {"header": self.header, "poses": self.views.poses()}
-
-
-LiveAnswer: TypeAlias = LiveGrid | LiveTransmitter | LiveViews
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    percent: NDArray[np.integer[Any]]
-    resolution_m: float
-    origin: tuple[float, float, float]
-    frame: str
-    stamp: tuple[int, int]
-    partial: PartialMap
-    number: int
-    came_s: float
-
-    @property
-    def key(self) -> tuple[object, ...]:
-        return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
-
-    @property
-    def header(self) -> dict[str, Any]:
-        return {"stamp": dict(zip(("sec", "nanosec"), self.stamp, strict=True)), "frame_id": self.frame}
-
-    @property
-    def info(self) -> dict[str, Any]:
-        return _grid_info(self.percent.shape, self.resolution_m, self.origin, self.header["stamp"])
-
-    def costs(
-        self, axes_m: tuple[Floats, Floats], spacing_m: float, p_below: Floats, max_cost: int
-    ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the costs of free and of unknown cells as `cost_grid`, -1 elsewhere."""
-        x, y, yaw = self.origin
-        rows, columns = ((np.arange(n) + 0.5) * self.resolution_m for n in self.percent.shape)
-        x_m = x + math.cos(yaw) * columns - math.sin(yaw) * rows[:, None]
-        y_m = y + math.sin(yaw) * columns + math.cos(yaw) * rows[:, None]
-        points_m = np.stack([x_m, y_m], axis=-1)
-        cost = cost_grid(axes_m, spacing_m, p_below, points_m, max_cost)
-        state = self.partial.state_at(points_m)
-        state[(self.percent < 0) | (self.percent > 100)] = CellState.UNKNOWN
-        free, unknown = (np.where(state == kind, cost, np.int8(-1)) for kind in (CellState.FREE, CellState.UNKNOWN))
-        return free, unknown
-
-
-def _named(*values: float) -> dict[str, float]:
-    return dict(zip("xyzw", values, strict=False))
-
-
-def _grid_info(
-    shape: tuple[int, ...], resolution_m: float, origin: tuple[float, float, float], stamp: dict[str, int]
-) -> dict[str, Any]:
-    x, y, yaw = origin
-    pose = {"position": _named(x, y, 0.0), "orientation": _named(0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2))}
-    sizes = {"resolution": resolution_m, "width": shape[1], "height": shape[0]}
-    return {"map_load_time": stamp, **sizes, "origin": pose}
-
-
 class _NewerMap(Exception):
     """A newer map is waiting."""
 
@@ -307,7 +152,7 @@ class LiveCoverage:
     await_frequency : bool
         Whether the carrier frequency comes with the first message of a connection instead of `trace_settings`.
     **model
-        `predictor`, `trace_settings` and `scene_settings` of `LinkModel`.
+        `predictor`, `trace_settings` (28 GHz by default) and `scene_settings` of `LinkModel`.
 
     Raises
     ------
@@ -347,8 +192,8 @@ class LiveCoverage:
         self._model: LinkModel | None = None
         self._changed = threading.Condition()
         self._closed = False
-        self._newest: _Grid | None = None
-        self._waiting: _Grid | None = None
+        self._newest: MapMessage | None = None
+        self._waiting: MapMessage | None = None
         self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
@@ -451,7 +296,7 @@ class LiveCoverage:
 
     def run(self) -> None:
         """Compute maps until `close` is called and none is waiting."""
-        if self._waiting is None:
+        if self._waiting is None and not self._closed:
             self._guarded("", self._warm_up)
         while self.step() or not self._closed:
             with self._changed:
@@ -470,7 +315,7 @@ class LiveCoverage:
         return thread
 
     def close(self) -> None:
-        """End `run` after the current and the waiting map."""
+        """End `run` after the current and the waiting map, and the last powers."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -483,7 +328,8 @@ class LiveCoverage:
                     self.report("the map waits for a connection, which has the carrier frequency.")
                 return False
             now_s, grid = time.monotonic(), self._waiting
-            if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
+            is_due = self._closed or now_s - self._stepped_s >= self.settings.refresh_s
+            if grid is None and self._new_powers and is_due:
                 grid = self._newest
             self._waiting, every_s = None, self.settings.views_every_s
             wanted = self._views_wanted or 0.0 < every_s <= now_s - self._views_s
@@ -517,7 +363,9 @@ class LiveCoverage:
             raise MapError(f"it is {age_s:.2f} s older than the last one.")
         partial = map_of_percent(values, resolution_m, origin[:2], origin[2])
         number = 1 if last is None else last.number + 1
-        grid = _Grid(values.astype(np.int16), resolution_m, origin, frame, stamp, partial, number, time.monotonic())
+        grid = MapMessage(
+            values.astype(np.int16), resolution_m, origin, frame, stamp, partial, number, time.monotonic()
+        )
         if last is None or grid.key != last.key:
             with self._changed:
                 self.frame, self._newest, self._waiting = frame, grid, grid
@@ -533,7 +381,7 @@ class LiveCoverage:
             if what:
                 self.report(f"{what} not answered: {reason_of(error)}")
 
-    def _compute(self, grid: _Grid) -> None:
+    def _compute(self, grid: MapMessage) -> None:
         partial = self._extended(grid.partial)
         if self._model is None:
             self._model = LinkModel(partial, **self._model_settings)
@@ -578,11 +426,11 @@ class LiveCoverage:
         if self._waiting is not None:
             raise _NewerMap
 
-    def _each(self, grid: _Grid, *, is_final: bool, report: Progress = no_progress) -> None:
+    def _each(self, grid: MapMessage, *, is_final: bool, report: Progress = no_progress) -> None:
         for name, tx_m in self.tx_m.items():
             self._guarded(f"map for {name}" if is_final else "", self._answer, grid, name, tx_m, is_final, report)
 
-    def _answer(self, grid: _Grid, name: str, tx_m: Floats | None, is_final: bool, report: Progress) -> None:
+    def _answer(self, grid: MapMessage, name: str, tx_m: Floats | None, is_final: bool, report: Progress) -> None:
         assert self._model is not None
         measured = self._measured(name, tx_m)
         if tx_m is None and (measured is None or not is_final):
@@ -615,29 +463,30 @@ class LiveCoverage:
     def _receivers(
         self, partial: PartialMap, coverage: xr.Dataset, tx_m: Floats | None
     ) -> tuple[tuple[Floats, Floats], float, Floats]:
-        """Return axes, spacing and P(too small a gain) of the receivers, with `tx_m` bounds for those of a final grid.
-
-        A bound is the largest probability of the coarse receivers around, and 1 out of the transmitter's sight, where
-        the gain may change within one spacing.
-        """
-        p_below = 1.0 - probability_above(coverage, self.settings.threshold_db)
+        """Return axes, spacing and P(too small a gain) of receivers; with `tx_m` bounds for those of a final grid."""
         axes_m, spacing_m = (coverage["y"].to_numpy(), coverage["x"].to_numpy()), float(coverage.attrs["spacing_m"])
         if tx_m is None:
-            return axes_m, spacing_m, p_below
+            return axes_m, spacing_m, 1.0 - probability_above(coverage, self.settings.threshold_db)
         assert self._model is not None
-        worst = maximum_filter(np.nan_to_num(p_below, nan=-1.0), size=3, mode="nearest")
         x_m, y_m = grid_axes(partial, self.settings.spacing_m)
         near = [
             np.clip(np.rint((fine_m - coarse_m[0]) / spacing_m).astype(int), 0, len(coarse_m) - 1)
             for fine_m, coarse_m in zip((y_m, x_m), axes_m, strict=True)
         ]
-        bound = worst[np.ix_(*near)]
-        grid_m = np.meshgrid(x_m, y_m)
-        rx_m = np.stack([*grid_m, np.full(bound.shape, self.settings.rx_height_m)], axis=-1).reshape(-1, 3)
-        line_m = np.broadcast_to(tx_m, rx_m.shape), rx_m
+
+        def largest(size: int, margin_db: float) -> Floats:
+            above = probability_above(coverage, min(self.settings.threshold_db + margin_db, 0.0))
+            p_below = maximum_filter(np.nan_to_num(1.0 - above, nan=-1.0), size=size, mode="nearest")[np.ix_(*near)]
+            return np.where(p_below < 0.0, 1.0, p_below)
+
+        bound = largest(3, 0.0)
+        rx_m = np.stack([*np.meshgrid(x_m, y_m), np.full(bound.shape, self.settings.rx_height_m)], axis=-1)
+        line_m = np.broadcast_to(tx_m, rx_m.shape).reshape(-1, 3), rx_m.reshape(-1, 3)
         hidden = walled_lengths_m(self._model.partial, *line_m) > 0.0
         hidden |= lengths_in_unknown_m(self._model.partial, *line_m) > 0.0
-        return (y_m, x_m), self.settings.spacing_m, np.where(hidden.reshape(bound.shape) | (bound < 0.0), 1.0, bound)
+        # behind opaque walls, a reflection may end between two receivers
+        behind = largest(5, BETWEEN_DB) if self._model.simulation.trace_settings.through_walls else 1.0
+        return (y_m, x_m), self.settings.spacing_m, np.where(hidden.reshape(bound.shape), behind, bound)
 
     def _measured(self, name: str, tx_m: Floats | None) -> Measurements | None:
         with self._changed:

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from sionna_partial.checks import Checked, require, require_whole, shown
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.live.coverage import LiveAnswer, LiveCoverage, LiveTransmitter, LiveViews
+from sionna_partial.live.answers import LiveAnswer, LiveTransmitter, LiveViews
+from sionna_partial.live.coverage import LiveCoverage
 from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
 from sionna_partial.resources import optional_packages
 
@@ -131,16 +132,16 @@ class Topics(Checked):
         types = {f"{self.prefix}/next_views": VIEWS_TYPE}
         for name, position in names.items():
             topic = f"{self.prefix}/{name}"
-            types |= {topic: GRID_TYPE, f"{topic}/filter_info": FILTER_TYPE}
-            types |= {f"{topic}/unknown": GRID_TYPE} if self.unknown else {}
+            for grid in (topic, f"{topic}/unknown") if self.unknown else (topic,):
+                types |= {grid: GRID_TYPE, f"{grid}/filter_info": FILTER_TYPE}
             types |= {f"{topic}/position": POSE_TYPE, f"{topic}/region": GRID_TYPE} if position is None else {}
         return types
 
     def messages(self, answer: LiveAnswer, sent: Container[str] = ()) -> dict[str, tuple[str, dict[str, Any]]]:
         """Return topic, message and type of each part of an answer.
 
-        The first grid comes with the topic for nav2's keepout filter, which would start again with each such message:
-        it is not among topics that have been `sent`.
+        The first grid comes with its topic for nav2's keepout filter. The filter starts again with each such message,
+        which is left out once it has been `sent`.
         """
         if isinstance(answer, LiveViews):
             return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
@@ -151,9 +152,10 @@ class Topics(Checked):
         messages = {topic: (GRID_TYPE, answer.message())}
         if self.unknown:
             messages[f"{topic}/unknown"] = GRID_TYPE, answer.message(unknown=True)
-        if f"{topic}/filter_info" not in sent:
-            info = {"header": answer.header, "type": KEEPOUT, "filter_mask_topic": topic}
-            messages[f"{topic}/filter_info"] = FILTER_TYPE, info | {"base": 0.0, "multiplier": 1.0}
+        for grid in [*messages]:
+            if f"{grid}/filter_info" not in sent:
+                info = {"header": answer.header, "type": KEEPOUT, "filter_mask_topic": grid}
+                messages[f"{grid}/filter_info"] = FILTER_TYPE, info | {"base": 0.0, "multiplier": 1.0}
         return messages
 
 
