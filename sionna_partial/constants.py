@@ -38,6 +38,9 @@ DRYWALL_CONDUCTIVITY_EXPONENT = 0.9395
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
 
+COST_THRESHOLD_DB = -100.0
+"""Default path gain up to which a cell of a cost grid counts as not covered [dB]."""
+
 MAX_COST = 98
 """Largest value of a cost grid [percent]: nav2 reads 99 as an inscribed obstacle and 100 as an obstacle."""
 

@@ -48,7 +48,7 @@ def run_demo(
     report(0.85, "writing")
     with atomic_files(output_path(out)) as folder:
         for suffix in FORMATS:
-            save_coverage(coverages[PARTIAL], folder / f"coverage{suffix}")
+            save_coverage(coverages[PARTIAL], folder / f"coverage{suffix}", scene=known)
         (folder / "comparison.png").write_bytes(figure_png(plot_comparison(coverages)))
         (folder / "table.txt").write_text(table, encoding="utf-8")
     report(1.0, "done")

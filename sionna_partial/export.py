@@ -9,12 +9,22 @@ from typing import Any
 import numpy as np
 import xarray as xr
 import yaml
+from numpy.typing import ArrayLike
 
-from sionna_partial.constants import MAX_COST, NO_RECEIVER
-from sionna_partial.coverage.dataset import ANTENNA, ATTRIBUTES, TX_COORDINATES, require_coverage, transmitters_of
+from sionna_partial.arrays import Floats
+from sionna_partial.constants import COST_THRESHOLD_DB, MAX_COST, NO_RECEIVER, CellState
+from sionna_partial.coverage.dataset import (
+    ANTENNA,
+    ATTRIBUTES,
+    TX_COORDINATES,
+    cost_grid,
+    probability_above,
+    transmitters_of,
+)
 from sionna_partial.coverage.network import VARIABLES, require_network
 from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5, write_netcdf
+from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, require_map
 from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
@@ -30,7 +40,13 @@ MAX_BYTES, MAX_ARRAY_BYTES = 500_000_000, 4_000_000_000
 LINK_STATES = ("link_state", "partial_link_state")
 
 
-def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
+def save_coverage(
+    coverage: xr.Dataset,
+    path: str | os.PathLike[str],
+    *,
+    scene: PartialMap | None = None,
+    threshold_db: ArrayLike = COST_THRESHOLD_DB,
+) -> None:
     """Write a coverage map in the format of the suffix. Equal maps give equal files.
 
     ======== ==========================================================================================
@@ -43,9 +59,9 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     `.png`   The picture of `plot_coverage`.
     `.html`  A page for the browser, without network access: layers, values under the pointer, P(gain > threshold),
              and the best server of several transmitters.
-    `.yaml`  ROS map_server map in `raw` mode with a `.pgm`: occupancy 0 to 98 is the probability of outage in
-             percent; unknown (-1) without receiver and in unknown cells (`docs/live.md`). One transmitter; for
-             several, save `network_map`.
+    `.yaml`  Costs for a planner: ROS map_server map in `raw` mode with a `.pgm`, as `LiveCoverage` publishes them
+             (`docs/live.md`). Free cells have P(path gain <= threshold) in percent, at most 98, of several transmitters
+             the smallest (an upper bound on the probability for all); walls and unknown cells are -1.
     ======== ==========================================================================================
 
     Parameters
@@ -54,11 +70,17 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
         From `predict_map`.
     path : path-like
         Path of the file, which is replaced if it exists.
+    scene : PartialMap, optional
+        Map whose cells the costs of a `.yaml` are for; without it they are for the receivers, as a picture.
+    threshold_db : float or (T,) array-like
+        Of a `.yaml`: path gain that a receiver needs [dB], from all or each of the T transmitters.
 
     Raises
     ------
     SettingsError
-        For anything but a coverage map, or several transmitters as `.yaml`.
+        For anything but a coverage map, or another threshold than -150 to 0 dB.
+    MapError
+        For anything but a PartialMap as `scene`.
     OutputError
         For another suffix, or if writing fails; no partial file remains.
 
@@ -71,8 +93,13 @@ def save_coverage(coverage: xr.Dataset, path: str | os.PathLike[str]) -> None:
     """
     target, suffix = _target(path, FORMATS)
     maps = transmitters_of(coverage)
+    if scene is not None:
+        require_map("scene", scene)
     if suffix == ".yaml":
-        _write_ros_map(require_coverage(coverage), "p_outage", target)
+        thresholds_db = np.broadcast_to(threshold_db, len(maps)).tolist()
+        p_below = [1.0 - probability_above(*each) for each in zip(maps.values(), thresholds_db, strict=True)]
+        event = f"path gain up to {' or '.join(f'{each:g}' for each in dict.fromkeys(thresholds_db))} dB"
+        _write_ros_map(coverage, np.fmin.reduce(p_below), event, scene, target)
     else:
         one = coverage if "tx" in coverage.dims else maps[""]
         content = _ENCODERS[suffix](one)  # complete before the disk is touched
@@ -115,10 +142,10 @@ def load_coverage(path: str | os.PathLike[str]) -> xr.Dataset:
     return coverage
 
 
-def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
+def save_network(network: xr.Dataset, path: str | os.PathLike[str], *, scene: PartialMap | None = None) -> None:
     """Write a network map as `.nc` (everything), `.tif`, `.csv` (both without `p_best`), `.png` or `.yaml`.
 
-    The `.yaml` is a ROS map of the probability that all transmitters are in outage, see `save_coverage`.
+    The `.yaml` has costs, as `save_coverage` writes them, of the probability that all transmitters are in outage.
 
     Parameters
     ----------
@@ -126,6 +153,8 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
         From `network_map`.
     path : path-like
         Path of the file.
+    scene : PartialMap, optional
+        As of `save_coverage`.
 
     Raises
     ------
@@ -151,7 +180,7 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str]) -> None:
     }
     target, suffix = _target(path, (*encoders, ".yaml"))
     if suffix == ".yaml":
-        _write_ros_map(network, "p_all_outage", target)
+        _write_ros_map(network, network["p_all_outage"].to_numpy(), "outage of all links", scene, target)
         return
     content = encoders[suffix]()
     with atomic_write(target) as stream:
@@ -241,13 +270,17 @@ def _encode_table(table: Any) -> bytes:
     return bytes(table.to_csv(index=False, lineterminator="\n"), "utf-8")
 
 
-def _write_ros_map(coverage: xr.Dataset, p_outage: str, path: Path) -> None:
-    spacing_m = float(coverage.attrs["spacing_m"])
-    corner_m = [float(coverage[name][0]) - spacing_m / 2 for name in ("x", "y")]
-    quantity = {"quantity": f"probability of outage in percent, at most {MAX_COST}; 255 where unknown or no receiver"}
-    sheet = ros_sheet(path, "raw", spacing_m, corner_m) | quantity
-    cost = np.minimum(np.rint(100 * coverage[p_outage].where(coverage["observed"]).to_numpy()), MAX_COST)
-    percent = np.nan_to_num(cost, nan=NO_RECEIVER).astype(np.uint8)
+def _write_ros_map(coverage: xr.Dataset, p_below: Floats, event: str, scene: PartialMap | None, path: Path) -> None:
+    if scene is None:
+        step_m, state = float(coverage.attrs["spacing_m"]), coverage["cell_state"].to_numpy().astype(np.uint8)
+        x_m, y_m = (float(coverage[name][0]) - step_m / 2 for name in ("x", "y"))
+        scene = PartialMap(state, step_m, (x_m, y_m))
+    rows, columns = np.indices(scene.shape)
+    axes_m, points_m = (coverage["y"].to_numpy(), coverage["x"].to_numpy()), np.stack([rows, columns], axis=-1)
+    cost = cost_grid(axes_m, float(coverage.attrs["spacing_m"]), p_below, cell_centres_m(scene, points_m))
+    percent = np.where((scene.state == CellState.FREE) & (cost >= 0), cost, NO_RECEIVER).astype(np.uint8)
+    quantity = {"quantity": f"probability of {event} in percent, at most {MAX_COST}; 255 is unknown"}
+    sheet = ros_sheet(path, "raw", scene.resolution_m, scene.origin_m) | quantity
     write_ros_files(
         path, yaml.safe_dump(sheet, sort_keys=False, default_flow_style=None), {path.with_suffix(".pgm"): percent}
     )

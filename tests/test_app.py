@@ -306,7 +306,9 @@ class TestFiles:
             content = window.session.file(kind)
             assert content.startswith(start)
             assert content == window.session.file(kind)
-        assert [*unzipped(window.session.file("yaml"), 10**7)] == ["coverage.pgm", "coverage.yaml"]
+        costs = unzipped(window.session.file("yaml"), 10**7)
+        assert [*costs] == ["coverage.pgm", "coverage.yaml"]
+        assert costs["coverage.pgm"].startswith(b"P5\n%d %d\n" % PARTIAL.shape[::-1])  # the cells of the map
 
     def test_measurements_are_counted_kept_dropped_and_forgotten(self, window: Window) -> None:
         session = window.session

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from sionna_partial import cli
 from sionna_partial.constants import CellState
 from sionna_partial.coverage.network import network_map
-from sionna_partial.errors import OutputError, SettingsError
+from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
 from sionna_partial.maps.map_files import load_map, save_map
 
@@ -65,23 +65,41 @@ def test_csv_has_a_row_for_each_receiver(coverage, tmp_path):
     assert pd.read_csv(tmp_path / "coverage.csv")["x_m"][0] == 499_999.125
 
 
-def test_ros_map_holds_the_probability_of_outage_and_loads_as_a_map(coverage, tmp_path):
+def occupancy_of(path):
     """As nav2_map_server reads it in raw mode: shades 0 to 98 are occupancies, others unknown, row 0 is the top."""
-    coverage = coverage.assign(p_outage=coverage["p_outage"] + coverage["p_los"], p_los=0.0 * coverage["p_los"])
-    save_coverage(coverage, tmp_path / "outage.yaml")
-    sheet = yaml.safe_load((tmp_path / "outage.yaml").read_text())
-    assert (sheet["mode"], sheet["negate"], sheet["image"]) == ("raw", 0, "outage.pgm")
-    occupancy = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(int)
-    p_outage, known = coverage["p_outage"].to_numpy(), (coverage["valid"] & coverage["observed"]).to_numpy()
-    loaded = load_map(tmp_path / "outage.yaml")
-    assert (occupancy[~known] == 255).all()
-    assert (np.abs(occupancy - np.minimum(100 * p_outage, 98))[known] <= 0.5).all()
-    assert (known & (p_outage > 0.99)).any()
-    assert (~known & coverage["valid"].to_numpy()).any()
-    p_outage[~known] = np.nan
-    assert (loaded.shape, loaded.resolution_m, loaded.origin_m) == (p_outage.shape, 0.25, (-1.0, 2.0))
-    assert (loaded.state[p_outage > 0.66] == CellState.WALL).all()
-    assert (loaded.state[np.isnan(p_outage)] == CellState.UNKNOWN).all()
+    sheet = yaml.safe_load(path.read_text())
+    assert (sheet["mode"], sheet["negate"], sheet["image"]) == ("raw", 0, f"{path.stem}.pgm")
+    shades = np.flipud(np.asarray(Image.open(path.with_suffix(".pgm")))).astype(int)
+    return sheet, np.where(shades <= 100, shades, -1)
+
+
+def test_costs_are_on_the_cells_of_the_map_and_below_the_threshold(coverage, tmp_path):
+    scene = map_of(PICTURE)
+    save_coverage(coverage, tmp_path / "cost.yaml", scene=scene, threshold_db=-62.0)
+    sheet, cost = occupancy_of(tmp_path / "cost.yaml")
+    assert (cost.shape, sheet["resolution"], sheet["origin"]) == (scene.shape, 0.5, [-1.0, 2.0, 0.0])
+    assert ((cost >= 0) == (scene.state == CellState.FREE)).all()
+    p_below = 1.0 - coverage.radio.probability_above(-62.0)
+    for row, column in np.argwhere(scene.state == CellState.FREE):
+        x, y = -1.0 + 0.5 * (column + 0.5), 2.0 + 0.5 * (row + 0.5)  # in the middle of four receivers
+        near = np.minimum(100 * p_below.sel(x=slice(x - 0.2, x + 0.2), y=slice(y - 0.2, y + 0.2)), 98)
+        assert np.isnan(near).any() or np.abs(near - cost[row, column]).min() < 0.51
+    assert cost.max() == 98
+    assert 0 <= cost[cost >= 0].min() < 20
+    save_coverage(coverage, tmp_path / "all.yaml", scene=scene, threshold_db=-150.0)
+    assert occupancy_of(tmp_path / "all.yaml")[1].max() <= round(100 * float(coverage["p_outage"].max()))
+    with pytest.raises(MapError, match="scene is of type str: give a PartialMap"):
+        save_coverage(coverage, tmp_path / "cost.yaml", scene="map.yaml")
+
+
+def test_without_a_map_costs_are_on_the_receivers(coverage, tmp_path):
+    save_coverage(coverage, tmp_path / "cost.yaml")
+    sheet, cost = occupancy_of(tmp_path / "cost.yaml")
+    assert (cost.shape, sheet["resolution"]) == (coverage["valid"].shape, 0.25)
+    assert ((cost >= 0) == (coverage["cell_state"] == CellState.FREE).to_numpy()).all()
+    loaded = load_map(tmp_path / "cost.yaml")
+    assert (loaded.state[cost > 66] == CellState.WALL).all()
+    assert (loaded.state[cost < 0] == CellState.UNKNOWN).all()
 
 
 def test_equal_maps_give_equal_files(coverage, tmp_path):
@@ -131,23 +149,21 @@ class TestSeveralTransmitters:
 
     def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
         network = network_map(several, n=50)
-        save_network(network, tmp_path / "outage.yaml")
-        percent = np.flipud(np.asarray(Image.open(tmp_path / "outage.pgm"))).astype(float)
-        expected = np.minimum(100 * network["p_all_outage"].where(network["observed"]).to_numpy(), 98)
-        np.testing.assert_allclose(np.where(percent == 255, np.nan, percent), expected, atol=0.5)
-        assert yaml.safe_load((tmp_path / "outage.yaml").read_text())["origin"] == [-1.0, 2.0, 0.0]
+        save_network(network, tmp_path / "outage.yaml", scene=map_of(PICTURE))
+        _, cost = occupancy_of(tmp_path / "outage.yaml")
+        assert ((cost >= 0) == (map_of(PICTURE).state == CellState.FREE)).all()
+        assert (cost.max() > 0) == bool((network["p_all_outage"].where(network["observed"] == 1) > 0.005).any())
 
-    @pytest.mark.parametrize(
-        ("choose", "message"),
-        [
-            ({}, r"transmitters west, <b>east\$}\$: choose one, as by coverage\.isel\(tx=0\)"),
-            ({"tx": [0, 0]}, r"coverage\.tx = \['west', 'west'\] is not allowed: give each a name"),
-        ],
-    )
-    def test_a_ros_map_needs_one_transmitter(self, several, tmp_path, choose, message):
-        with pytest.raises(SettingsError, match=message):
-            save_coverage(several.isel(choose), tmp_path / "outage.yaml")
-        assert not list(tmp_path.iterdir())
+    def test_costs_of_several_are_the_smallest(self, several, tmp_path):
+        thresholds_db = [-62.0, -80.0]
+        save_coverage(several, tmp_path / "all.yaml", scene=map_of(PICTURE), threshold_db=thresholds_db)
+        each = []
+        for at, threshold_db in enumerate(thresholds_db):
+            save_coverage(several.isel(tx=at), tmp_path / "one.yaml", scene=map_of(PICTURE), threshold_db=threshold_db)
+            each.append(occupancy_of(tmp_path / "one.yaml")[1])
+        np.testing.assert_array_equal(occupancy_of(tmp_path / "all.yaml")[1], np.min(each, axis=0))
+        with pytest.raises(SettingsError, match=r"coverage\.tx = \['west', 'west'\] is not allowed: give each a name"):
+            save_coverage(several.isel(tx=[0, 0]), tmp_path / "twice.yaml")
 
 
 @pytest.mark.parametrize("name", ["coverage.nc.gz"])

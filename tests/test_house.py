@@ -62,7 +62,7 @@ ROOMS = {
     "calibration": ("material_fit", "calibration"),
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
-    "live": ("coverage", "topics"),
+    "live": ("answers", "coverage", "topics"),
     "datasets": ("shards", "home_links", "dataset"),
     "evaluation": ("evaluation",),
     "training": ("predictor", "paths", "walls"),

@@ -2,21 +2,18 @@
 
 import logging
 import math
-import re
 from pathlib import Path
 from types import SimpleNamespace as Fields
 from typing import Any
 
 import numpy as np
 import pytest
-import yaml
-from typer.testing import CliRunner
+from PIL import Image
 
 import sionna_partial as sp
-from sionna_partial import cli
 from sionna_partial.errors import SettingsError
 from sionna_partial.live import topics
-from sionna_partial.live.coverage import LiveGrid, LiveViews
+from sionna_partial.live.answers import LiveGrid, LiveTransmitter, LiveViews
 from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
@@ -47,13 +44,16 @@ def grown(cells: Any = ROOM) -> list[list[int]]:
 
 
 class TestOrder:
-    def test_coarse_then_fine_as_predict_map(self) -> None:
+    def test_coarse_then_fine_as_predict_map(self, tmp_path: Path) -> None:
         heard = Heard()
         heard.live.on_map(message())
         assert heard.step() == [(1, False), (1, True)]
         assert heard[0].coverage.attrs["spacing_m"] == 0.8
         expected = sp.predict_map(sp.map_from_occupancy(message()), TX, spacing_m=0.2)
         assert heard[-1].coverage.identical(expected)
+        sp.save_coverage(expected, tmp_path / "cost.yaml", scene=sp.map_from_occupancy(message()))
+        percent = np.flipud(np.asarray(Image.open(tmp_path / "cost.pgm"))).astype(int)
+        np.testing.assert_array_equal(np.where(percent == 255, -1, percent), heard[-1].cost)
         assert heard.step() == []
         heard.live.on_map(message(sec=6))
         assert heard.step() == []
@@ -139,15 +139,47 @@ class TestMaps:
 
 
 class TestTransmitters:
+    def test_outside_the_map_that_slam_has_so_far(self) -> None:
+        """Outside is unknown: the grid is that of a map with unknown cells up to the transmitter."""
+        heard, tx = Heard(), (8.5, 1.5, 1.5)
+        heard.live.on_map(message())
+        assert heard.step() == [(1, False), (1, True)]
+        heard.live.on_transmitter("tx", tx)
+        assert heard.step() == [(1, False), (1, True)]
+        assert heard[-1].cost.shape == np.shape(ROOM)
+        wide = sp.map_from_occupancy(message(np.pad(ROOM, ((1, 1), (1, 9)), constant_values=-1), at=(-1.0, -1.0)))
+        expected = sp.predict_map(wide, tx, spacing_m=0.2, area_m=(0.0, 0.0, 5.0, 4.0))
+        for name in ("p_los", "gain_mean_db", "unobserved_distance_m"):
+            np.testing.assert_allclose(heard[-1].coverage[name], expected[name], atol=1e-3, err_msg=name)
+        assert float(heard[-1].coverage["unobserved_distance_m"].max()) > 4.0
+        with pytest.raises(SettingsError, match=r"area_m = .* is not allowed: give x and y of two corners on the map"):
+            sp.predict_map(wide, tx, spacing_m=0.2, area_m=(0.0, 0.0, 50.0, 4.0))
+
+    @pytest.mark.parametrize(("frequency_hz", "threshold_db"), [(28e9, -100.0), (5.2e9, -80.0)])
+    def test_coarse_costs_are_upper_bounds(self, frequency_hz: float, threshold_db: float) -> None:
+        partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
+        grids: list[Any] = []
+        settings = sp.LiveSettings(spacing_m=0.3, threshold_db=threshold_db)
+        trace_settings = sp.TraceSettings(frequency_hz=frequency_hz)
+        live = sp.LiveCoverage((7.0, 9.8, 1.5), grids.append, settings, trace_settings=trace_settings)
+        sent = message(np.array([0, 100, -1])[partial.state], at=partial.origin_m)
+        sent.info.resolution = partial.resolution_m
+        live.on_map(sent)
+        live.step()
+        coarse, final = (grid.cost.astype(int) for grid in grids)
+        assert ((coarse >= 0) == (final >= 0)).mean() > 0.999
+        assert (final - coarse)[(final >= 0) & (coarse >= 0)].max() <= 4
+        assert coarse[final >= 0].min() < 50  # they still tell something
+
     def test_by_name(self, caplog: pytest.LogCaptureFixture) -> None:
-        heard = Heard({"desk": TX, "door": (3.4, 2.4, 2.0), "far": (90.0, 1.0, 1.0)})
+        heard = Heard({"desk": TX, "door": (3.4, 2.4, 2.0), "far": (290.0, 1.0, 1.0)})
         heard.live.on_map(message())
         heard.step()
         assert [each.name for each in heard] == ["desk", "door"] * 2
-        assert "map for far not answered" in caplog.text
+        assert "tx far is 285 m outside the map, more than 200 m: check its unit and its frame" in caplog.text
 
     def test_refused(self) -> None:
-        for tx in ((1.0, math.nan, 1.0), {}, {"a b": TX}, "here"):
+        for tx in ((1.0, math.nan, 1.0), {"a b": TX}, "here"):
             with pytest.raises(sp.SionnaPartialError, match="tx"):
                 sp.LiveCoverage(tx, print)
         with pytest.raises(SettingsError, match=r"powers\['/rssi'\] = 'attic' is not allowed: name one of the"):
@@ -179,21 +211,6 @@ class TestTransmitters:
             assert line in caplog.text
 
 
-@pytest.mark.usefixtures("command_line")
-def test_the_files_for_nav2_name_what_is_published() -> None:
-    nav2 = Path(__file__).parents[1] / "examples" / "nav2"
-    costmap = yaml.safe_load((nav2 / "nav2_params.yaml").read_text("utf-8"))["global_costmap"]["global_costmap"]
-    displays = yaml.safe_load((nav2 / "radio.rviz").read_text("utf-8"))["Visualization Manager"]["Displays"]
-    shown = {display["Topic"]["Value"] for display in displays}
-    assert {*Topics().published({"tx": None}), "/map"} <= shown
-    assert costmap["ros__parameters"]["use_maximum"]
-    assert costmap["ros__parameters"]["radio_layer"]["map_topic"] in shown
-    named = re.findall(r'"(--[a-z-]+)"', (nav2 / "radio.launch.py").read_text("utf-8"))
-    options = CliRunner().invoke(cli.app, ["live", "--help"]).output
-    assert named
-    assert [option for option in named if option not in options] == []
-
-
 def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
     heard = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0)
@@ -208,8 +225,8 @@ def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     assert grid.cost.max() == grid.unknown_cost.max() == 98  # nav2 reads 99 and 100 as obstacles
     assert len({*grid.cost.ravel().tolist()}) > 10
     assert (grid.unknown_cost >= 0).sum() > 0.9 * (percent == -1).sum()
-    assert list(Topics(unknown=True).messages(grid)) == ["/radio/tx", "/radio/tx/unknown"]
-    assert list(Topics().messages(grid)) == ["/radio/tx"]
+    assert [*Topics(unknown=True).messages(grid)][:2] == ["/radio/tx", "/radio/tx/unknown"]
+    assert list(Topics().messages(grid)) == ["/radio/tx", "/radio/tx/filter_info"]
     assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
 
 
@@ -314,6 +331,67 @@ class TestListener:
         assert isinstance(heard[0], LiveViews)
         assert [*heard[0].message()["poses"][0]] == ["position", "orientation"]
         assert [*listener.topics.messages(heard[0])] == ["/radio/next_views"]
+
+
+def connection(level: int, bssid: str = "AA:00:00:00:00:01", frequency: float = 5.2) -> Fields:
+    return Fields(signal_level=level, bssid=bssid, essid="home", frequency=frequency)
+
+
+class TestLocated:
+    def test_position_and_region_from_powers(self, caplog: pytest.LogCaptureFixture) -> None:
+        heard = Heard(None, spacing_m=0.5, refresh_s=0.1)
+        listener = Listener(heard.live, Topics(powers={"/rssi": None}))
+        listener.take("/map", message(np.kron(grown(), np.ones((3, 3), dtype=int))))
+        heard.step()
+        assert not heard
+        tx, free_m = (8.5, 6.5), [(3.6, 3.6), (5.1, 4.2), (7.4, 3.4), (10.2, 4.6), (4.4, 7.2), (6.6, 5.4), (9.8, 8.2)]
+        for number, at in enumerate(free_m):
+            heard.live.on_pose(*at, float(number))
+            power_dbm = 20.0 - 61.4 - 20.0 * math.log10(math.dist(at, tx))
+            listener.take("/rssi", Fields(data=power_dbm), float(number))
+        heard.live._stepped_s = -math.inf
+        assert heard.step() == [(1, True)]
+        grid, found = heard
+        assert isinstance(found, LiveTransmitter)
+        assert math.dist(found.position_m[:2], tx) < 3.0
+        assert grid.coverage.attrs["measured_links"] == len(free_m)
+        topics = listener.topics.messages(found)
+        assert {topic: kind for topic, (kind, _) in topics.items()} == {
+            topic: kind
+            for topic, kind in listener.topics.published(heard.live.tx_m).items()
+            if topic.endswith(("position", "region"))
+        }
+        region = topics["/radio/tx/region"][1]
+        assert {*region["data"]} == {0, 100}
+        assert region["info"]["width"] * region["info"]["height"] == len(region["data"])
+        variance = topics["/radio/tx/position"][1]["pose"]["covariance"][0]
+        assert 0.0 < variance < 30.0
+
+    def test_access_points_and_their_frequency_from_connections(self, caplog: pytest.LogCaptureFixture) -> None:
+        live = sp.LiveCoverage({}, print, await_frequency=True)
+        listener = Listener(live, Topics(connections={"/connection": None}))
+        listener.take("/map", message(grown()))
+        assert not live.step()  # it waits for the frequency
+        live.on_pose(1.5, 1.5, 1.0)
+        for frequency, bssid in ((5.18, "AA:00:00:00:00:01"), (5180.0, "AA:00:00:00:00:02"), (2.412, "BB:00"), (0, "")):
+            listener.take("/connection", connection(-60, bssid, frequency), 1.0)
+        assert live._model_settings["trace_settings"].frequency_hz == pytest.approx(5.18e9)
+        assert {name: len(powers) for name, powers in live._powers.items()} == {
+            "ap_aa0000000001": 1,
+            "ap_aa0000000002": 1,
+        }
+        assert "at 2.412 GHz: grids are at 5.18 GHz" in caplog.text
+        assert "it has no access point or frequency" in caplog.text
+
+    def test_a_named_one_is_not_mixed_with_others(self, caplog: pytest.LogCaptureFixture) -> None:
+        live = sp.LiveCoverage(None, print, await_frequency=True)
+        listener = Listener(live, Topics(connections={"/connection": None}))
+        listener.take("/map", message(grown()))
+        for number in (1, 2):
+            live.on_pose(1.5, float(number), 1.0)
+            listener.take("/connection", connection(-60, f"AA:00:00:00:00:0{number}"), 1.0)
+        assert len(live._powers["tx"]) == 1
+        assert "tx is the access point AA:00:00:00:00:01" in caplog.text
 
 
 def test_lines_are_not_repeated(caplog: pytest.LogCaptureFixture) -> None:

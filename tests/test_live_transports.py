@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -21,7 +22,10 @@ import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.live import topics as topics_module
 from sionna_partial.live.topics import (
+    CONNECTION_TYPE,
+    FILTER_TYPE,
     GRID_TYPE,
+    POSE_TYPE,
     VIEWS_TYPE,
     Dds,
     Listener,
@@ -44,7 +48,7 @@ LOOPBACK = (
     "<AllowMulticast>false</AllowMulticast></General><Discovery><ParticipantIndex>auto</ParticipantIndex>"
     "<Peers><Peer Address='localhost'/></Peers></Discovery></Domain></CycloneDDS>"
 )
-LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25"]
+LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25", "--frequency", "28GHz"]
 
 ROBOT = """
 import sys, time
@@ -71,13 +75,32 @@ def domain(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
 
 class TestDds:
     @pytest.mark.parametrize(
-        ("kind", "values"), [(GRID_TYPE, GRID), (VIEWS_TYPE, {"header": HEADER, "poses": [POSE, POSE]})]
+        ("kind", "values"),
+        [
+            (GRID_TYPE, GRID),
+            (VIEWS_TYPE, {"header": HEADER, "poses": [POSE, POSE]}),
+            (POSE_TYPE, {"header": HEADER, "pose": {"pose": POSE, "covariance": [0.0] * 36}}),
+        ],
     )
     def test_wire_format_is_that_of_ros(self, kind: str, values: dict[str, Any]) -> None:
         store = get_typestore(Stores.ROS2_HUMBLE)
         message = store.deserialize_cdr(filled(kind, values).serialize(), kind)
         assert (message.header.frame_id, message.header.stamp.nanosec) == ("map", 8)
         assert struct(kind).deserialize(bytes(store.serialize_cdr(message, kind))) == filled(kind, values)
+
+    def test_messages_that_no_type_store_has(self) -> None:
+        info = {"header": HEADER, "type": 0, "filter_mask_topic": "/radio/tx", "base": 0.0, "multiplier": 1.0}
+        message = struct(FILTER_TYPE).deserialize(filled(FILTER_TYPE, info).serialize())
+        assert (message.filter_mask_topic, message.multiplier) == ("/radio/tx", 1.0)
+        strings = dict.fromkeys(("link_quality_raw", "essid", "bssid"), "AA:00:00:00:00:01")
+        numbers = dict.fromkeys(("bitrate", "txpower", "link_quality", "signal_level", "noise_level"), -60)
+        connection = filled(CONNECTION_TYPE, {**strings, **numbers, "frequency": 5.18})
+        live = sp.LiveCoverage({}, print, await_frequency=True)
+        live.on_map(struct(GRID_TYPE).deserialize(filled(GRID_TYPE, GRID).serialize()))
+        live.on_pose(1.5, 1.5, 0.0)
+        live.on_connection(struct(CONNECTION_TYPE).deserialize(connection.serialize()), 0.0)
+        assert [len(powers) for powers in live._powers.values()] == [1]
+        assert struct(FILTER_TYPE).__idl_typename__ == "nav2_msgs.msg.dds_.CostmapFilterInfo_"
 
     def test_robot_in_another_process(self, domain: dict[str, str]) -> None:
         command = [sys.executable, "-m", "sionna_partial", "live", *LIVE]
@@ -203,6 +226,30 @@ class TestCommand:
         expected = sp.predict_map(sp.map_from_bag(path), (1.5, 1.5, 1.5), spacing_m=0.25)
         assert sp.load_coverage(out / "tx.nc").equals(expected)
 
+    def test_a_transmitter_is_located_at_the_end_of_a_recording(self, tmp_path: Path) -> None:
+        make, cells = Messages(2), np.pad(np.zeros((10, 12), dtype=int), 1, constant_values=100)
+        rows = [("/map", 0.0, make.grid(cells, (0.0, 0.0, 0.0)))]
+        for number, x in enumerate((1.2, 2.3, 3.4, 4.6, 5.2, 6.1), 1):
+            rows.append(("/tf", float(number), make.transform(number, "map", "base_link", x, 1.3, 0.0)))
+            rows.append(("/rssi", number + 0.1, make.power(-30.0 - 4.0 * abs(x - 5.0))))
+        bag, options = write_bag(tmp_path / "drive_mcap", rows), ["--frequency", "5.2GHz", "--spacing", "0.5"]
+        result = CliRunner().invoke(
+            cli.app, ["live", "--power", "/rssi", *options, "--bag", str(bag), "--rate", "0", "--out", str(tmp_path)]
+        )
+        assert result.exit_code == 0, result.output
+        final, found, _ = result.stdout.splitlines()
+        assert final.startswith("map 1, tx: final after")
+        x_m = re.fullmatch(r"tx: at \((.*), .*\) m, .* m2 hold 90 %", found)
+        assert x_m is not None
+        assert float(x_m[1]) == pytest.approx(5.0, abs=1.5)
+        assert "p_transmitter" in sp.load_coverage(tmp_path / "tx.nc")
+
     def test_refused(self, tmp_path: Path) -> None:
         result = CliRunner().invoke(cli.app, ["live", *LIVE, "--name", "a", "--name", "b"])
         assert (result.exit_code, "2 --name for 1 --tx" in result.stderr) == (2, True)
+        for words, line in (
+            (LIVE[:-2], "--frequency is missing: give for example 5.2GHz, or a --connection with it."),
+            (LIVE[-2:], "--tx is missing: give X Y Z, or --power, --key-values or --connection."),
+        ):
+            result = CliRunner().invoke(cli.app, ["live", *words])
+            assert (result.exit_code, line in " ".join(result.stderr.split())) == (2, True)

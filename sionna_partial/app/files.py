@@ -8,6 +8,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
+import numpy as np
 import xarray as xr
 
 from sionna_partial.app.jobs import logged_warnings
@@ -17,6 +18,7 @@ from sionna_partial.checks import require, shown
 from sionna_partial.constants import (
     BAG_SUFFIXES,
     DRAWING_SUFFIXES,
+    GAIN_FLOOR_DB,
     IFC_SUFFIXES,
     MESH_SUFFIXES,
     PICTURE_SUFFIXES,
@@ -24,7 +26,7 @@ from sionna_partial.constants import (
     VACUUM_SUFFIXES,
 )
 from sionna_partial.errors import MapError
-from sionna_partial.export import save_coverage, save_network
+from sionna_partial.export import save_coverage
 from sionna_partial.files import decoding, unzipped, zipped
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -104,20 +106,18 @@ def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
 def coverage_file(
     kind: str,
     coverage: xr.Dataset,
-    network: xr.Dataset | None,
     eirp_dbm: Floats,
     threshold_dbm: float,
     heading: Sequence[str] = (),
+    *,
+    scene: PartialMap | None = None,
 ) -> bytes:
-    """Return the content of one of `FILES`; a ROS map is a zip. `heading` is for the report."""
+    """Return the content of one of `FILES`. `heading` is for the report, `scene` for the ROS map, which is a zip."""
     if kind == "pdf":
         return report_pdf(coverage, eirp_dbm, threshold_dbm, heading)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         path = Path(folder) / f"coverage.{kind}"
-        if kind == "yaml" and network is not None:
-            save_network(network, path)
-        else:
-            save_coverage(coverage.isel(tx=0) if kind == "yaml" else coverage, path)
+        save_coverage(coverage, path, scene=scene, threshold_db=np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0))
         made = {each.name: each.read_bytes() for each in sorted(Path(folder).iterdir())}
         return made[path.name] if kind != "yaml" else zipped(made)
 

@@ -588,7 +588,7 @@ class Session:
             )
         threshold_dbm = answer.settings.threshold_dbm
         heading = self.title, f"{answer.made:%Y-%m-%d}"
-        return coverage_file(kind, answer.coverage, answer.network, answer.eirp_dbm, threshold_dbm, heading)
+        return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=self._map())
 
     def python(self) -> str:
         if self.partial is None or not self.transmitters:

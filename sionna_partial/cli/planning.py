@@ -21,6 +21,11 @@ _CSV_HELP = "Columns tx_x,tx_y,tx_z,rx_x,rx_y,rx_z [m], gain_db [dB]."
 _OBJECTIVE_HELP = "Mean predicted coverage, or the gain of the worst tenth of the receivers."
 
 _POWER_HELP = "Topic of std_msgs/Float32 with received powers, NAME=TOPIC of several transmitters; may be repeated."
+_CONNECTION_HELP = (
+    "Topic of wireless_msgs/Connection with powers and frequency, NAME=TOPIC of several transmitters; may be repeated."
+)
+_TX_HELP = "Transmitter [m]; once for each. By default located by measured powers."
+_FREQUENCY_HELP = "Carrier frequency [Hz], or with its unit: 5.2GHz. Default: from --connection."
 
 
 @opt.with_options
@@ -189,17 +194,21 @@ def _topics(
     robot_frame: Annotated[str, typer.Option(help="Frame of the robot.")] = "base_link",
     power: Annotated[list[str], typer.Option(metavar="TOPIC", help=_POWER_HELP, show_default=False)] = [],  # noqa: B006
     key_values: Annotated[str, typer.Option(help="Topic of diagnostic_msgs/KeyValue: name, power.")] = "",
+    connection: Annotated[list[str], typer.Option(metavar="TOPIC", help=_CONNECTION_HELP, show_default=False)] = [],  # noqa: B006
     publish_unknown: Annotated[
         bool, typer.Option("--publish-unknown", help="Publish predictions for unknown cells, at PREFIX/NAME/unknown.")
     ] = False,
 ) -> Any:
     from sionna_partial.live.topics import Topics
 
-    parts = [each.rpartition("=") for each in power]
-    powers = {topic: name or None for name, _, topic in parts}
-    if len(powers) < len(parts):
-        raise typer.BadParameter(f"--power {' '.join(power)} has a topic twice: give each topic once.")
-    return Topics(map_topic, prefix, robot_frame, powers, key_values, publish_unknown)
+    parsed = []
+    for option, texts in (("--power", power), ("--connection", connection)):
+        parts = [each.rpartition("=") for each in texts]
+        parsed.append({topic: name or None for name, _, topic in parts})
+        if len(parsed[-1]) < len(parts):
+            raise typer.BadParameter(f"{option} {' '.join(texts)} has a topic twice: give each topic once.")
+    powers, connections = parsed
+    return Topics(map_topic, prefix, robot_frame, powers, key_values, publish_unknown, connections)
 
 
 def _live_settings(
@@ -217,10 +226,25 @@ def _live_settings(
     return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]
 
 
+def _live_model(
+    frequency: Annotated[
+        float | None,
+        typer.Option(help=_FREQUENCY_HELP, parser=opt.parse_frequency, metavar="HZ", show_default=False),
+    ] = None,
+    material: opt.MaterialText = "",
+    max_depth: opt.MaxDepth = 6,
+    diffraction: opt.Diffraction = True,
+    through_walls: opt.ThroughWalls = None,
+) -> dict[str, Any]:
+    known = CARRIER_FREQUENCY_HZ if frequency is None else frequency
+    settings = opt.settings_of(known, material, max_depth, diffraction, through_walls)
+    return {**settings, "await_frequency": frequency is None}
+
+
 @opt.with_options
 def live(
     *,
-    tx: Annotated[list[str], typer.Option(metavar="X Y [Z]", help="Transmitter [m]; once for each.")],
+    tx: Annotated[list[str], typer.Option(metavar="X Y [Z]", help=_TX_HELP, show_default=False)] = [],  # noqa: B006
     name: Annotated[list[str], typer.Option(help="Name of each transmitter.", show_default=False)] = [],  # noqa: B006
     domain: Annotated[
         int | None, typer.Option(help="DDS domain. Default: ROS_DOMAIN_ID, or 0.", show_default=False)
@@ -231,14 +255,13 @@ def live(
     out: Annotated[Path | None, typer.Option(help="Of a recording: folder for the last grids.")] = None,
     topics: Annotated[Any, _topics],
     settings: Annotated[Any, _live_settings],
-    model: opt.Settings,
+    model: Annotated[Any, _live_model],
     predictor: opt.PredictorName = "",
 ) -> None:
     """Keep up with a robot's map: coverage as cost grids for its planner, until Ctrl-C."""
-    names = name or (["tx"] if len(tx) == 1 else transmitter_names(len(tx)))
-    if len(names) != len(tx) or len({*names}) < len(names):
-        raise typer.BadParameter(f"{len(names)} --name for {len(tx)} --tx: give each its own.")
-    positions = dict(zip(names, map(opt.parse_position, tx), strict=True))
+    positions = _live_positions(tx, name, topics)
+    if model["await_frequency"] and not topics.connections:
+        raise typer.BadParameter("--frequency is missing: give for example 5.2GHz, or a --connection with it.")
     last: dict[str, Any] = {}
     robot: Any = None
     if bag is None and rosbridge:
@@ -257,6 +280,9 @@ def live(
             last[answer.name] = answer
             kind = "final" if answer.is_final else "coarse"
             typer.echo(f"map {answer.map_number}, {answer.name}: {kind} after {answer.age_s:.1f} s")
+        elif hasattr(answer, "position_m"):
+            x_m, y_m = answer.position_m[:2]
+            typer.echo(f"{answer.name}: at ({x_m:.1f}, {y_m:.1f}) m, {answer.area_m2:.1f} m2 hold 90 %")
         else:
             typer.echo(f"next views: {len(answer.views)}")
 
@@ -272,6 +298,18 @@ def live(
         _save(last, out)
 
 
+def _live_positions(tx: list[str], names: list[str], topics: Any) -> dict[str, Any]:
+    """Return the transmitters by name; None is to be located, and none at all by the access points' own names."""
+    if not tx:
+        if not (topics.powers or topics.key_values or topics.connections):
+            raise typer.BadParameter("--tx is missing: give X Y Z, or --power, --key-values or --connection.")
+        return dict.fromkeys(names or ([] if topics.connections and not topics.powers else ["tx"]))
+    names = names or (["tx"] if len(tx) == 1 else transmitter_names(len(tx)))
+    if len(names) != len(tx) or len({*names}) < len(names):
+        raise typer.BadParameter(f"{len(names)} --name for {len(tx)} --tx: give each its own.")
+    return dict(zip(names, map(opt.parse_position, tx), strict=True))
+
+
 def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
     from sionna_partial.live.topics import Listener, replay
 
@@ -280,6 +318,8 @@ def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
     coverage.close()
     if thread:
         thread.join()
+    else:
+        coverage.run()
 
 
 def _save(last: dict[str, Any], out: Path | None) -> None:

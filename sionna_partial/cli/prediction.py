@@ -11,7 +11,14 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.checks import require_number
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MEMORY_GB, CellState
+from sionna_partial.constants import (
+    CARRIER_FREQUENCY_HZ,
+    COST_THRESHOLD_DB,
+    DEFAULT_HEIGHT_M,
+    GAIN_FLOOR_DB,
+    MEMORY_GB,
+    CellState,
+)
 from sionna_partial.display import part_of
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_files, read_columns
@@ -100,7 +107,8 @@ def predict(
                     figure = sp.plot_coverage(coverage, threshold_db=budget.gain_db)
                     (folder / name).write_bytes(figure_png(figure))
                 else:
-                    sp.save_coverage(coverage, folder / name)
+                    threshold_db = budget.gain_db if budget else COST_THRESHOLD_DB
+                    sp.save_coverage(coverage, folder / name, scene=partial, threshold_db=threshold_db)
     if "wall_material" in coverage.attrs:
         typer.echo(f"walls: {coverage.attrs['wall_material']}, mean loss {coverage.attrs['wall_loss_db']:.1f} dB")
     opt.print_files(out, names)

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import distance_transform_edt
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, number_of, require, require_names, require_number, shown
-from sionna_partial.constants import GAIN_FLOOR_DB, NO_RECEIVER, CellState, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, MAX_COST, NO_RECEIVER, CellState, LinkState
 from sionna_partial.coverage.link_budget import LinkBudget, schemes, transmit_powers_dbm
 from sionna_partial.display import later, picture_html
 from sionna_partial.errors import PositionError, SettingsError
@@ -231,6 +232,26 @@ def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
     return LinkPrediction(**columns).probability_above(threshold_db)
 
 
+def cost_grid(
+    axes_m: tuple[Floats, Floats], spacing_m: float, p_below: Floats, points_m: Floats, max_cost: int = MAX_COST
+) -> NDArray[np.int8]:
+    """Return costs (...) of points (..., 2) [m] for a planner: the probability at the nearest receiver in percent.
+
+    `p_below` (ny, nx) is the probability of too small a gain at receivers with `axes_m` y (ny,) and x (nx,) [m]; NaN
+    without receiver. Costs are at most `max_cost`, and -1 where no receiver is within two spacings.
+    """
+    percent = np.minimum(np.rint(100.0 * p_below), max_cost)
+    valid = np.isfinite(percent)
+    apart, nearest = distance_transform_edt(~valid, return_indices=True)
+    known = np.where(valid.any() & (apart < 2.0), np.nan_to_num(percent)[tuple(nearest)], -1.0)
+    cells, inside = [], np.ones(points_m.shape[:-1], dtype=bool)
+    for axis_m, each_m in zip(axes_m, (points_m[..., 1], points_m[..., 0]), strict=True):
+        index = np.rint((each_m - axis_m[0]) / spacing_m).astype(np.intp)
+        cells.append(np.clip(index, 0, len(axis_m) - 1))
+        inside &= np.abs(index - cells[-1]) < 2
+    return np.where(inside, known[tuple(cells)], -1.0).astype(np.int8)
+
+
 @xr.register_dataset_accessor("radio")
 class CoverageAccessor:
     """Methods of a coverage map from `predict_map` or `load_coverage`: ``coverage.radio``.
@@ -261,9 +282,9 @@ class CoverageAccessor:
         """Return the figure of `plot_coverage`."""
         return later(_PLOT)(self._coverage)
 
-    def save(self, path: str | PathLike[str]) -> None:
-        """Write the map as `save_coverage` does."""
-        later("export:save_coverage")(self._coverage, path)
+    def save(self, path: str | PathLike[str], **options: Any) -> None:
+        """Write the map as `save_coverage` does, with its options."""
+        later("export:save_coverage")(self._coverage, path, **options)
 
     def probability_above(self, threshold_db: float) -> xr.DataArray:
         """Return the probability (ny, nx) or (tx, ny, nx) that the path gain exceeds a threshold t [dB].

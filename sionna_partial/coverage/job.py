@@ -40,7 +40,7 @@ from sionna_partial.coverage.dataset import (
     with_posterior,
 )
 from sionna_partial.display import part_of, reporting
-from sionna_partial.errors import MemoryLimitError, PositionError
+from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
 from sionna_partial.measurements.assimilation import Assimilation
@@ -59,6 +59,7 @@ from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_w
 RECEIVERS = ("indoor", "anywhere")
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
+Area: TypeAlias = tuple[float, float, float, float]
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
 
 POSITIONS = 8
@@ -95,6 +96,7 @@ def predict_map(
     tx_antenna: TxAntenna = None,
     rx_height_m: float = DEFAULT_HEIGHT_M,
     spacing_m: float = 0.15,
+    area_m: tuple[float, float, float, float] | None = None,
     predictor: Predictor | str | Path | None = None,
     scene_settings: SceneSettings | None = None,
     trace_settings: TraceSettings | None = None,
@@ -134,6 +136,8 @@ def predict_map(
         Height of the receivers [m].
     spacing_m : float
         Distance between receivers [m]. The grid starts half of it inside the lower-left corner of the map.
+    area_m : (float, float, float, float), optional
+        Smallest x and y and largest x and y of the grid [m]; by default those of the map (`PartialMap.bounds_m`).
     predictor : None, "map", "paper", path or Predictor
         None is the shipped default, "map"; a path is a saved predictor. Not used on a complete map.
     scene_settings : SceneSettings, optional
@@ -171,7 +175,7 @@ def predict_map(
     PositionError
         For a transmitter outside the map or in a wall, or if no receiver is valid.
     SettingsError
-        For a height, spacing or frequency out of range, or another value of `receivers`.
+        For a height, spacing, area or frequency out of range, or another value of `receivers`.
     PredictorError
         If the predictor cannot be read.
     BackendError
@@ -189,12 +193,14 @@ def predict_map(
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     require_choice("receivers", receivers, RECEIVERS)
     require_memory(memory_gb)
-    names, transmitters = _transmitters(model, tx, tx_antenna, measurements, rx_height_m, spacing_m)
+    area_m = _checked_area(model.partial, area_m)
+    names, transmitters = _transmitters(model, tx, tx_antenna, measurements, rx_height_m, spacing_m, area_m)
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
     maps, weights = [], []
     with reporting(progress) as report:
         report(0.0, "building the scene")
-        job = CoverageJob(model, rx_height_m, spacing_m, receivers, block).with_others(transmitters, measurements)
+        job = CoverageJob(model, rx_height_m, spacing_m, receivers, block, area_m)
+        job = job.with_others(transmitters, measurements)
         for number, transmitter in enumerate(transmitters):
             part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
             coverage, of_materials = job.coverage(transmitter, part)
@@ -249,6 +255,7 @@ class CoverageJob:
     spacing_m: float
     receivers: str
     block: int
+    area_m: Area | None = None
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
     """Assimilated measurements of other transmitters, by the transmitter they are used for."""
 
@@ -258,7 +265,7 @@ class CoverageJob:
         if transmitter.position_m is None:
             posterior = self.located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
-            grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m)
+            grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m, self.area_m)
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
@@ -400,6 +407,7 @@ def _transmitters(
     measurements: Any,
     rx_height_m: float,
     spacing_m: float,
+    area_m: Area | None,
 ) -> tuple[list[str] | None, list[Transmitter]]:
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     names: list[str] | None = None
@@ -411,7 +419,7 @@ def _transmitters(
     for antenna in {*antennas}:
         antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
-    grids = [grid_receivers(model, tx_m, rx_height_m, spacing_m) for tx_m in sources_m]
+    grids = [grid_receivers(model, tx_m, rx_height_m, spacing_m, area_m) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)
     if measurements is not None:
         measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
@@ -473,11 +481,13 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
     }
 
 
-def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float) -> Receivers:
+def grid_receivers(
+    model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float, area_m: Area | None = None
+) -> Receivers:
     """Return the receivers; those near a wall or transmitter (T, 3) [m] are masked."""
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     require_height(partial, "rx_height_m", rx_height_m)
-    x_m, y_m = grid_axes(partial, spacing_m)
+    x_m, y_m = grid_axes(partial, spacing_m, area_m)
     points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
@@ -498,12 +508,25 @@ def grid_receivers(model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m
     return Receivers(x_m, y_m, cell_state, valid, points[valid])
 
 
-def grid_axes(partial: PartialMap, spacing_m: float) -> tuple[Floats, Floats]:
+def _checked_area(partial: PartialMap, area_m: ArrayLike | None) -> Area | None:
+    if area_m is None:
+        return None
+    x0, y0, x1, y1 = partial.bounds_m
+    remedy = f"give x and y of two corners on the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m."
+    corners = float_array("area_m", area_m, SettingsError, remedy)
+    require(corners.shape == (4,), "area_m", area_m, remedy)
+    low, high, slack_m = corners[:2], corners[2:], partial.resolution_m / 2
+    inside = (low >= np.array([x0, y0]) - slack_m) & (high <= np.array([x1, y1]) + slack_m)
+    require(bool((inside & (low < high)).all()), "area_m", area_m, remedy)
+    return tuple(corners.tolist())  # type: ignore[return-value]
+
+
+def grid_axes(partial: PartialMap, spacing_m: float, area_m: Area | None = None) -> tuple[Floats, Floats]:
     low = partial.resolution_m / 10
     require_number("spacing_m", spacing_m, low, 1e6)
-    x0, y0, x1, y1 = partial.bounds_m
+    x0, y0, x1, y1 = partial.bounds_m if area_m is None else area_m
     nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
-    size = f"the map is {x1 - x0:g} x {y1 - y0:g} m"
+    size = f"the {'map' if area_m is None else 'area'} is {x1 - x0:g} x {y1 - y0:g} m"
     require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
     enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
     remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."

@@ -7,13 +7,13 @@ import re
 import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any, NamedTuple
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import maximum_filter
 
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import (
@@ -28,14 +28,17 @@ from sionna_partial.checks import (
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import COARSER, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
+from sionna_partial.constants import COARSER, COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
+from sionna_partial.coverage.job import grid_axes
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
-from sionna_partial.exploration.next_views import NextViews, next_views
+from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
+from sionna_partial.live.answers import LiveAnswer, LiveGrid, LiveTransmitter, LiveViews, MapMessage
 from sionna_partial.maps.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
+from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
 
 LATE_S = 30.0
@@ -43,10 +46,28 @@ LATE_S = 30.0
 
 POSE_AGE_S = 2.0
 
+BETWEEN_DB = 6.0
+"""Difference of gains behind walls that paths go through, within two receivers of a coarse grid [dB]."""
+
+SAME_BAND = 0.15
+"""Relative difference of frequencies up to which powers are used."""
+
 POWER_CELL_M = 0.25
 """Edge of squares that keep the newest power of a transmitter [m]."""
 
 MOST_POWERS = 500
+
+LEAST_POWERS = 5
+"""Number of measured powers from which a transmitter is located."""
+
+MOST_ACCESS_POINTS = 8
+"""Number of access points that are located by themselves."""
+
+SEARCH_M = 5.0
+"""Distance outside the map at which access points are searched: they may be where the robot has not been yet [m]."""
+
+FARTHEST_M = 200.0
+"""Distance from the map up to which the map is extended with unknown cells to a transmitter [m]."""
 
 REPEATED_S, MOST_LINES = 60.0, 50
 """Time for which a line is not repeated [s], and number of remembered lines."""
@@ -83,115 +104,13 @@ class LiveSettings(Checked):
     """
 
     frame: str = ""
-    threshold_db: Annotated[float, Within(GAIN_FLOOR_DB, 0.0)] = -100.0
+    threshold_db: Annotated[float, Within(GAIN_FLOOR_DB, 0.0)] = COST_THRESHOLD_DB
     spacing_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = 0.15
     rx_height_m: Annotated[float, Within(0.0, 100.0)] = DEFAULT_HEIGHT_M
     tx_power_dbm: Annotated[float, Within(-200.0, 200.0)] = 0.0
     refresh_s: Annotated[float, Within(0.1, 1e6)] = 10.0
     views_every_s: Annotated[float, Within(0.0, 1e6)] = 0.0
     max_cost: Annotated[int, Within(1, 100)] = MAX_COST
-
-
-class LiveGrid(NamedTuple):
-    """The coverage of one transmitter on one map.
-
-    Parameters
-    ----------
-    name : str
-    map_number : int
-        Number of the map, from 1.
-    is_final : bool
-        False for the coarse answer.
-    coverage : xarray.Dataset
-        From `predict_map`.
-    cost : (ny, nx) int8 array
-        P(path gain <= threshold) [percent], at most `LiveSettings.max_cost`, on the message's cells; -1 in walls and
-        unknown cells.
-    unknown_cost : (ny, nx) int8 array
-        Values of the unknown cells; -1 in all others.
-    header, info : dict
-        Fields of the `nav_msgs/OccupancyGrid` of the map.
-    age_s : float
-        Time since the map arrived [s].
-    """
-
-    name: str
-    map_number: int
-    is_final: bool
-    coverage: xr.Dataset
-    cost: NDArray[np.int8]
-    unknown_cost: NDArray[np.int8]
-    header: dict[str, Any]
-    info: dict[str, Any]
-    age_s: float
-
-    def message(self, *, unknown: bool = False) -> dict[str, Any]:
-        """Return a `nav_msgs/OccupancyGrid` of `cost` or `unknown_cost` as a dict."""
-        data = self.unknown_cost if unknown else self.cost
-        return {"header": self.header, "info": self.info, "data": data.ravel().tolist()}
-
-
-class LiveViews(NamedTuple):
-    """Next views on one map."""
-
-    views: NextViews
-    header: dict[str, Any]
-
-    def message(self) -> dict[str, Any]:
-        """Return a `geometry_msgs/PoseArray` as a dict."""
-        return {"header": self.header, "poses": self.views.poses()}
-
-
-@dataclass(frozen=True, eq=False)
-class _Grid:
-    percent: NDArray[np.integer[Any]]
-    resolution_m: float
-    origin: tuple[float, float, float]
-    frame: str
-    stamp: tuple[int, int]
-    partial: PartialMap
-    number: int
-    came_s: float
-
-    @property
-    def key(self) -> tuple[object, ...]:
-        return self.percent.tobytes(), self.percent.shape, self.resolution_m, self.origin
-
-    @property
-    def header(self) -> dict[str, Any]:
-        return {"stamp": dict(zip(("sec", "nanosec"), self.stamp, strict=True)), "frame_id": self.frame}
-
-    @property
-    def info(self) -> dict[str, Any]:
-        x, y, yaw = self.origin
-        position, turn = (
-            {"x": x, "y": y, "z": 0.0},
-            {"x": 0.0, "y": 0.0, "z": math.sin(yaw / 2), "w": math.cos(yaw / 2)},
-        )
-        sizes = {"resolution": self.resolution_m, "width": self.percent.shape[1], "height": self.percent.shape[0]}
-        return {"map_load_time": self.header["stamp"], **sizes, "origin": {"position": position, "orientation": turn}}
-
-    def costs(
-        self, coverage: xr.Dataset, threshold_db: float, max_cost: int
-    ) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """Return the outage of free and of unknown cells [percent], -1 elsewhere."""
-        valid = coverage["valid"].to_numpy() == 1
-        percent = np.minimum(np.rint(100.0 * (1.0 - probability_above(coverage, threshold_db))), max_cost)
-        apart, nearest = distance_transform_edt(~valid, return_indices=True)
-        predicted = np.where(valid.any() & (apart < 2.0), percent[tuple(nearest)], -1.0)
-        x, y, yaw = self.origin
-        rows, columns = ((np.arange(n) + 0.5) * self.resolution_m for n in self.percent.shape)
-        x_m = x + math.cos(yaw) * columns - math.sin(yaw) * rows[:, None]
-        y_m = y + math.sin(yaw) * columns + math.cos(yaw) * rows[:, None]
-        at = []
-        for name, each_m in (("y", y_m), ("x", x_m)):
-            index = np.rint((each_m - float(coverage[name][0])) / float(coverage.attrs["spacing_m"])).astype(int)
-            at.append(np.clip(index, 0, coverage.sizes[name] - 1))
-        cost = np.nan_to_num(predicted, nan=-1.0)[tuple(at)].astype(np.int8)
-        state = self.partial.state_at(np.stack([x_m, y_m], axis=-1))
-        state[(self.percent < 0) | (self.percent > 100)] = CellState.UNKNOWN
-        free, unknown = (np.where(state == kind, cost, np.int8(-1)) for kind in (CellState.FREE, CellState.UNKNOWN))
-        return free, unknown
 
 
 class _NewerMap(Exception):
@@ -220,15 +139,20 @@ class LiveCoverage:
     Any thread may pass messages; newer maps replace each other while one is computed. `start` computes in a thread,
     `step` in the calling one. Refused messages are logged.
 
+    Every grid has the cells of the newest map: nav2 resizes its costmap to a grid of another size, and forgets walls.
+
     Parameters
     ----------
-    tx : (3,) array-like, or mapping of names to them
-        Transmitter positions [m], in the frame of the map.
+    tx : (3,) array-like, None, or mapping of names to them
+        Transmitter positions [m], in the frame of the map, up to 200 m outside it; None if measured powers shall locate
+        the transmitter. An empty mapping locates the access points that connections name.
     publish : callable
-        Called with each `LiveGrid` and `LiveViews`.
+        Called with each `LiveGrid`, `LiveTransmitter` and `LiveViews`.
     settings : LiveSettings, optional
+    await_frequency : bool
+        Whether the carrier frequency comes with the first message of a connection instead of `trace_settings`.
     **model
-        `predictor`, `trace_settings` and `scene_settings` of `LinkModel`.
+        `predictor`, `trace_settings` (28 GHz by default) and `scene_settings` of `LinkModel`.
 
     Raises
     ------
@@ -252,21 +176,24 @@ class LiveCoverage:
 
     def __init__(
         self,
-        tx: ArrayLike | Mapping[str, ArrayLike],
-        publish: Callable[[LiveGrid | LiveViews], None],
+        tx: ArrayLike | Mapping[str, ArrayLike | None] | None,
+        publish: Callable[[LiveAnswer], None],
         settings: LiveSettings | None = None,
+        *,
+        await_frequency: bool = False,
         **model: Any,
     ) -> None:
         self.settings = settings_or_default("settings", settings, LiveSettings)
         self.tx_m = _named_positions(tx)
-        self._publish, self._model_settings = publish, model
+        self._finds, self._access_points = not self.tx_m, dict[str, str]()
+        self._publish, self._model_settings, self._await_frequency = publish, model, await_frequency
         for name, kind in (("trace_settings", TraceSettings), ("scene_settings", SceneSettings)):
             settings_or_default(name, model.get(name), kind)
         self._model: LinkModel | None = None
         self._changed = threading.Condition()
         self._closed = False
-        self._newest: _Grid | None = None
-        self._waiting: _Grid | None = None
+        self._newest: MapMessage | None = None
+        self._waiting: MapMessage | None = None
         self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
@@ -309,7 +236,7 @@ class LiveCoverage:
         """Take a received power [dBm] or path gain [dB] of a transmitter at the robot."""
         name = next(iter(self.tx_m)) if name is None and len(self.tx_m) == 1 else name
         if name not in self._powers:
-            raise MeasurementError(f"of {shown(name)}: the transmitters are {', '.join(self.tx_m)}.")
+            raise MeasurementError(f"of {shown(name)}: the transmitters are {', '.join(self.tx_m) or 'none yet'}.")
         gain_db, pose = number_of(power_dbm) - self.settings.tx_power_dbm, self._pose
         if pose is None or not 0.0 <= time_s - pose[2] <= POSE_AGE_S:
             raise MeasurementError("the robot's position is not known: it is read from the transforms.")
@@ -324,14 +251,40 @@ class LiveCoverage:
                 self._new_powers = True
 
     @_refusing
+    def on_connection(self, message: Any, time_s: float, name: str | None = None) -> None:
+        """Take a `wireless_msgs/Connection`: power, frequency, and access point, which is added if it has no name."""
+        if not message.bssid or not message.frequency > 0.0:
+            raise MeasurementError("it has no access point or frequency: the robot is not connected.")
+        frequency_hz = number_of(message.frequency)
+        frequency_hz *= 1e9 if frequency_hz < 1e3 else 1e6 if frequency_hz < 1e6 else 1.0  # iwconfig: GHz; iw: MHz
+        given = self._model_settings.get("trace_settings") or TraceSettings()
+        if self._await_frequency:
+            self._model_settings["trace_settings"] = replace(given, frequency_hz=frequency_hz)
+            self._await_frequency = False
+        elif not math.isclose(frequency_hz, given.frequency_hz, rel_tol=SAME_BAND):
+            raise MeasurementError(f"at {frequency_hz / 1e9:g} GHz: grids are at {given.frequency_hz / 1e9:g} GHz.")
+        if name is None and self._finds:
+            name = f"ap_{re.sub('[^0-9a-f]', '', message.bssid.lower())}"
+            if name not in self.tx_m:
+                require(len(self.tx_m) < MOST_ACCESS_POINTS, "access point", name, f"{len(self.tx_m)} are located.")
+                self._add({name: None})
+        name = next(iter(self.tx_m)) if name is None and len(self.tx_m) == 1 else name
+        known = self._access_points.setdefault(str(name), message.bssid)
+        if known != message.bssid:
+            raise MeasurementError(f"{name} is the access point {known}: powers of {message.bssid} are not used.")
+        self.on_power(message.signal_level, time_s, name)
+
+    @_refusing
     def on_transmitter(self, name: str, position_m: ArrayLike | None) -> None:
         """Add, move or (None) remove a transmitter, and forget its measured powers."""
         if position_m is None and name not in self.tx_m:
             raise PositionError(f"{shown(name)} is not known: the transmitters are {', '.join(self.tx_m)}.")
-        added = {} if position_m is None else _named_positions({name: position_m})
+        self._add({} if position_m is None else _named_positions({name: position_m}), without=name)
+
+    def _add(self, added: dict[str, Floats | None], without: str = "") -> None:
         with self._changed:
-            self.tx_m = {known: at_m for known, at_m in self.tx_m.items() if known != name} | added
-            self._powers = {known: {} if known == name else self._powers[known] for known in self.tx_m}
+            self.tx_m = {known: at_m for known, at_m in self.tx_m.items() if known != without} | added
+            self._powers = {name: {} if name in added else self._powers[name] for name in self.tx_m}
             self._waiting, self._answered = self._newest, 0
             self._changed.notify_all()
 
@@ -343,10 +296,17 @@ class LiveCoverage:
 
     def run(self) -> None:
         """Compute maps until `close` is called and none is waiting."""
+        if self._waiting is None and not self._closed:
+            self._guarded("", self._warm_up)
         while self.step() or not self._closed:
             with self._changed:
                 if self._waiting is None and not self._closed:
                     self._changed.wait(0.2)
+
+    def _warm_up(self) -> None:
+        """Load libraries, networks and kernels before the first map comes."""
+        room = PartialMap(np.array([[1, 1, 1, 1], [1, 0, 0, 2], [1, 1, 1, 1]], dtype=np.uint8), 1.0)
+        LinkModel(room, **self._model_settings).coverage((1.5, 1.5, 1.5), spacing_m=0.5, progress=False)
 
     def start(self) -> threading.Thread:
         """Call `run` in a thread."""
@@ -355,7 +315,7 @@ class LiveCoverage:
         return thread
 
     def close(self) -> None:
-        """End `run` after the current and the waiting map."""
+        """End `run` after the current and the waiting map, and the last powers."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -363,8 +323,13 @@ class LiveCoverage:
     def step(self) -> bool:
         """Answer the newest map if it or its powers are new; return whether it was."""
         with self._changed:
+            if self._await_frequency:
+                if self._waiting is not None:
+                    self.report("the map waits for a connection, which has the carrier frequency.")
+                return False
             now_s, grid = time.monotonic(), self._waiting
-            if grid is None and self._new_powers and now_s - self._stepped_s >= self.settings.refresh_s:
+            is_due = self._closed or now_s - self._stepped_s >= self.settings.refresh_s
+            if grid is None and self._new_powers and is_due:
                 grid = self._newest
             self._waiting, every_s = None, self.settings.views_every_s
             wanted = self._views_wanted or 0.0 < every_s <= now_s - self._views_s
@@ -398,7 +363,9 @@ class LiveCoverage:
             raise MapError(f"it is {age_s:.2f} s older than the last one.")
         partial = map_of_percent(values, resolution_m, origin[:2], origin[2])
         number = 1 if last is None else last.number + 1
-        grid = _Grid(values.astype(np.int16), resolution_m, origin, frame, stamp, partial, number, time.monotonic())
+        grid = MapMessage(
+            values.astype(np.int16), resolution_m, origin, frame, stamp, partial, number, time.monotonic()
+        )
         if last is None or grid.key != last.key:
             with self._changed:
                 self.frame, self._newest, self._waiting = frame, grid, grid
@@ -414,10 +381,11 @@ class LiveCoverage:
             if what:
                 self.report(f"{what} not answered: {reason_of(error)}")
 
-    def _compute(self, grid: _Grid) -> None:
+    def _compute(self, grid: MapMessage) -> None:
+        partial = self._extended(grid.partial)
         if self._model is None:
-            self._model = LinkModel(grid.partial, **self._model_settings)
-        self._model.update(grid.partial)
+            self._model = LinkModel(partial, **self._model_settings)
+        self._model.update(partial)
         if grid.number != self._answered:
             self._answered = grid.number
             self._clear_removed()
@@ -428,38 +396,99 @@ class LiveCoverage:
         except _NewerMap:
             self._gave_way = True
 
+    def _extended(self, partial: PartialMap) -> PartialMap:
+        """Return the map with unknown cells up to the transmitters: space outside a map is unknown."""
+        low, high = bounds_m = np.reshape(partial.bounds_m, (2, 2))
+        for tx_m in self.tx_m.values():
+            if tx_m is None and not partial.is_nearly_complete:
+                low, high = np.minimum(low, bounds_m[0] - SEARCH_M), np.maximum(high, bounds_m[1] + SEARCH_M)
+            elif tx_m is not None and _beyond_m(partial, tx_m) <= FARTHEST_M:
+                low, high = np.minimum(low, tx_m[:2]), np.maximum(high, tx_m[:2])
+        cells = np.ceil(np.array([bounds_m[0] - low, high - bounds_m[1]]) / partial.resolution_m - 1e-6).astype(int)
+        if not cells.any():
+            return partial
+        cells += 1  # no radio is on an edge
+        (left, below), (right, above) = cells.tolist()
+        ny, nx = partial.shape
+        return partial.window(-below, -left, (below + ny + above, left + nx + right), CellState.UNKNOWN)
+
     def _clear_removed(self) -> None:
         for name in self._published.keys() - self.tx_m.keys():
             last = self._published.pop(name)
-            nothing = np.full_like(last.cost, -1)
-            self._publish(last._replace(cost=nothing, unknown_cost=nothing, is_final=True))
+            with self._changed:
+                newest = self._newest
+                assert newest is not None
+                nothing = np.full(newest.percent.shape, -1, dtype=np.int8)
+                empty = last._replace(cost=nothing, unknown_cost=nothing, is_final=True)
+                self._publish(empty._replace(header=newest.header, info=newest.info))
 
     def _give_way(self, fraction: float, message: str) -> None:
         if self._waiting is not None:
             raise _NewerMap
 
-    def _each(self, grid: _Grid, *, is_final: bool, report: Progress = no_progress) -> None:
+    def _each(self, grid: MapMessage, *, is_final: bool, report: Progress = no_progress) -> None:
         for name, tx_m in self.tx_m.items():
             self._guarded(f"map for {name}" if is_final else "", self._answer, grid, name, tx_m, is_final, report)
 
-    def _answer(self, grid: _Grid, name: str, tx_m: Floats, is_final: bool, report: Progress) -> None:
+    def _answer(self, grid: MapMessage, name: str, tx_m: Floats | None, is_final: bool, report: Progress) -> None:
         assert self._model is not None
-        spacing_m = self.settings.spacing_m * (1 if is_final else COARSER)
+        measured = self._measured(name, tx_m)
+        if tx_m is None and (measured is None or not is_final):
+            return
+        beyond_m = 0.0 if tx_m is None else _beyond_m(grid.partial, tx_m)
+        if beyond_m > FARTHEST_M:
+            remedy = f"more than {FARTHEST_M:g} m: check its unit and its frame."
+            raise PositionError(f"tx {name} is {beyond_m:.0f} m outside the map, {remedy}")
         coverage = self._model.coverage(
             tx_m,
-            spacing_m=spacing_m,
+            spacing_m=self.settings.spacing_m * (1 if is_final else COARSER),
             rx_height_m=self.settings.rx_height_m,
-            measurements=self._measured(name, tx_m),
+            area_m=grid.partial.bounds_m,
+            measurements=measured,
             progress=report,
         )
-        cost, unknown = grid.costs(coverage, self.settings.threshold_db, self.settings.max_cost)
-        age_s = time.monotonic() - grid.came_s
-        answer = LiveGrid(name, grid.number, is_final, coverage, cost, unknown, grid.header, grid.info, age_s)
-        if self.tx_m.get(name) is tx_m:  # it was not moved meanwhile
+        receivers = self._receivers(grid.partial, coverage, None if is_final else tx_m)
+        with self._changed:  # no newer map comes before the grid is published
+            newest = self._newest
+            if newest is None or name not in self.tx_m or self.tx_m[name] is not tx_m:
+                return  # it was moved meanwhile
+            cost, unknown = newest.costs(*receivers, self.settings.max_cost)
+            age_s = time.monotonic() - grid.came_s
+            answer = LiveGrid(name, grid.number, is_final, coverage, cost, unknown, newest.header, newest.info, age_s)
             self._published[name] = answer
             self._publish(answer)
+            if tx_m is None:
+                self._publish(_located(name, coverage, newest.header))
 
-    def _measured(self, name: str, tx_m: Floats) -> Measurements | None:
+    def _receivers(
+        self, partial: PartialMap, coverage: xr.Dataset, tx_m: Floats | None
+    ) -> tuple[tuple[Floats, Floats], float, Floats]:
+        """Return axes, spacing and P(too small a gain) of receivers; with `tx_m` bounds for those of a final grid."""
+        axes_m, spacing_m = (coverage["y"].to_numpy(), coverage["x"].to_numpy()), float(coverage.attrs["spacing_m"])
+        if tx_m is None:
+            return axes_m, spacing_m, 1.0 - probability_above(coverage, self.settings.threshold_db)
+        assert self._model is not None
+        x_m, y_m = grid_axes(partial, self.settings.spacing_m)
+        near = [
+            np.clip(np.rint((fine_m - coarse_m[0]) / spacing_m).astype(int), 0, len(coarse_m) - 1)
+            for fine_m, coarse_m in zip((y_m, x_m), axes_m, strict=True)
+        ]
+
+        def largest(size: int, margin_db: float) -> Floats:
+            above = probability_above(coverage, min(self.settings.threshold_db + margin_db, 0.0))
+            p_below = maximum_filter(np.nan_to_num(1.0 - above, nan=-1.0), size=size, mode="nearest")[np.ix_(*near)]
+            return np.where(p_below < 0.0, 1.0, p_below)
+
+        bound = largest(3, 0.0)
+        rx_m = np.stack([*np.meshgrid(x_m, y_m), np.full(bound.shape, self.settings.rx_height_m)], axis=-1)
+        line_m = np.broadcast_to(tx_m, rx_m.shape).reshape(-1, 3), rx_m.reshape(-1, 3)
+        hidden = walled_lengths_m(self._model.partial, *line_m) > 0.0
+        hidden |= lengths_in_unknown_m(self._model.partial, *line_m) > 0.0
+        # behind opaque walls, a reflection may end between two receivers
+        behind = largest(5, BETWEEN_DB) if self._model.simulation.trace_settings.through_walls else 1.0
+        return (y_m, x_m), self.settings.spacing_m, np.where(hidden.reshape(bound.shape), behind, bound)
+
+    def _measured(self, name: str, tx_m: Floats | None) -> Measurements | None:
         with self._changed:
             rows = np.array([*self._powers.get(name, {}).values()]).reshape(-1, 3)
         if not len(rows):
@@ -469,14 +498,18 @@ class LiveCoverage:
         partial = self._model.partial
         usable = partial.radios_can_stand(rx_m)
         frequency_hz = self._model.simulation.trace_settings.frequency_hz
-        usable[usable] = can_be_used(partial, tx_m[None], rx_m[usable], frequency_hz)
-        return Measurements(tx_m, rx_m[usable], rows[usable, 2]) if usable.any() else None
+        sources_m = np.empty((0, 3)) if tx_m is None else tx_m[None]
+        usable[usable] = can_be_used(partial, sources_m, rx_m[usable], frequency_hz)
+        enough = usable.sum() >= (LEAST_POWERS if tx_m is None else 1)
+        return Measurements(tx_m, rx_m[usable], rows[usable, 2]) if enough else None  # type: ignore[arg-type]
 
     def _compute_views(self) -> None:
         assert self._model is not None
         grid = self._newest
         assert grid is not None
-        tx_m = np.stack([*self.tx_m.values()])
+        known = {name: at_m for name, at_m in self.tx_m.items() if at_m is not None}
+        found = {name: last.coverage.attrs["transmitter_m"] for name, last in self._published.items()}
+        tx_m = np.array([*(found | known).values()]) if found | known else None
         # the nearest free cell: a pose in a wall is an error of the robot's localisation
         starts_m = [] if self._pose is None else [*nearest_free_m(self._model.partial, self._pose[:2])]
         start = starts_m[0] if starts_m else None
@@ -484,18 +517,29 @@ class LiveCoverage:
         self._publish(LiveViews(views, grid.header))
 
 
-def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike]) -> dict[str, Floats]:
-    given = tx if isinstance(tx, Mapping) else {"tx": tx}
-    require(bool(given), "tx", tx, "give at least one transmitter.")
-    found = {}
-    for name, position in given.items():
+def _named_positions(tx: ArrayLike | Mapping[str, ArrayLike | None] | None) -> dict[str, Floats | None]:
+    found: dict[str, Floats | None] = {}
+    for name, position in (tx if isinstance(tx, Mapping) else {"tx": tx}).items():
         if not (isinstance(name, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,60}", name)):
             raise SettingsError(f"tx has the name {shown(name)}: give a letter, then letters, digits or _.")
-        values = with_height(float_array(f"tx {name}", position, PositionError, "give x, y and z in metres."))
-        if values.shape != (3,) or not np.isfinite(values).all():
-            raise PositionError(f"tx {name} = {shown(position)} is no position: give x, y and z in metres.")
-        found[name] = values
+        found[name] = None
+        if position is not None:
+            values = with_height(float_array(f"tx {name}", position, PositionError, "give x, y and z in metres."))
+            if values.shape != (3,) or not np.isfinite(values).all():
+                raise PositionError(f"tx {name} = {shown(position)} is no position: give x, y and z in metres.")
+            found[name] = values
     return found
+
+
+def _beyond_m(partial: PartialMap, tx_m: Floats) -> float:
+    """Return how far a position is outside the map along x or y [m]."""
+    low, high = np.reshape(partial.bounds_m, (2, 2))
+    return float(max((low - tx_m[:2]).max(), (tx_m[:2] - high).max(), 0.0))
+
+
+def _located(name: str, coverage: xr.Dataset, header: dict[str, Any]) -> LiveTransmitter:
+    x_m, y_m, probability = (coverage[key].to_numpy() for key in ("tx_x", "tx_y", "p_transmitter"))
+    return LiveTransmitter(name, np.asarray(coverage.attrs["transmitter_m"]), x_m, y_m, probability, header)
 
 
 def _frame_and_stamp(message: Any) -> tuple[str, tuple[int, int]]:

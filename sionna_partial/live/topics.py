@@ -6,7 +6,7 @@ import os
 import re
 import time
 from collections import ChainMap
-from collections.abc import Mapping, MutableMapping
+from collections.abc import Container, Mapping, MutableMapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from sionna_partial.checks import Checked, require, require_whole, shown
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.live.coverage import LiveCoverage, LiveGrid, LiveViews
+from sionna_partial.live.answers import LiveAnswer, LiveTransmitter, LiveViews
+from sionna_partial.live.coverage import LiveCoverage
 from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
 from sionna_partial.resources import optional_packages
 
@@ -28,9 +29,22 @@ MOST_FRAMES = 1000
 
 GRID_TYPE, VIEWS_TYPE = "nav_msgs/msg/OccupancyGrid", "geometry_msgs/msg/PoseArray"
 
-UPDATE_TYPE = "map_msgs/msg/OccupancyGridUpdate"
-UPDATE_TEXT = "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data"
-"""Definition of the only message that no type store has."""
+UPDATE_TYPE, CONNECTION_TYPE = "map_msgs/msg/OccupancyGridUpdate", "wireless_msgs/msg/Connection"
+FILTER_TYPE = "nav2_msgs/msg/CostmapFilterInfo"
+DEFINITIONS = {
+    UPDATE_TYPE: "std_msgs/Header header\nint32 x\nint32 y\nuint32 width\nuint32 height\nint8[] data",
+    CONNECTION_TYPE: (
+        "float32 bitrate\nint16 txpower\nstring link_quality_raw\nfloat32 link_quality\nint16 signal_level\n"
+        "int16 noise_level\nstring essid\nstring bssid\nfloat64 frequency"
+    ),
+    FILTER_TYPE: ("std_msgs/Header header\nuint8 type\nstring filter_mask_topic\nfloat32 base\nfloat32 multiplier"),
+}
+"""Definitions of messages that no type store has."""
+
+POSE_TYPE = "geometry_msgs/msg/PoseWithCovarianceStamped"
+
+KEEPOUT = 0
+"""Type of nav2's keepout filter."""
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
 
@@ -66,8 +80,9 @@ class Topics(Checked):
         Topic of the map ("_updates" is added for its updates); prefix of published topics.
     robot_frame : str
         Frame of the robot in `/tf` and `/tf_static`.
-    powers : mapping
-        Transmitter of each topic of `std_msgs/Float32` with received powers; None for a single one.
+    powers, connections : mapping
+        Transmitter of each topic of `std_msgs/Float32` with received powers, and of `wireless_msgs/Connection`; None
+        for a single one, or for the access point of a connection.
     key_values : str
         Topic of `diagnostic_msgs/KeyValue` with names of transmitters and powers; "" for none.
     unknown : bool
@@ -85,11 +100,15 @@ class Topics(Checked):
     powers: Mapping[str, str | None] = field(default_factory=dict)
     key_values: str = ""
     unknown: bool = False
+    connections: Mapping[str, str | None] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        require(isinstance(self.powers, Mapping), "powers", self.powers, "give a mapping of topics to transmitters.")
-        names = {"map": self.map, "prefix": self.prefix, **{f"powers {name}": name for name in self.powers}}
+        names = {"map": self.map, "prefix": self.prefix}
+        for each in ("powers", "connections"):
+            given = getattr(self, each)
+            require(isinstance(given, Mapping), each, given, "give a mapping of topics to transmitters.")
+            names |= {f"{each} {topic}": topic for topic in given}
         names |= {"key_values": self.key_values} if self.key_values else {}
         for name, topic in names.items():
             good = isinstance(topic, str) and re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic)
@@ -99,7 +118,7 @@ class Topics(Checked):
     def types(self) -> dict[str, str]:
         """Return the message type of each subscribed topic."""
         types = {self.map: GRID_TYPE, f"{self.map}_updates": UPDATE_TYPE, "/tf": TF_TYPE, "/tf_static": TF_TYPE}
-        types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32")
+        types |= dict.fromkeys(self.powers, "std_msgs/msg/Float32") | dict.fromkeys(self.connections, CONNECTION_TYPE)
         types |= dict.fromkeys(filter(None, (self.key_values, self.transmitters)), "diagnostic_msgs/msg/KeyValue")
         return types | {f"{self.prefix}/request_views": "std_msgs/msg/Empty"}
 
@@ -109,18 +128,35 @@ class Topics(Checked):
         return f"{self.prefix}/transmitters"
 
     def published(self, names: Mapping[str, object]) -> dict[str, str]:
-        """Return the message type of each topic published for the named transmitters."""
-        ends = ("", "/unknown") if self.unknown else ("",)
-        grids = {f"{self.prefix}/{name}{end}": GRID_TYPE for name in names for end in ends}
-        return grids | {f"{self.prefix}/next_views": VIEWS_TYPE}
+        """Return the message type of each topic published for the named transmitters; None is to be located."""
+        types = {f"{self.prefix}/next_views": VIEWS_TYPE}
+        for name, position in names.items():
+            topic = f"{self.prefix}/{name}"
+            for grid in (topic, f"{topic}/unknown") if self.unknown else (topic,):
+                types |= {grid: GRID_TYPE, f"{grid}/filter_info": FILTER_TYPE}
+            types |= {f"{topic}/position": POSE_TYPE, f"{topic}/region": GRID_TYPE} if position is None else {}
+        return types
 
-    def messages(self, answer: LiveGrid | LiveViews) -> dict[str, tuple[str, dict[str, Any]]]:
-        """Return topic, message and type of each part of an answer."""
+    def messages(self, answer: LiveAnswer, sent: Container[str] = ()) -> dict[str, tuple[str, dict[str, Any]]]:
+        """Return topic, message and type of each part of an answer.
+
+        The first grid comes with its topic for nav2's keepout filter. The filter starts again with each such message,
+        which is left out once it has been `sent`.
+        """
         if isinstance(answer, LiveViews):
             return {f"{self.prefix}/next_views": (VIEWS_TYPE, answer.message())}
         topic = f"{self.prefix}/{answer.name}"
-        unknown = {f"{topic}/unknown": (GRID_TYPE, answer.message(unknown=True))} if self.unknown else {}
-        return {topic: (GRID_TYPE, answer.message())} | unknown
+        if isinstance(answer, LiveTransmitter):
+            region = GRID_TYPE, answer.region_message()
+            return {f"{topic}/position": (POSE_TYPE, answer.message()), f"{topic}/region": region}
+        messages = {topic: (GRID_TYPE, answer.message())}
+        if self.unknown:
+            messages[f"{topic}/unknown"] = GRID_TYPE, answer.message(unknown=True)
+        for grid in [*messages]:
+            if f"{grid}/filter_info" not in sent:
+                info = {"header": answer.header, "type": KEEPOUT, "filter_mask_topic": grid}
+                messages[f"{grid}/filter_info"] = FILTER_TYPE, info | {"base": 0.0, "multiplier": 1.0}
+        return messages
 
 
 class _Transform(NamedTuple):
@@ -139,10 +175,12 @@ class Listener:
 
     def __init__(self, live: LiveCoverage, topics: Topics) -> None:
         self.live, self.topics = live, topics
-        for topic, name in topics.powers.items():
-            known = name in live.tx_m if name is not None else len(live.tx_m) == 1
-            remedy = f"name one of the transmitters {', '.join(live.tx_m)}."
-            require(known, f"powers[{topic!r}]", name, remedy)
+        for option in ("powers", "connections"):
+            for topic, name in getattr(topics, option).items():
+                finds = option == "connections" and not live.tx_m
+                known = name in live.tx_m if name is not None else finds or len(live.tx_m) == 1
+                remedy = f"name one of the transmitters {', '.join(live.tx_m)}."
+                require(known, f"{option}[{topic!r}]", name, remedy)
         self._frames = ChainMap[str, _Transform]({}, {})  # of /tf and of /tf_static
 
     def take(self, topic: str, message: Any, time_s: float | None = None) -> None:
@@ -157,6 +195,8 @@ class Listener:
                 self._take_transforms(message, now_s, self._frames.maps[topic == "/tf_static"])
             elif topic in topics.powers:
                 live.on_power(message.data, now_s, topics.powers[topic])
+            elif topic in topics.connections:
+                live.on_connection(message, now_s, topics.connections[topic])
             elif topic == topics.key_values:
                 live.on_power(float(message.value), now_s, message.key)
             elif topic == topics.transmitters:
@@ -238,7 +278,7 @@ class Dds:
         except DDSException as error:
             remedy = "check CYCLONEDDS_URI and the network interfaces."
             raise SettingsError(f"DDS domain {number} cannot be joined ({error.msg}): {remedy}") from error
-        self.topics, self.source = topics, f"DDS domain {number}"
+        self.topics, self.source, self._sent = topics, f"DDS domain {number}", set[str]()
         self._readers = [
             (topic, self._reader(topic, kind, latched))
             for topic, kind in topics.types().items()
@@ -246,12 +286,13 @@ class Dds:
         ]
         self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
 
-    def publish(self, answer: LiveGrid | LiveViews) -> None:
+    def publish(self, answer: LiveAnswer) -> None:
         """Publish an answer reliably; late subscribers get the last one."""
-        for topic, (kind, message) in self.topics.messages(answer).items():
+        for topic, (kind, message) in self.topics.messages(answer, self._sent).items():
             if topic not in self._writers:
                 self._writers[topic] = self._writer(topic, kind)
             self._writers[topic].write(filled(kind, message))
+            self._sent.add(topic)
 
     def listen(self, live: LiveCoverage) -> None:
         """Pass messages to a `LiveCoverage` without end."""
@@ -323,7 +364,8 @@ def _store() -> Any:
     from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    store.register(get_types_from_msg(UPDATE_TEXT, UPDATE_TYPE))
+    for kind, text in DEFINITIONS.items():
+        store.register(get_types_from_msg(text, kind))
     return store
 
 
@@ -394,9 +436,9 @@ class Rosbridge:
         self._socket: Any = None
         self._last: dict[str, str] = {}
 
-    def publish(self, answer: LiveGrid | LiveViews) -> None:
+    def publish(self, answer: LiveAnswer) -> None:
         """Publish an answer; a restarted server gets the last ones."""
-        for topic, (kind, message) in self.topics.messages(answer).items():
+        for topic, (kind, message) in self.topics.messages(answer, self._last).items():
             if topic not in self._published:
                 self._published[topic] = kind
                 self._advertise(topic)
