@@ -512,18 +512,18 @@ class DifferentiableLinks:
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""
-        numeric, rx_m = feature_values(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
+        phi, rx_m = self._phi, tf.constant(self._paths.rx_m)
+        numeric: dict[str, Any] = {name: getattr(phi, name) for name in GAIN_INPUTS}
+        numeric |= {"gain_db": gain_db} if phi.context is None else feature_values(phi) | {"gain_db": gain_db}
         if tx_m is None:
             return numeric
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         scene, base = self._scene, (first, self._paths.rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
         unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
-        return numeric | {
-            "distance_m": distance_m,
-            "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
-            "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
-        }
+        if phi.context is not None:
+            numeric["walled_m"] = moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends)
+        return numeric | {"distance_m": distance_m, "unobserved_distance_m": tf.minimum(unobserved_m, distance_m)}
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
         legs, context, indirect = self._legs, context_of(self._phi), self._paths.power[self._legs.paths]
