@@ -351,8 +351,8 @@ class DifferentiableScene:
         walls = UnseenWalls.shipped().of_map(self.partial)
         return walls._replace(lines=UnseenWalls.keras_lines())
 
-    def _losses_db(self, values: Mapping[str, Floats]) -> Floats:
-        """Return the mean loss of traced walls, and the additional losses of candidates (2 K,) [dB]."""
+    def _walls_at(self, values: Mapping[str, Floats]) -> Floats:
+        """Return the mean loss of traced walls [dB]; additional losses (2 K,) [dB] and prior (K,) of candidates."""
         at, resolved = self.simulation.parameters(np.zeros(3)), self.simulation.resolved
         base_hz, at, total_db = float(at.frequency_hz), replace(at, **values), 0.0
         frequency_hz, default = float(at.frequency_hz), resolved.scene_settings.traced_material
@@ -367,7 +367,7 @@ class DifferentiableScene:
             grown = [(frequency_hz / base_hz) ** law.exponent for law in power_laws(material, base_hz)]
             total_db += fraction * mean_loss_db(slab[0] * grown[0], slab[1] * grown[1], slab[2], frequency_hz)
         candidates = WallMaterials.at(frequency_hz, self.partial.wall_class_count)
-        return np.append(total_db, candidates.crossing_db)
+        return np.concatenate([[total_db], candidates.crossing_db.ravel(), candidates.prior])
 
 
 class DifferentiableLinks:
@@ -437,16 +437,17 @@ class DifferentiableLinks:
     def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
-    def _traces(self, power: Any, given: Mapping[str, Any]) -> tuple[list[WallTrace], Floats]:
+    def _traces(self, power: Any, given: Mapping[str, Any]) -> tuple[list[WallTrace], Any]:
         """Return the traced links under each candidate for the material of walls, and their probabilities."""
         phi, scene, nothing = self._phi, self._scene, np.zeros(len(self._phi))
-        losses_db = by_differences(scene._losses_db, {name: each for name, each in given.items() if name != "tx_m"})
-        known = nothing if phi.context is None else phi.context.straight_walls
+        walls = by_differences(scene._walls_at, {name: each for name, each in given.items() if name != "tx_m"})
+        known = context_of(phi).straight_walls
         if phi.path_power is None or {*given} & {*MATERIAL_PARAMETERS}:
             gain_db = self._changed_db(phi.gain_db, power, self._paths.power)
-            return [WallTrace(phi.link_state, gain_db, nothing + losses_db[0], known)], np.ones(1)
+            return [WallTrace(phi.link_state, gain_db, nothing + walls[0], known)], np.ones(1)
         materials, fractions, traces = scene.model.wall_materials, scene.partial.unnamed_walls, []
-        crossings_db = tf.reshape(losses_db[1:], (-1, len(fractions)))
+        count = len(materials.prior)
+        crossings_db, prior = tf.reshape(walls[1:-count], (count, -1)), walls[-count:]
         for number, under in enumerate(materials.under(phi, fractions)):
             reflection_db, crossing_db = materials.reflection_db[number], crossings_db[number]
             kept, first = (
@@ -454,9 +455,9 @@ class DifferentiableLinks:
                 for each_db in (crossing_db, materials.crossing_db[number])
             )
             gain_db = self._changed_db(under.gain_db, power * kept, self._paths.power * first)
-            loss_db = losses_db[0] + tf.reduce_sum(crossing_db * fractions)
+            loss_db = walls[0] + tf.reduce_sum(crossing_db * fractions)
             traces.append(WallTrace(under.link_state, gain_db, nothing + loss_db, known))
-        return traces, materials.prior
+        return traces, prior
 
     @cached_property
     def _unnamed(self) -> Floats:
@@ -522,7 +523,8 @@ class DifferentiableLinks:
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""
-        numeric, rx_m = feature_values(self._phi) | {"gain_db": gain_db}, tf.constant(self._paths.rx_m)
+        phi, rx_m = self._phi, tf.constant(self._paths.rx_m)
+        numeric = feature_values(phi) | {"gain_db": gain_db}
         if tx_m is None:
             return numeric
         first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)

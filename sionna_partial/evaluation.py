@@ -75,6 +75,9 @@ WITHOUT_INDOOR, WITH_INDOOR = "without indoor model", "with indoor model"
 
 ALWAYS_OUTAGE = "always outage"
 
+FEWEST_HOMES = 5
+"""Number of test homes below which standard errors over homes have no meaning."""
+
 
 @dataclass(frozen=True)
 class Metrics:
@@ -331,6 +334,8 @@ class Row:
     model : str
         "predictor" or a baseline.
     metrics : Metrics
+    accuracy_error, rmse_error_db : float
+        Standard errors over homes of their accuracies and of their `rmse_db` [dB], nan for fewer than two homes.
     """
 
     homes: str
@@ -339,6 +344,8 @@ class Row:
     ends_seen: str
     model: str
     metrics: Metrics
+    accuracy_error: float
+    rmse_error_db: float
 
 
 @dataclass(frozen=True)
@@ -478,7 +485,7 @@ def home_scores(prediction: LinkPrediction, links: LinkTable) -> tuple[Floats, F
 def mean_and_error(values: Floats) -> tuple[float, float]:
     """Return the mean over homes (H,) and its standard error, nan for one home."""
     error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else np.nan
-    return float(values.mean()), float(error)
+    return _mean(values), float(error)
 
 
 def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> dict[str, LinkPrediction]:
@@ -490,6 +497,9 @@ def _anywhere(model: Predictor, links: LinkTable, indoors: LinkPrediction) -> di
 def _notes(model: Predictor, others: Mapping[str, Predictor], test: tuple[str, ...]) -> Iterator[str]:
     fitted = others["distance only"]
     those = "those" if set(fitted.homes) == set(model.homes) else "others than those"
+    if len(test) < FEWEST_HOMES:
+        count = "1 test home is" if len(test) == 1 else f"{len(test)} test homes are"
+        yield f"{count} too few to compare predictors: homes differ by more than predictors. Evaluate on 20 or more."
     yield f"Majority and distance only were fitted to {len(fitted.homes)} homes, {those} of the predictor."
     for name, other in others.items():
         known = len(set(other.homes) & set(test))
@@ -533,9 +543,12 @@ def _rows(
     ends = links.context.tx_seen.astype(np.int64) + links.context.rx_seen
     cells = {"all": np.ones(len(links), dtype=bool)} | {name: ends == count for name, count in ENDS_SEEN.items()}
     for name, cell in cells.items():
-        state, gain_db = links.link_state[cell], links.gain_db[cell]
+        some = links.take(cell)
         for model, prediction in predictions.items():
-            yield Row(homes, receivers, stage, name, model, measure(prediction.take(cell), state, gain_db))
+            found = prediction.take(cell)
+            errors = (mean_and_error(scores)[1] for scores in home_scores(found, some))
+            measured = measure(found, some.link_state, some.gain_db)
+            yield Row(homes, receivers, stage, name, model, measured, *errors)
 
 
 def _differences(

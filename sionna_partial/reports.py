@@ -15,17 +15,19 @@ REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
 
 _COLUMNS = {
     "links": ("links", "d"),
-    "accuracy": ("accuracy", ".3f"),
-    "rmse_db": ("RMSE [dB]", ".2f"),
+    "accuracy": ("accuracy ± error", ".3f"),
+    "rmse_db": ("RMSE ± error [dB]", ".2f"),
     "rmse_linked_db": ("RMSE without outages", ".2f"),
     "nll_state": ("NLL state", ".3f"),
     "nll": ("NLL", ".3f"),
     "calibration_error": ("calibration error", ".3f"),
     "coverage_90": ("in 90 %", ".3f"),
 }
+_ERRORS = {"accuracy": "accuracy_error", "rmse_db": "rmse_error_db"}
 _WHERE = {"indoor": "receivers indoors", "anywhere": "receivers anywhere on the map, outage outdoors"}
 _ENDS_SEEN = {"all": "", "both": ", both ends seen", "one": ", one end seen", "none": ", no end seen"}
 _MISSING = "-"
+_ERROR = "standard error over homes of the figures of each home."
 
 
 def summary(evaluation: Evaluation) -> str:
@@ -35,7 +37,8 @@ def summary(evaluation: Evaluation) -> str:
         rows = evaluation.select(homes="test", receivers=receivers, ends_seen="all")
         if rows:
             tables.append(f"### Test homes ({len(evaluation.homes['test'])}), {title}\n\n{_by_stage(rows)}")
-    shown = "\n".join(f"{_COLUMNS[name][0]}: {DEFINITIONS[name]}" for name in ("accuracy", "rmse_db"))
+    shown = "\n".join(f"{name}: {DEFINITIONS[key]}" for key, name in (("accuracy", "accuracy"), ("rmse_db", "RMSE")))
+    shown += f"\n±: {_ERROR}"
     return "\n\n".join([*tables, shown, *evaluation.notes])
 
 
@@ -47,7 +50,7 @@ def markdown(evaluation: Evaluation) -> str:
         f"SHA-256 {evaluation.fingerprint}. {counts} homes of the data set; test homes are those that the predictor "
         "was not trained on.",
         *evaluation.notes,
-        "\n".join(f"- **{_COLUMNS[name][0]}**: {text}" for name, text in DEFINITIONS.items()),
+        "\n".join(f"- **{_COLUMNS[name][0]}**: {text}" for name, text in DEFINITIONS.items()) + f"\n- **±**: {_ERROR}",
         f"`{_MISSING}` stands where there is no finite value, as of the likelihood of a gain that is predicted "
         "without standard deviation.",
     ]
@@ -68,11 +71,8 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
         "homes": {kind: list(names) for kind, names in evaluation.homes.items()},
         "notes": list(evaluation.notes),
         "definitions": DEFINITIONS,
-        "rows": [{**asdict(row), "metrics": row.metrics.as_json()} for row in evaluation.rows],
-        "differences": [
-            {name: None if value != value else value for name, value in asdict(each).items()}
-            for each in evaluation.differences
-        ],
+        "rows": [_without_nan({**asdict(row), "metrics": row.metrics.as_json()}) for row in evaluation.rows],
+        "differences": [_without_nan(asdict(each)) for each in evaluation.differences],
         "calibration": {
             f"{stage:g}": {
                 "links": calibration.state.links.tolist(),
@@ -83,6 +83,10 @@ def as_json(evaluation: Evaluation) -> dict[str, Any]:
             for stage, calibration in evaluation.calibrations.items()
         },
     }
+
+
+def _without_nan(values: dict[str, Any]) -> dict[str, Any]:
+    return {name: None if value != value else value for name, value in values.items()}
 
 
 def save_report(evaluation: Evaluation, folder: Path) -> list[Path]:
@@ -120,7 +124,7 @@ def _differences(evaluation: Evaluation) -> Iterable[str]:
 
 def _by_stage(rows: Sequence[Row]) -> str:
     stages, models = (list(dict.fromkeys(getattr(row, name) for row in rows)) for name in ("stage", "model"))
-    found = {(row.model, row.stage): f"{row.metrics.accuracy:.3f} {row.metrics.rmse_db:5.2f} dB" for row in rows}
+    found = {(row.model, row.stage): f"{_measured(row, 'accuracy')}, {_measured(row, 'rmse_db')} dB" for row in rows}
     header = ["accuracy, RMSE", *(stage_name(stage) for stage in stages)]
     cells = ([model, *(found.get((model, stage), _MISSING) for stage in stages)] for model in models)
     return markdown_table(header, cells)
@@ -128,12 +132,19 @@ def _by_stage(rows: Sequence[Row]) -> str:
 
 def _section(evaluation: Evaluation, homes: str, receivers: str = "indoor", ends_seen: str = "all") -> str:
     cells = [
-        [stage_name(row.stage), row.model, *(_text(getattr(row.metrics, name), _COLUMNS[name][1]) for name in _COLUMNS)]
+        [stage_name(row.stage), row.model, *(_measured(row, name) for name in _COLUMNS)]
         for row in evaluation.select(homes=homes, receivers=receivers, ends_seen=ends_seen)
         if row.metrics.links
     ]
     table = markdown_table(["stage", "model", *(label for label, _ in _COLUMNS.values())], cells, names=2)
     return f"### {homes.capitalize()} homes, {_WHERE[receivers]}{_ENDS_SEEN[ends_seen]}\n\n{table}"
+
+
+def _measured(row: Row, name: str) -> str:
+    """Return a figure of merit, with its standard error if it has one."""
+    form = _COLUMNS[name][1]
+    text = _text(getattr(row.metrics, name), form)
+    return f"{text} ± {_text(getattr(row, _ERRORS[name]), form)}" if name in _ERRORS else text
 
 
 def _difference_cells(each: Difference) -> list[str]:

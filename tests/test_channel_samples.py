@@ -63,6 +63,34 @@ def test_draws_agree_with_the_prediction_and_with_themselves(
     assert np.ptp(samples.gain_db, axis=0).max() > 20.0
 
 
+def room() -> sp.PartialMap:
+    """A complete room of 6 x 4 m with a wall into it."""
+    state = np.zeros((42, 62), dtype=np.uint8)
+    state[[0, -1]] = state[:, [0, -1]] = state[:30, 30, None] = sp.CellState.WALL
+    return sp.PartialMap(state, 0.1)
+
+
+@pytest.mark.parametrize("case", ["brick", "unknown material", "partial map"])
+def test_mean_and_spread_of_draws_are_predicted(case: str, partial: sp.PartialMap, receivers: np.ndarray) -> None:
+    """Through walls with the residual of a trace, and over materials; 5 GHz, and 28 GHz on a partial map."""
+    if case == "partial map":
+        model, tx, rx = sp.LinkModel(partial), TX, receivers[:12]
+    else:
+        material = sp.Material.named("brick") if case == "brick" else None
+        settings = sp.TraceSettings(5e9, max_depth=2), sp.SceneSettings(material=material)
+        model, tx = sp.LinkModel(room(), None, *settings), (1.0, 2.0, 1.5)
+        rx = np.array([(5.0, 2.3, 1.2), (2.5, 1.0, 1.0), (2.2, 3.5, 1.5), (4.0, 1.0, 1.5), (5.5, 3.7, 1.5)])
+    drawn, expected = sp.sample_channels(model, tx, rx, n=3000), model.predict(tx, rx)
+    clear = expected.gain_nlos_mean_db - 3.0 * expected.gain_nlos_std_db > -150.0  # no gain is below the floor
+    assert clear.sum() >= 4
+    assert np.abs(drawn.gain_db.mean(axis=0) - expected.gain_mean_db)[clear].max() < 0.15
+    assert np.abs(drawn.gain_db.std(axis=0) - expected.gain_std_db)[clear].max() < 0.15
+    links = drawn.links(7)
+    power = np.bincount(links.path_rx, np.abs(links.a) ** 2, len(rx))
+    received = links.link_state != sp.LinkState.OUTAGE
+    np.testing.assert_allclose(10 * np.log10(power[received]), links.gain_db[received], atol=1e-6)
+
+
 def test_what_was_seen_is_in_every_draw(partial: sp.PartialMap) -> None:
     rx_m = np.array([(7.8, 10.2, 1.5)])
     seen = sp.link_features(partial, sp.trace_links(partial, TX, rx_m)).context.indirect_gain_db[0, -1]

@@ -15,7 +15,6 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.differentiable import STEEPEST, LinkDistribution, SmoothLengths, moved_lengths_m, moved_paths
 from sionna_partial.errors import SettingsError
 from sionna_partial.prediction.paper_networks import import_keras, tf
-from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.tracing.path_set import PARAMETERS, PathSet
 
@@ -76,9 +75,8 @@ def links_of():
 
 
 def predicted(kind, predictor):
-    links = sp.trace_links(MAPS[kind], TX_M, RX_M, trace_settings=TRACE, scene_settings=SCENE)
-    phi = sp.link_features(MAPS[kind], links)
-    return LinkPrediction.of_trace(phi) if kind == "complete" else loaded(predictor).predict(phi), links
+    model = sp.LinkModel(MAPS[kind], loaded(predictor), TRACE, SCENE)
+    return model.predict(TX_M, RX_M), sp.trace_links(model.simulation, TX_M, RX_M)
 
 
 def assert_same(found, expected, **tolerance):

@@ -225,3 +225,30 @@ def test_a_model_of_the_user_predicts_what_is_not_certain() -> None:
 def test_what_is_no_distribution_is_refused(columns: dict[str, float], message: str) -> None:
     with pytest.raises(PredictorError, match=message):
         sp.LinkModel(home(HALF_SEEN), Constant(**columns)).predict(TX, [[3.2, 0.4, 1.5]])
+
+
+def test_distributions_by_material_are_kept():
+    rng, weights = np.random.default_rng(0), np.array([0.25, 0.75])
+
+    def links(count=6):
+        means_db = np.stack([np.full(count, -150.0), *rng.uniform(-140.0, -60.0, (2, count))])
+        stds_db = np.stack([np.zeros(count), *rng.uniform(0.3, 20.0, (2, count))])
+        return LinkPrediction.of_parts(rng.dirichlet(np.ones(3), count).T, means_db, stds_db)
+
+    mixed, plain = LinkPrediction.over_materials([links(), links()], weights, 5.0), links()
+    assert (plain.by_material, len(plain.materials[0])) == (None, 1)
+    taken = np.arange(6) % 2 == 0
+    half = np.full((2, 6), 0.5)
+    for found, change in (
+        (mixed.where(taken, plain), lambda part: part.where(taken, plain)),
+        (mixed.take(taken), lambda part: part.take(taken)),
+        (mixed.reshaped((2, 3)), lambda part: part.reshaped((2, 3))),
+        (mixed.anywhere(np.full(6, 0.5)), lambda part: part.anywhere(np.full(6, 0.5))),
+        (LinkPrediction.mixture([mixed, plain], half), lambda part: LinkPrediction.mixture([part, plain], half)),
+        (LinkPrediction.concatenate([plain, mixed]), lambda part: LinkPrediction.concatenate([plain, part])),
+    ):
+        parts, kept = found.by_material
+        assert kept is weights
+        for part, first in zip(parts, mixed.by_material[0], strict=True):
+            for name in LinkPrediction.COLUMNS:
+                np.testing.assert_array_equal(getattr(part, name), getattr(change(first), name))

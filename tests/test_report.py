@@ -37,11 +37,14 @@ class TestSummary:
             for row in measured:
                 (cells,) = (cells for cells in rows if cells[0] == row.model)
                 cell = cells[rows[0].index(f"{row.stage:g} steps")]
-                assert cell.split() == [f"{row.metrics.accuracy:.3f}", f"{row.metrics.rmse_db:.2f}", "dB"]
+                accuracy = f"{row.metrics.accuracy:.3f} ± {row.accuracy_error:.3f}"
+                assert cell == f"{accuracy}, {row.metrics.rmse_db:.2f} ± {row.rmse_error_db:.2f} dB"
 
         text = summary(dataclasses.replace(evaluation, notes=("one note", "another")))
         assert DEFINITIONS["accuracy"] in text
         assert text.endswith("one note\n\nanother")
+        assert "±: standard error over homes" in text
+        assert summary(evaluation).count("2 test homes are too few to compare predictors") == 1
 
 
 class TestMarkdown:
@@ -49,8 +52,9 @@ class TestMarkdown:
         rows = tables(markdown(evaluation))["Test homes, receivers indoors"]
         (row,) = (cells for cells in rows if cells[:2] == ["100 steps", "predictor"])
         (found,) = evaluation.select(homes="test", stage=100, model="predictor", ends_seen="all")
-        assert rows[0][2:5] == ["links", "accuracy", "RMSE [dB]"]
-        assert row[2:5] == ["600", f"{found.metrics.accuracy:.3f}", f"{found.metrics.rmse_db:.2f}"]
+        assert rows[0][2:5] == ["links", "accuracy ± error", "RMSE ± error [dB]"]
+        accuracy = f"{found.metrics.accuracy:.3f} ± {found.accuracy_error:.3f}"
+        assert row[2:5] == ["600", accuracy, f"{found.metrics.rmse_db:.2f} ± {found.rmse_error_db:.2f}"]
 
     def test_every_definition_and_every_part_is_there(self, evaluation):
         text = markdown(evaluation)

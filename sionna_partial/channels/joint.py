@@ -114,11 +114,11 @@ def drawn_states(links: LinkPrediction, quantile: Floats) -> States:
     return np.where(quantile < links.p_outage, LinkState.OUTAGE, state).astype(np.uint8)
 
 
-def drawn_gains(links: LinkPrediction, state: States, quantile: Floats, residual_db: Floats | float = 0.0) -> Floats:
+def drawn_gains(links: LinkPrediction, state: States, quantile: Floats) -> Floats:
     """Return gains (n, ...) [dB] of predicted links (...) at quantiles given their states."""
     _, means_db, stds_db = links.by_state
     mean_db, std_db = (np.take_along_axis(each, state.astype(np.intp), axis=0) for each in (means_db, stds_db))
-    gain_db = np.clip(mean_db + std_db * ndtri(quantile) + residual_db, GAIN_FLOOR_DB, 0.0)
+    gain_db = np.clip(mean_db + std_db * ndtri(quantile), GAIN_FLOOR_DB, 0.0)
     return np.where(state == LinkState.OUTAGE, GAIN_FLOOR_DB, gain_db)
 
 

@@ -274,18 +274,26 @@ class _Buildings(NamedTuple):
         kept: Floats = 10.0 ** (-0.1 * self.loss_db[candidates] @ self.counts[paths].T)
         return kept
 
-    def states_and_gains(self, of_state: Floats, of_gain: Floats, seed: list[int]) -> tuple[States, Floats]:
-        """Return states and gains (n, L) [dB], at quantiles that are spread evenly for each candidate and state."""
+    def states_and_gains(
+        self, of_state: Floats, of_gain: Floats, of_residual: Floats | None, seed: list[int]
+    ) -> tuple[States, Floats, Floats]:
+        """Return states, gains without residual and residuals (n, L) [dB].
+
+        Quantiles are spread evenly for each candidate and state.
+        """
         rng, group = np.random.default_rng(seed), np.broadcast_to(self.of_draw[:, None], of_state.shape)
         of_state = evenly_within(group, of_state, rng)
         state, gain_db = np.zeros(of_state.shape, np.uint8), np.zeros(of_state.shape)
         rows = [(self.of_draw == number, part) for number, part in enumerate(self.parts)]
         for here, part in rows:
             state[here] = drawn_states(part, of_state[here])
-        of_gain = evenly_within(len(LinkState) * group + state, of_gain, rng)
+        group = len(LinkState) * group + state
+        of_gain = evenly_within(group, of_gain, rng)
         for here, part in rows:
             gain_db[here] = drawn_gains(part, state[here], of_gain[here])
-        return state, gain_db
+        if of_residual is None:
+            return state, gain_db, np.zeros(state.shape)
+        return state, gain_db, RESIDUAL_DB * ndtri(evenly_within(group, of_residual, rng))
 
 
 def _is_certain(links: LinkPrediction) -> Bools:
@@ -317,8 +325,8 @@ class _Draws:
         self._power = csr_array((power, (np.arange(len(power)), self._of_link)), shape=shape)
         unobserved_m = traced_unobserved_m(partial, traced, self._paths)
         seen = unobserved_m < SEEN_M
-        self.state, within_db = buildings.states_and_gains(of_state, of_gain, [seed, _EVEN])
-        residual_db = RESIDUAL_DB * ndtri(others[0]) if deviates else np.zeros(())
+        quantiles = of_state, of_gain, others[0] if deviates else None
+        self.state, within_db, residual_db = buildings.states_and_gains(*quantiles, [seed, _EVEN])
         has_path = self.state != LinkState.OUTAGE
         self.gain_db = np.where(has_path, np.clip(within_db + residual_db, GAIN_FLOOR_DB, 0.0), GAIN_FLOOR_DB)
         # with LOS there are the direct path and all paths in observed space, at least
