@@ -35,6 +35,7 @@ ROOMS = {
             "import_report",
             "partial_map",
             "mesh.cells",
+            "mesh.upright",
             "mesh.points",
             "mesh.files",
             "ros_map",

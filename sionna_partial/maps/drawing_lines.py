@@ -24,9 +24,14 @@ MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 2_000_000, 16
 FLAT_FRACTION = 0.001
 """Distance of a polygon from its curve, relative to the extent of the curve."""
 
-LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "MLINE"}
+LINE_TYPES = {
+    *("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "TRACE", "MLINE"),
+    *("3DFACE", "MESH"),
+}
+"""Types with lines in the plan; of faces, the upright ones."""
 
-XREF = "external reference"
+XREF, HIDDEN = "external reference", "hidden"
+"""Kinds of entities that are not read: external references, and those that AutoCAD does not show."""
 
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
@@ -85,6 +90,9 @@ MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
 """Differences of misfits from which the header's unit is rejected; from which it gives a warning, or is rejected if it
 is inches or feet in a metric drawing; and from which one unit is better than all others."""
 
+UPRIGHT_RATIO = 0.1
+"""Largest vertical part of the normal of an upright face."""
+
 RASTER_CELLS = 1000
 """Number of cells along the longer side of the plan in which openings are found."""
 
@@ -140,6 +148,7 @@ class DrawnLines:
     def __init__(self, path: Path, drawing: Any) -> None:
         self._path, self._drawing = path, drawing
         self.names = {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers}
+        self._frozen = {layer.dxf.name.lower() for layer in drawing.layers if layer.is_frozen()}
         self._counted: dict[str, Counter[tuple[str, str]]] = {}
         self._read: dict[str, dict[str, Segments]] = {}
         space = drawing.modelspace()
@@ -168,6 +177,9 @@ class DrawnLines:
             name, kind = _layer_of(entity), entity.dxftype()
             layer = name.lower()
             self.names.setdefault(layer, name)
+            if not self._shows(entity):
+                found[layer, HIDDEN] += entity.mcount if kind == "INSERT" else 1
+                continue
             if kind != "INSERT":
                 found[layer, kind] += 1
                 continue
@@ -184,11 +196,18 @@ class DrawnLines:
                     found[layer if own == "0" else own, inner] += count * times
         return found
 
+    def _shows(self, entity: Any) -> bool:
+        """Return whether an entity is visible, and no INSERT on a frozen layer, which hides its block on any layer."""
+        is_insert = entity.dxftype() == "INSERT"
+        return not entity.dxf.get("invisible", 0) and not (is_insert and _layer_of(entity).lower() in self._frozen)
+
     def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
         parts: dict[str, list[Segments]] = {}
         pieces = 0
         for entity in entities:
             layer = _layer_of(entity).lower()
+            if not self._shows(entity):
+                continue
             if entity.dxftype() == "INSERT":
                 found = self._inserted(entity, layer, layers, nesting)
             elif layer in layers or layer == "0":
@@ -249,17 +268,34 @@ def _pieces(entity: Any) -> Iterator[Segments]:
     kind = entity.dxftype()
     if kind == "LINE":
         yield np.array([[entity.dxf.start.xyz, entity.dxf.end.xyz]])
-    elif kind == "MLINE":
+    elif kind == "MLINE" or (kind == "POLYLINE" and (entity.is_poly_face_mesh or entity.is_polygon_mesh)):
         for part in entity.virtual_entities():
             yield from _pieces(part)
+    elif kind == "3DFACE":
+        yield from _upright([corner.xyz for corner in entity.wcs_vertices()])
+    elif kind == "MESH":
+        for face in entity.faces:
+            yield from _upright([tuple(entity.vertices[number]) for number in face])
     elif kind in LINE_TYPES:
         for corners in _curves(entity):
             yield np.stack([corners[:-1], corners[1:]], axis=1)
 
 
+def _upright(corners: list[tuple[float, ...]]) -> Iterator[Segments]:
+    """Yield the line under an upright face."""
+    points = np.array(corners, dtype=np.float64)
+    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    if np.isfinite(points).all() and abs(normal[2]) < UPRIGHT_RATIO * np.linalg.norm(normal):
+        apart = np.linalg.norm(points[:, None, :2] - points[None, :, :2], axis=2)
+        yield points[[[*np.unravel_index(np.argmax(apart), apart.shape)]]]
+
+
 def _curves(entity: Any) -> Iterator[Floats]:
     from ezdxf.path import from_hatch, make_path
 
+    if entity.dxftype() in ("LWPOLYLINE", "POLYLINE") and entity.has_width:
+        yield from _wide(entity)
+        return
     for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
         corners = np.array([corner.xyz for corner in path.control_vertices()])
         if len(corners) > 1 and path.has_curves:
@@ -267,6 +303,18 @@ def _curves(entity: Any) -> Iterator[Floats]:
             corners = np.array([corner.xyz for corner in path.flattening(flat, segments=4)])
         if len(corners) > 1:
             yield corners
+
+
+def _wide(entity: Any) -> Iterator[Floats]:
+    """Yield the outlines of the segments of a polyline with widths."""
+    from ezdxf.math import Vec3
+    from ezdxf.render.trace import TraceBuilder
+
+    ocs = entity.ocs()
+    for trace in TraceBuilder.from_polyline(entity, segments=16):
+        for face in trace.faces():
+            corners = [Vec3(corner) for corner in face]
+            yield np.array([ocs.to_wcs(corner).xyz for corner in [*corners, corners[0]]])
 
 
 class _Scale(NamedTuple):

@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Indices, States, largest_by_area
+from sionna_partial.arrays import Bools, Indices, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.drawing_lines import (
+    HIDDEN,
     LINE_TYPES,
     NO_WALL,
     PARTIAL_HEIGHT,
@@ -33,7 +34,13 @@ from sionna_partial.maps.drawing_lines import (
     wall_thickness,
 )
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
-from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, crossed_cells, fitted_grid, require_unit
+from sionna_partial.maps.mesh.cells import (
+    DEFAULT_RESOLUTION_M,
+    crossed_cells,
+    fitted_grid,
+    require_unit,
+    states_of_lines,
+)
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import bare_image, opened_image
@@ -43,9 +50,6 @@ MAX_DRAWING_BYTES = 100_000_000
 
 FOREIGN = "AEC_", "ACAD_PROXY"
 """Prefixes of types of objects that the DXF does not contain as lines."""
-
-OPENING_M, SOLID_M = 2.0, 0.5
-"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
 
 MAX_ADDED, MAX_GROWTH = 8, 2.5
 """Most layers tried if walls enclose hardly any area, and their largest relative extent."""
@@ -160,7 +164,7 @@ class _Plan(NamedTuple):
     @classmethod
     def of(cls, path: Path, drawing: Any) -> "_Plan":
         lines = DrawnLines(path, drawing)
-        visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
+        visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF, HIDDEN)}
         visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
         return cls(path, drawing, visible, lines)
 
@@ -209,6 +213,8 @@ class _Plan(NamedTuple):
                 what, remedy = (kind, "explode them") if kind != XREF else (name, "bind it")
                 notes.skip(what, count, f"{'object of another program' if kind != XREF else kind}: {remedy}")
                 lost[what] = lost.get(what, 0) + count
+            elif kind == HIDDEN:
+                notes.skip(layer, count, "invisible, or blocks on a frozen layer")
             elif kind in LINE_TYPES:
                 notes.skip(layer, count, reasons.get(name, NO_WALL))
             elif kind != "INSERT" and not reasons.get(name, NO_WALL):
@@ -338,26 +344,6 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
     if wall_layers is not None and not (plain and wall_layers and all(isinstance(name, str) for name in wall_layers)):
         raise MapError(f"wall_layers = {shown(wall_layers)} is not allowed: give names of layers, such as ['WALLS'].")
     return wall_layers
-
-
-def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
-    """Return the cell states (ny, nx): walls including `solid`, enclosed area, and unknown cells."""
-    cell_m = empty.resolution_m
-    cells = crossed_cells((segments - empty.origin_m) / cell_m, empty.shape, BORDER_M / cell_m)
-    margin = math.ceil(OPENING_M / cell_m)
-    wall = np.pad(cells if solid is None else cells | solid, margin)
-    # A disc of half the opening's width that rolls along the outer walls does not enter the building.
-    radius = OPENING_M / 2 / cell_m
-    to_wall = ndimage.distance_transform_edt(~wall)
-    area, _ = ndimage.label(to_wall > radius)
-    outside = ndimage.distance_transform_edt(area != area[0, 0]) <= radius
-    area, count = ndimage.label(~(wall | outside))
-    widest_m = 2 * cell_m * largest_by_area(to_wall, area, count)
-    inside = area > 0
-    state = np.full(wall.shape, CellState.UNKNOWN, dtype=np.uint8)
-    state[inside] = CellState.FREE
-    state[wall | (inside & (widest_m <= SOLID_M)[area])] = CellState.WALL
-    return state[margin:-margin, margin:-margin]
 
 
 def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
