@@ -36,18 +36,60 @@ XREF, HIDDEN = "external reference", "hidden"
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
 
-WALL_NAMES = re.compile(
-    r"wall|wand|wänd|mauer|mur(?!al)|pared|parete|vägg|vegg|muur|sciana|ściana|стен|colum|pillar|s-cols|stütze|partition|"
-    r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
-    re.IGNORECASE,
-)
-"""Words in names of layers with walls, columns and windows."""
+WALL_WORDS = {
+    "English": "wall partition colum pillar s-cols window glaz",
+    "German": "wand wänd mauer stütze säule fenster",
+    "French": "mur(?!al) cloison poteau fenêtre vitr",
+    "Spanish": "pared muro tabique pilar ventana",
+    "Italian": "parete pareti tramezz pilastr finestra",
+    "Portuguese": "parede alvenaria janela",
+    "Dutch": "muur kolom <raam>",
+    "Swedish": "vägg pelare fönster",
+    "Norwegian": "vegg søyle vindu",
+    "Danish": "væg søjle",
+    "Finnish": "seinä pilari ikkuna",
+    "Estonian": "<sein <aken",
+    "Latvian, Lithuanian": "<sien[aou]",
+    "Polish": "ścian słup <okn",
+    "Czech, Slovak": "<stěn[aoy] <zeď> <zdi zdiv příčk priečk sloup <stĺp",
+    "Hungarian": "<fal> <fala válaszfal főfal oszlop pillér ablak",
+    "Romanian": "perete pereți zidăr <stâlp fereastr ferestre",
+    "Croatian, Serbian, Slovenian": "<zid <stup(?!id) prozor зид прозор",
+    "Russian, Bulgarian": "стен перегород колон окн окон",
+    "Ukrainian": "стін стін вікн вікон",
+    "Greek": "τοίχο τοιχ κολών παράθυρ toich toix",
+    "Turkish": "duvar kolon pencere",
+    "Indonesian, Malay": "dinding tembok jendela",
+    "Vietnamese": "tường tuong vách <cột> cửa_sổ",
+    "Chinese": "墙 牆 柱 窗",
+    "Japanese": "壁 柱 窓",
+    "Korean": "벽 기둥 창문",
+    "Thai": "ผนัง กำแพง เสา หน้าต่าง",
+    "Arabic, Persian": "جدار حائط عمود نافذة دیوار",
+    "Hebrew": "קיר עמוד חלון",
+    "Hindi": "दीवार",
+}
+"""Patterns of names of layers with walls, columns and windows; < and > are ends of words, accents do not count."""
+
+
+def _plain(text: str) -> str:
+    """Return text in lower case without accents."""
+    kept = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+    return "".join(kept).casefold().translate(str.maketrans({"ł": "l", "ø": "o", "æ": "ae", "\u0131": "i"}))
+
+
+_ENDS = {"<": "(?<![^\\W\\d_])", ">": "(?![^\\W\\d_])", "_": "[ _-]?"}
+_WALLS = "|".join(word for words in WALL_WORDS.values() for word in _plain(words).split())
+WALL_NAMES = re.compile(re.sub("[<>_]", lambda found: _ENDS[found[0]], _WALLS))
+"""Words in names of layers with walls, columns and windows, for `_plain` names."""
 
 NO_WALL_NAMES = {
     reason: re.compile(words, re.IGNORECASE)
     for reason, words in {
         "texts, dimensions or door headers": r"head|text|dim|anno|iden|note",
         "furniture": r"furn|möbel|mobel|schrank",
+        "doors": r"门窗|門窗",
+        "axes": r"芯|轴|軸",
         "lamps or sockets": r"-lite|light|lamp|leucht|lumin|sconce|socket|steckdose|outlet",
         "above the room": r"ovhd|overhead",
         "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
@@ -107,13 +149,14 @@ def skip_reason(name: str) -> str:
     """
     name = unicodedata.normalize("NFC", _REFERENCE.split(name)[-1])
     parts = _AIA.fullmatch(name)
-    if parts and parts[2].upper() not in AIA_WALLS and not WALL_NAMES.search(parts[2]):
+    if parts and parts[2].upper() not in AIA_WALLS and not WALL_NAMES.search(_plain(parts[2])):
         return "major group of no wall (AIA/NCS)"
+    is_wall = WALL_NAMES.search(_plain(name))
     for reason, words in NO_WALL_NAMES.items():
         if words.search(name):
-            return reason if WALL_NAMES.search(name) else f"{NO_WALL}: {reason}"
+            return reason if is_wall else f"{NO_WALL}: {reason}"
     if not parts:
-        return "" if WALL_NAMES.search(name) else NO_WALL
+        return "" if is_wall else NO_WALL
     status = "D" if parts[1].upper() in AIA_DEMOLITION else (parts[4] or "").upper()
     return AIA_STATUS.get(status, "")
 

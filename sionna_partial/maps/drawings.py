@@ -58,6 +58,10 @@ THIN_M, FILLED_FRACTION = 0.06, 0.3
 """Width of thin lines (furniture, doors, dimensions) [m], and least fraction of dark pixels in wider lines on plans
 with filled walls."""
 
+HATCH_M, THINNEST_M, HATCHED_FRACTION = 0.15, 0.1, 0.02
+"""Widest space between the lines of a hatch, least thickness of hatched walls [m], and least fraction of dark pixels
+inside them: walls of two lines have none."""
+
 MARK_M = 0.5
 """Largest extent along x and y of text or symbols [m]."""
 
@@ -85,8 +89,9 @@ def map_from_drawing(
         DXF, text or binary.
     wall_layers : sequence of str or None
         Layers with the walls, with wildcards `*` and `?`. By default visible layers named as walls, columns or
-        windows, in European languages or the AIA/NCS standard, except demolished ones. Without any, all visible
-        ones; if they enclose hardly any area, also the layer that closes most rooms: both raise a `MapWarning`.
+        windows, in one of 40 languages or by the AIA/NCS standard, except demolished ones. If they enclose hardly any
+        area, also the layer that closes most rooms, with a `MapWarning`. Without such names, the only layer with lines,
+        with a `MapWarning`; several are refused, with a list of their lines.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers, with wildcards; the last layer wins.
     layer_heights_m : mapping of str to float, or None
@@ -181,6 +186,21 @@ class _Plan(NamedTuple):
         texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
         return f"{len(names)} layers: {', '.join(texts)}"
 
+    def preview(self, layers: set[str]) -> str:
+        """Return number, length and extent of the lines on layers, the longest first."""
+        segments, on_layer = self.lines.segments(layers)
+        found = []
+        for layer in layers:
+            own = segments[on_layer == layer]
+            if len(own):
+                x, y = np.ptp(own.reshape(-1, 2), axis=0)
+                length = float(np.linalg.norm(own[:, 1] - own[:, 0], axis=1).sum())
+                name = self.lines.names.get(layer, layer)
+                found.append((-length, f"'{name}' ({len(own):,} lines, {length:.4g} long, on {x:.4g} x {y:.4g})"))
+        texts = [text for _, text in sorted(found)]
+        more = f", and {len(texts) - 20} more" if len(texts) > 20 else ""
+        return f"{', '.join(texts[:20])}{more} [units of the drawing]"
+
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
         if names is not None:
             found = {
@@ -193,7 +213,13 @@ class _Plan(NamedTuple):
             return found
         found = {layer: skip_reason(layer) if shows else "hidden" for layer, shows in self.visible.items()}
         if all(found.values()):
-            message = f"path = '{self.path}' has no layer whose name looks like walls, so all lines are walls"
+            counts = self.lines.line_counts()
+            shown_layers = {layer for layer, shows in self.visible.items() if shows and counts[layer]}
+            message = f"path = '{self.path}' has no layer whose name looks like walls"
+            if len(shown_layers) > 1:
+                remedy = f"give wall_layers (--wall-layer), one or more of {self.preview(shown_layers)}"
+                raise MapError(f"{message}: {remedy}.")
+            message = f"{message}, so all lines are walls"
             warnings.warn(f"{message}: name them as wall_layers; it has {self.listed()}.", MapWarning, stacklevel=4)
             found = {layer: "" if reason != "hidden" else reason for layer, reason in found.items()}
         return found
@@ -403,7 +429,9 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
     width = round(THIN_M / pixel_m)
     if width > 1:
         wide = ndimage.binary_opening(wall, np.ones((width, width), dtype=bool))
-        if wide.sum() >= FILLED_FRACTION * wall.sum():
+        if wide.sum() < FILLED_FRACTION * wall.sum():
+            wide = _hatched(wall, pixel_m)
+        if wide.any():
             notes.skip("thin lines", ndimage.label(wall & ~wide)[1], f"narrower than {width * pixel_m:.2g} m")
             wall = wide
     pieces, _ = ndimage.label(wall, np.ones((3, 3), dtype=bool))
@@ -416,6 +444,25 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
         what = f"path = '{path}' has no connected walls longer than {MARK_M:g} m with resolution_m = {pixel_m:g}"
         raise MapError(f"{what}: give the metres per pixel, or a picture with darker walls.")
     return np.asarray(wall)
+
+
+def _hatched(wall: Bools, pixel_m: float) -> Bools:
+    """Return the pixels (rows, columns) of hatched walls with the space between their lines, none without such walls.
+
+    Separate marks are left out first: the letters of a text would close to a wall.
+    """
+    margin = math.ceil(HATCH_M / pixel_m)
+    pieces, _ = ndimage.label(np.pad(wall, margin), np.ones((3, 3), dtype=bool))
+    longest = [0, *(max(side.stop - side.start for side in box) for box in ndimage.find_objects(pieces))]
+    lines = (np.array(longest) * pixel_m > MARK_M)[pieces]
+    radius, width = HATCH_M / 2 / pixel_m, max(2, round(THINNEST_M / pixel_m))
+    closed = ndimage.distance_transform_edt(ndimage.distance_transform_edt(~lines) <= radius) > radius
+    band = ndimage.binary_opening(closed, np.ones((width, width), dtype=bool))
+    inside = ndimage.distance_transform_edt(band) > THIN_M / pixel_m / 2
+    is_hatched = (lines & inside).sum() >= HATCHED_FRACTION * inside.sum() > 0
+    if not (is_hatched and (lines & band).sum() >= FILLED_FRACTION * lines.sum()):
+        return np.zeros_like(wall)
+    return np.asarray(band[margin:-margin, margin:-margin])
 
 
 def _shades(path: Path) -> States:

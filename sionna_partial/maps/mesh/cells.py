@@ -73,7 +73,7 @@ class MeshReading:
 
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
         """Return a map with its report; the extent is checked if all of the file is observed."""
-        free = "give the height_band_m of its walls, or the observed area."
+        free = "give the observed area, the height_band_m of its walls, or sensor_positions_m of a cloud."
         return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.", free=free)
 
 
@@ -233,7 +233,7 @@ def _without_floor(known: Bools, wall: Bools, empty: PartialMap) -> Bools:
         row, column = np.nonzero(wall)
         inside[row.min(initial=0) : row.max(initial=-1) + 1, column.min(initial=0) : column.max(initial=-1) + 1] = True
         inside &= ~wall
-    if (known & inside).sum() >= ENCLOSED_FRACTION * inside.sum():
+    if (known & ~wall).sum() >= ENCLOSED_FRACTION * min(inside.sum(), wall.sum()):
         return np.zeros_like(known)
     remedy = "give its observed area as observed if that is less."
     warnings.warn(

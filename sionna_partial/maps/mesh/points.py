@@ -329,7 +329,7 @@ def _cloud_map(
     turn = levelling(what, surfaces_of_points(sample), notes) if found.endswith("z") else np.eye(3)
     if turn[2, 2] < 1.0:
         axes = _Axes(turn @ axes.turn, bounds.mean(axis=0) - turn @ bounds.mean(axis=0))
-        voxels, count, heights_m, _ = _occupied_voxels(what, parts(), cell, axes, reading, replace(notes))
+        voxels, count, heights_m, _ = _occupied_voxels(what, parts(), cell, axes, reading, ImportNotes(what))
         bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
     sensors = _sensors(sensor_positions_m, reading.up, axes)
     empty = fitted_grid(bounds, cell)

@@ -27,7 +27,7 @@ HIGHEST_ROOM_M, FLOORS_RATIO = 6.0, 1.5
 SMALLEST_LEAN_DEG, LARGEST_LEAN_DEG, SEARCHED_DEG = 0.5, 10.0, 45.0
 """Angles from which scans are levelled, up to which they are, and up to which their direction up is searched."""
 
-CONES_DEG = (8.0, 4.0, 2.0)
+CONES_DEG = (8.0, 4.0, 2.0, 1.0)
 """Largest deviations of floors and walls from the direction up, which is refined step by step."""
 
 AGREEING, BETTER = 0.3, 1.5
