@@ -206,6 +206,16 @@ def test_hardly_any_area(tmp_path: Path) -> None:
     assert re.search(message, str(caught[0].message))
 
 
+def test_degrees(tmp_path: Path) -> None:
+    doc = ezdxf.new(units=6)
+    corners = [(11.57, 48.15), (11.5708, 48.15), (11.5708, 48.1503), (11.57, 48.1503)]
+    doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    message = r"spans x 11.57 to 11.5708 and y 48.15 to 48.1503, as if in degrees of longitude and latitude: project it"
+    with pytest.raises(MapError, match=message):
+        load_map(tmp_path / "plan.dxf")
+
+
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
     drawing().saveas(tmp_path / "plan.dxf")
     with pytest.warns(MapWarning, match=r"lines 0\.2 m apart, closer than resolution_m = 0\.25, .* of 0\.1"):
@@ -275,7 +285,7 @@ def test_layers_without_names(tmp_path: Path) -> None:
     with pytest.raises(MapError) as refused:
         load_map(tmp_path / "plan.dxf")
     message = (
-        r"looks like walls: give wall_layers \(--wall-layer\), one or more of 'LAYER1' \(8 lines, 61.6 long, on 8.2 x "
+        r"looks like walls: give wall_layers \(--wall-layer\), one or more of 'LAYER1' \(8 lines, 58 long, on 8.2 x "
     )
     assert re.search(
         message + r"5.2\), 'LAYER2' \(2 lines, 4 long, on 0.2 x 2\) \[units of the drawing\]", str(refused.value)

@@ -168,6 +168,18 @@ def test_boards_on_studs_lose_what_boards_lose() -> None:
     assert slab in partial.import_report.notes
 
 
+def test_walls_side_by_side(tmp_path: Path) -> None:
+    """Insulation that is a wall of its own beside concrete does not open it from its side."""
+    building = Building(0.0)
+    inner = building.rooms(0.0, 0)[-1]
+    building.made_of(inner, ("Concrete", 100.0))
+    building.made_of(building.part("IfcWall", (4.1, 0.0, 0.0), (4.1, 2.0, 2.8), 0, 0.1), ("Mineral wool", 100.0))
+    building.model.write(str(tmp_path / "a.ifc"))
+    partial = sp.load_map(tmp_path / "a.ifc")
+    assert [material_at(partial, x, 1.0) for x in (4.0, 4.1)] == [thick("concrete", 0.1)] * 2
+    assert material_at(partial, 2.0, 0.0) is None
+
+
 def test_members_of_stairs_are_no_walls() -> None:
     partial = sp.load_map(REPORTS / "ifc_studs" / "stair.ifc")
     assert states(partial, *((x, 4.0) for x in (4.5, 5.5, 6.5, 7.5))) == [FREE] * 4

@@ -160,6 +160,11 @@ def test_clouds_upside_down(up: str, axes: list[tuple[int, int, int]]) -> None:
     require_room(map_from_points(cloud, up=up))
 
 
+def test_degrees() -> None:
+    with pytest.raises(MapError, match="as if in degrees of longitude and latitude: project it to metres"):
+        map_from_points(ROOM * (1e-5, 1e-5, 1.0) + (11.57, 48.15, 0.0))
+
+
 def test_two_storeys() -> None:
     upper = np.add(ROOM, (10.0, 0.0, 2.9))
     both = np.concatenate([ROOM, upper])

@@ -242,7 +242,8 @@ class DrawnLines:
     def _shows(self, entity: Any) -> bool:
         """Return whether an entity is visible, and no INSERT on a frozen layer, which hides its block on any layer."""
         is_insert = entity.dxftype() == "INSERT"
-        return not entity.dxf.get("invisible", 0) and not (is_insert and _layer_of(entity).lower() in self._frozen)
+        is_invisible = entity.dxf.hasattr("invisible") and entity.dxf.invisible
+        return not is_invisible and not (is_insert and _layer_of(entity).lower() in self._frozen)
 
     def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
         parts: dict[str, list[Segments]] = {}

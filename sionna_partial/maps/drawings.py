@@ -38,6 +38,7 @@ from sionna_partial.maps.mesh.cells import (
     DEFAULT_RESOLUTION_M,
     crossed_cells,
     fitted_grid,
+    require_no_degrees,
     require_unit,
     states_of_lines,
 )
@@ -89,7 +90,7 @@ def map_from_drawing(
         DXF, text or binary.
     wall_layers : sequence of str or None
         Layers with the walls, with wildcards `*` and `?`. By default visible layers named as walls, columns or
-        windows, in one of 40 languages or by the AIA/NCS standard, except demolished ones. If they enclose hardly any
+        windows, in one of 38 languages or by the AIA/NCS standard, except demolished ones. If they enclose hardly any
         area, also the layer that closes most rooms, with a `MapWarning`. Without such names, the only layer with lines,
         with a `MapWarning`; several are refused, with a list of their lines.
     layer_materials : mapping of str to Material or str, or None
@@ -132,6 +133,7 @@ def map_from_drawing(
         segments, on_layer = plan.segments(layers)
         notes = ImportNotes(source, unit or 0.0, "unit_m")
         if unit is None:
+            require_no_degrees(f"path = '{source}'", np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]))
             notes.unit_m, notes.unit_source = plan.unit(segments)
         state, empty = _cells(source, segments * notes.unit_m, notes.unit_m, resolution_m)
         if names is None and _enclosed(state) < ENCLOSED_FRACTION:
@@ -189,14 +191,14 @@ class _Plan(NamedTuple):
     def preview(self, layers: set[str]) -> str:
         """Return number, length and extent of the lines on layers, the longest first."""
         segments, on_layer = self.lines.segments(layers)
-        found = []
+        counts, found = self.lines.line_counts(), []
         for layer in layers:
             own = segments[on_layer == layer]
             if len(own):
                 x, y = np.ptp(own.reshape(-1, 2), axis=0)
                 length = float(np.linalg.norm(own[:, 1] - own[:, 0], axis=1).sum())
                 name = self.lines.names.get(layer, layer)
-                found.append((-length, f"'{name}' ({len(own):,} lines, {length:.4g} long, on {x:.4g} x {y:.4g})"))
+                found.append((-length, f"'{name}' ({counts[layer]:,} lines, {length:.4g} long, on {x:.4g} x {y:.4g})"))
         texts = [text for _, text in sorted(found)]
         more = f", and {len(texts) - 20} more" if len(texts) > 20 else ""
         return f"{', '.join(texts[:20])}{more} [units of the drawing]"

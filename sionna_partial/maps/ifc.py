@@ -34,6 +34,9 @@ CUT_M = 1.2001
 LEAST_STOREY_M = 2.0
 """Height from which the next storey is the ceiling [m]; closer levels belong to stairs or foundations."""
 
+BESIDE_M, BESIDE_RATIO = 0.02, 2.0
+"""Distance of walls side by side [m], and least length along them over the thickness: others are corners."""
+
 DOOR = "IfcDoor"
 
 TYPES = {
@@ -61,6 +64,20 @@ class _Cut(NamedTuple):
     product: Any
     segments: Segments
     area: shapely.Geometry
+
+
+class _Wall(NamedTuple):
+    """Type of an element in the file and in `TYPES`, its layers, and its area in the plane of the cut [m]."""
+
+    name: str
+    kind: str
+    is_wall: bool
+    layers: list[Layer]
+    area: shapely.Geometry
+
+    @property
+    def width_m(self) -> float:
+        return _width_m(self.area)
 
 
 class _Piece(NamedTuple):
@@ -159,7 +176,7 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
     of_owner: dict[tuple[int, int], list[_Cut]] = {}
     for body, (number, owner) in owner_of.items():
         of_owner.setdefault((-number, owner.id()), []).extend([cuts[body]] if body in cuts else [])
-    pieces, sets = [], Counter[str]()
+    found, lines_m = list[_Wall](), list[Segments]()
     for (number, owner_id), bodies in sorted(of_owner.items()):
         owner, kind = model.by_id(owner_id), kinds[-number]
         if not any(len(body.segments) for body in bodies):
@@ -170,20 +187,50 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
         bodies = own or [body for body in bodies if len(body.segments)]
         for name in [owner.is_a(), *(body.product.is_a() for body in bodies if not own)]:
             notes.use(name)
-        layers = _layers_of(owner, bodies, notes.unit_m)
-        width_m = _width_m(shapely.union_all([body.area for body in bodies])) if owner.is_a("IfcWall") else None
-        material = given.get(kind) or slab(layers, TYPES[kind], width_m)
-        sets[described(owner.is_a(), layers, material)] += 1
-        segments = np.concatenate([body.segments for body in bodies])
-        pieces.append(_Piece(material, segments, shapely.union_all([body.area for body in bodies])))
-    lines = [f"{count} x {text}" for text, count in sets.most_common()]
-    more = [f"and {len(lines) - SHOWN_ROWS} more sets of layers"] if len(lines) > SHOWN_ROWS else []
-    notes.notes += [*lines[:SHOWN_ROWS], *more]
+        area, segments = shapely.union_all([body.area for body in bodies]), [body.segments for body in bodies]
+        is_wall = owner.is_a("IfcWall")
+        found.append(_Wall(owner.is_a(), kind, is_wall, _layers_of(owner, bodies, notes.unit_m), area))
+        lines_m.append(np.concatenate(segments))
     for element in model.by_type("IfcElement"):
         if element.id() not in owner_of and element.Representation and not element.is_a("IfcFeatureElement"):
             is_door = element.is_a(DOOR)
             notes.skip(element.is_a(), 1, "open; layer_materials for IfcDoor closes it" if is_door else "no wall")
+    return _with_slabs(found, lines_m, given, notes)
+
+
+def _with_slabs(
+    found: list[_Wall], lines_m: list[Segments], given: dict[str, Material], notes: ImportNotes
+) -> list[_Piece]:
+    pieces, sets = [], Counter[str]()
+    for wall, beside, segments_m in zip(found, _beside(found), lines_m, strict=True):
+        layers = wall.layers + beside
+        width_m = _width_m(wall.area) if wall.is_wall else None
+        material = given.get(wall.kind) or slab(layers, TYPES[wall.kind], width_m)
+        sets[described(wall.name, layers, material)] += 1
+        pieces.append(_Piece(material, segments_m, wall.area))
+    lines = [f"{count} x {text}" for text, count in sets.most_common()]
+    more = [f"and {len(lines) - SHOWN_ROWS} more sets of layers"] if len(lines) > SHOWN_ROWS else []
+    notes.notes += [*lines[:SHOWN_ROWS], *more]
     return pieces
+
+
+def _beside(walls: list[_Wall]) -> list[list[Layer]]:
+    """Return the layers of the wall at the side of each wall: finishes and insulation may be walls of their own."""
+    solid = [index for index, wall in enumerate(walls) if wall.is_wall and not wall.area.is_empty]
+    around = [shapely.buffer(walls[index].area, BESIDE_M, cap_style="flat", join_style="mitre") for index in solid]
+    found: list[list[Layer]] = [[] for _ in walls]
+    if not solid:
+        return found
+    overlaps: dict[int, list[tuple[float, int]]] = {}
+    for one, other in shapely.STRtree(around).query(around, predicate="intersects").T.tolist():
+        if one != other:
+            length_m = shapely.intersection(around[one], around[other]).area / (2 * BESIDE_M)
+            overlaps.setdefault(one, []).append((length_m, solid[other]))
+    for one, lengths_m in overlaps.items():
+        wall, (length_m, other) = walls[solid[one]], max(lengths_m)
+        if sum(length for length, _ in lengths_m) > _length_m(wall.area) / 2 and length_m > BESIDE_RATIO * wall.width_m:
+            found[solid[one]] = walls[other].layers or [Layer("unnamed", round(walls[other].width_m, 3))]
+    return found
 
 
 def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:

@@ -27,6 +27,9 @@ DEFAULT_BAND_M = (1.0, 1.8)
 
 DEFAULT_RESOLUTION_M = 0.05
 
+DEGREES = 0.1
+"""Largest extent of a building in degrees."""
+
 SMALLEST_M, HIGHEST_M = 0.1, 100.0
 """Smallest extent along x or y, and largest height, of a mesh in metres [m]."""
 
@@ -113,11 +116,22 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading, *, is_metric: bool = False) 
 
 def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
+    require_no_degrees(what, bounds_m)
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
             f"{what} spans {x:g} x {y:g} x {z:g} m: {UNIT_REMEDY}, 0.01 for centimetres, 1000 for kilometres"
             + (", or give the height_band_m of the walls if it is so high." if z > HIGHEST_M else ".")
         )
+
+
+def require_no_degrees(what: str, bounds: Floats) -> None:
+    """Raise a MapError for longitudes and latitudes: an extent far below a unit, far from the origin of the globe."""
+    (low, high), size = bounds[:, :2], np.ptp(bounds[:, :2], axis=0)
+    is_on_globe = (np.abs(bounds[:, :2]) <= (180.0, 90.0)).all() or (np.abs(bounds[:, :2]) <= (90.0, 180.0)).all()
+    if is_on_globe and size.max() < DEGREES and (np.abs(low + high) / 2 > max(20.0 * size.max(), 1.0)).all():
+        where = f"x {low[0]:.7g} to {high[0]:.7g} and y {low[1]:.7g} to {high[1]:.7g}"
+        remedy = "project it to metres (such as UTM) in the program that it comes from."
+        raise MapError(f"{what} spans {where}, as if in degrees of longitude and latitude: {remedy}")
 
 
 def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshReading) -> None:
@@ -228,18 +242,19 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
 def _without_floor(known: Bools, wall: Bools, empty: PartialMap) -> Bools:
     """Return the extent of walls (ny, nx) with hardly any floor or ceiling, with a warning; else no cells."""
     state = states_of_lines(np.zeros((0, 2, 2)), empty, wall)
-    inside = state == CellState.FREE
-    if not inside.any():
+    inside, apart = state == CellState.FREE, ~ndimage.binary_dilation(wall, np.ones((3, 3)))
+    if not (inside & apart).any():
         row, column = np.nonzero(wall)
         inside[row.min(initial=0) : row.max(initial=-1) + 1, column.min(initial=0) : column.max(initial=-1) + 1] = True
         inside &= ~wall
-    if (known & ~wall).sum() >= ENCLOSED_FRACTION * min(inside.sum(), wall.sum()):
+    solid = state == CellState.WALL
+    if not (inside & apart).any() or (known & inside).sum() >= ENCLOSED_FRACTION * min(inside.sum(), solid.sum()):
         return np.zeros_like(known)
     remedy = "give its observed area as observed if that is less."
     warnings.warn(
         f"the mesh has no floor, so that all space between its walls is observed: {remedy}", MapWarning, stacklevel=5
     )
-    return inside | (state == CellState.WALL)
+    return inside | solid
 
 
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
