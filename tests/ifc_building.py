@@ -89,3 +89,7 @@ class Building:
         self.part("IfcColumn", (6.0, 2.5, z[0]), (6.8, 2.5, z[1]), level, 0.8)
         self.part("IfcFurniture", (1.0, 3.0, z[0]), (2.0, 3.0, z[0] + 2.0), level, 0.4)
         return [*walls, inner]
+
+
+def whole_of(building: Building, whole: Any, *parts: Any) -> None:
+    building.model.createIfcRelAggregates(ifcopenshell.guid.new(), None, None, None, whole, parts)

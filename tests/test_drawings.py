@@ -146,7 +146,10 @@ def test_heights_of_layers() -> None:
 
 LAYERS = {
     "": "A-WALL, a-wall-full-e, S-COLS, A-GLAZ-SILL, Wand, AR_Außenwände, Wa\u0308nde, Mur ext, A-WALL-FULL-N, I-WALL, "
-    "A-WALL-CORE-2, xref$0$A-WALL, plan|A-GLAZ, A-WALL-PRHT",
+    "A-WALL-CORE-2, xref$0$A-WALL, plan|A-GLAZ, A-WALL-PRHT, Ściany nośne, SCIANY, Obvodové stěny, zdivo, "
+    "Teherhordó fal, FALAK, Seinät, DUVARLAR, TOIXOS, Εξωτ. τοίχοι, Dinding, Tembok, 墙体, 牆, 外壁, 内壁, 벽체, ผนัง, "
+    "جدار, קיר, Perete, ZIDOVI, Наружные стены, Стіни, Vægge, Väggar, Yttervegg, Muros, Paredes, Parede, Tramezzi, "
+    "tường, Siena, Fönster, okna",
     "to be demolished": "A-WALL-D, plan|A-WALL-FULL-D, AD-WALL, Wand Abbruch, walls_demo",
     "future work": "A-WALL-F",
     "to be moved": "A-WALL-MOVE-M",
@@ -155,7 +158,10 @@ LAYERS = {
     "furniture": "Wandschrank",
     "major group of no wall (AIA/NCS)": "E-LITE-WALL, P-FIXT-WALL, A-DOOR, A-FLOR-WALL",
     "texts, dimensions or door headers": "A-WALL-HEAD",
-    "name of no wall": "Base",
+    "name of no wall": "Base, Default, Asphalt, Design, organized, mural, residual, 家具, 尺寸, Present, "
+    "Stendardo, stupid",
+    "doors": "门窗",
+    "axes": "壁芯",
 }
 """Names of layers by the reason for which they are skipped."""
 
@@ -198,6 +204,16 @@ def test_hardly_any_area(tmp_path: Path) -> None:
         load_map(tmp_path / "plan.dxf")
     message = r"encloses 0\.\d+ m2 in an extent of 12\..* wall_layers; it has .* layers: WALL \(2 lines\)"
     assert re.search(message, str(caught[0].message))
+
+
+def test_degrees(tmp_path: Path) -> None:
+    doc = ezdxf.new(units=6)
+    corners = [(11.57, 48.15), (11.5708, 48.15), (11.5708, 48.1503), (11.57, 48.1503)]
+    doc.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALL"})
+    doc.saveas(tmp_path / "plan.dxf")
+    message = r"spans x 11.57 to 11.5708 and y 48.15 to 48.1503, as if in degrees of longitude and latitude: project it"
+    with pytest.raises(MapError, match=message):
+        load_map(tmp_path / "plan.dxf")
 
 
 def test_lines_closer_than_a_cell(tmp_path: Path) -> None:
@@ -266,8 +282,45 @@ def test_layers_without_names(tmp_path: Path) -> None:
     doc.layers.get("A-GLAZ").rename("LAYER2")
     doc.layers.get("LAYER2").on()
     doc.saveas(tmp_path / "plan.dxf")
+    with pytest.raises(MapError) as refused:
+        load_map(tmp_path / "plan.dxf")
+    message = (
+        r"looks like walls: give wall_layers \(--wall-layer\), one or more of 'LAYER1' \(8 lines, 58 long, on 8.2 x "
+    )
+    assert re.search(
+        message + r"5.2\), 'LAYER2' \(2 lines, 4 long, on 0.2 x 2\) \[units of the drawing\]", str(refused.value)
+    )
+    require_rooms(load_map(tmp_path / "plan.dxf", wall_layers=["LAYER?"]))
+    doc.layers.get("LAYER2").off()
+    doc.saveas(tmp_path / "plan.dxf")
     with pytest.warns(MapWarning, match="has no layer whose name looks like walls, so all lines are walls: name them"):
-        require_rooms(load_map(tmp_path / "plan.dxf"))
+        load_map(tmp_path / "plan.dxf")
+
+
+@pytest.mark.parametrize(
+    ("name", "free_m2", "rooms"),
+    [("p00", 47.1, 2), ("p07", 47.3, 1), ("p10", 47.3, 1), ("p13", 42.0, 2), ("p16", 46.0, 2), ("p17", 47.1, 2)],
+)
+def test_what_a_drawing_shows(name: str, free_m2: float, rooms: int) -> None:
+    """Walls in a block on a frozen layer, invisible, of wide polylines, as solids, and as upright faces."""
+    report = load_map(Path(__file__).parent / "reports" / "dxf_visibility" / f"{name}.dxf").import_report
+    assert report.free_area_m2 == pytest.approx(free_m2, abs=0.1)
+    assert report.rooms == rooms
+    reasons = {row.reason for row in report.skipped}
+    assert reasons == ({"invisible, or blocks on a frozen layer"} if name in ("p07", "p10") else set())
+
+
+def test_faces_of_meshes(tmp_path: Path) -> None:
+    doc = drawing()
+    space, corners = doc.modelspace(), [(2, 1, 0), (3, 1, 0), (3, 1, 3), (2, 1, 3)]
+    flat = [(1, 3, 3), (3, 3, 3), (3, 4, 3), (1, 4, 3)]
+    with space.add_mesh(dxfattribs={"layer": "A-WALL"}).edit_data() as mesh:
+        mesh.vertices, mesh.faces = [*corners, *flat], [(0, 1, 2, 3), (4, 5, 6, 7)]
+    face = space.add_polyface(dxfattribs={"layer": "A-WALL"})
+    face.append_face([(x + 4, y, z) for x, y, z in corners])
+    doc.saveas(tmp_path / "plan.dxf")
+    partial = load_map(tmp_path / "plan.dxf")
+    assert states(partial, (2.5, 1.02), (6.5, 1.02), (2.0, 3.02)) == [WALL, WALL, FREE]
 
 
 def test_every_kind_of_line(tmp_path: Path) -> None:

@@ -35,11 +35,12 @@ ROOMS = {
             "import_report",
             "partial_map",
             "mesh.cells",
+            "mesh.upright",
             "mesh.points",
             "mesh.files",
             "ros_map",
         ),
-        *("drawing_lines", "drawings", "ifc", "bags", "vacuum", "map_files"),
+        *("drawing_lines", "drawings", "ifc_layers", "ifc", "bags", "vacuum", "map_files"),
     ),
     "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "scene"),
@@ -230,7 +231,7 @@ for name in ("", *typer.main.get_command(app).commands):
             "import sionna_partial as sp", f"sp.load_map({str(path)!r})", "sp.predict_map"
         )
         assert not libraries(package) & (HEAVY | {"typer", "rich"})
-        others = ("bags", "drawings", "ifc", "mesh.cells", "mesh.files", "mesh.points")
+        others = ("bags", "drawings", "ifc_layers", "ifc", "mesh.cells", "mesh.files", "mesh.points")
         assert not reader & {f"sionna_partial.maps.{name}" for name in others}
         assert not libraries(reader) & {"rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]

@@ -11,10 +11,14 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.ifc_layers import Layer, constants_at
+from sionna_partial.maps.ifc_layers import slab as slab_of_layers
 
 pytest.importorskip("ifcopenshell")
-from ifc_building import Building
+from ifc_building import Building, whole_of
 from small_maps import states
+
+REPORTS = Path(__file__).parent / "reports"
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 
@@ -51,7 +55,10 @@ def test_rooms(path: Path) -> None:
 
 def test_materials(path: Path) -> None:
     partial = sp.load_map(path, storey="Level 0")
-    expected = {(2.0, 0.0): thick("concrete", 0.15), (8.0, 2.5): thick("glass"), (6.4, 2.5): thick("concrete")}
+    assert material_at(partial, 2.0, 0.0) == slab_of_layers(
+        [Layer("Gypsum", 0.012), Layer("Concrete", 0.15)], None, None
+    )
+    expected = {(8.0, 2.5): thick("glass"), (6.4, 2.5): thick("concrete")}
     assert {at: material_at(partial, *at) for at in expected} == expected
     given = sp.load_map(path, storey="Level 0", layer_materials={"ifcwall*": "brick", "IfcDoor": "metal"})
     assert [material_at(given, *at) for at in ((2.0, 0.0), (4.0, 2.5), (8.0, 2.5))] == [
@@ -73,7 +80,7 @@ def test_one_storey_with_walls_placed_and_turned(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["control", "inner_in_layers", "outer_in_layers", "sub_walls"])
 def test_bodies_in_parts(name: str) -> None:
     """At 28 GHz a wall with two layers of its own bodies is opaque, as one with a single body is."""
-    partial = sp.load_map(Path(__file__).parent / "reports" / "ifc_layers" / f"{name}.ifc")
+    partial = sp.load_map(REPORTS / "ifc_layers" / f"{name}.ifc")
     assert sp.trace_links(partial, (2.0, 3.0, 1.5), [(6.0, 3.2, 1.5)]).link_state.tolist() == [sp.LinkState.OUTAGE]
     report = partial.import_report
     assert report is not None
@@ -83,15 +90,22 @@ def test_bodies_in_parts(name: str) -> None:
     assert parts == {"inner_in_layers": 2, "outer_in_layers": 8}.get(name, 0)
 
 
+BOARDS = replace(sp.Material(itu="plasterboard"), thickness_m=0.025)
+
+
 @pytest.mark.parametrize(
     ("layers", "expected"),
     [
         ([("Concrete C30", 240.0)], thick("concrete", 0.24)),
-        ([("Plaster", 15.0), ("Stahlbeton", 300.0), ("Wood", 20.0)], thick("reinforced concrete", 0.3)),
-        ([("Brick", 115.0), ("Air", 40.0), ("Brick", 115.0), ("Gypsum board", 12.5)], thick("brick", 0.23)),
-        ([("Gypsum board", 12.5), ("Air", 75.0), ("Gypsum board", 12.5)], thick("drywall")),
-        ([("Beton", None)], thick("concrete", 0.1)),
-        ([("Plaster", 15.0)], None),
+        ([("Metal Stud Layer", 70.0), ("Stahlbeton", 300.0), ("Holzfaserdämmung", 240.0)], thick("concrete", 0.3)),
+        ([("Brick", 115.0), ("Air", 40.0), ("Brick", 115.0)], thick("brick", 0.23)),
+        ([("Gypsum board", 12.5), ("Glass wool", 75.0), ("Gypsum board", 12.5)], BOARDS),
+        ([("Gypsum board", 12.5), ("Wood stud", 75.0), ("Gypsum board", 12.5)], BOARDS),
+        ([("Gypsum board", 12.5), ("Fiberglass", 75.0), ("Sheet metal cladding", 0.8)], thick("metal")),
+        ([("Fiberglass", 75.0)], sp.Material(1.05, 0.0, 0.075)),
+        ([("Béton armé", None)], thick("concrete", 0.1)),
+        ([("Type 7", 15.0)], None),
+        ([("Type 7", 150.0), ("Gypsum board", 12.5)], None),
     ],
 )
 def test_thickness_of_layers(tmp_path: Path, layers: list[tuple[str, float]], expected: sp.Material | None) -> None:
@@ -103,6 +117,87 @@ def test_thickness_of_layers(tmp_path: Path, layers: list[tuple[str, float]], ex
         building.made_of(inner, *layers)
     building.model.write(str(tmp_path / "a.ifc"))
     assert material_at(sp.load_map(tmp_path / "a.ifc"), 4.0, 1.0) == expected
+
+
+@pytest.mark.parametrize("frequency_hz", [2.4e9, 5.2e9, 28e9])
+def test_slab_of_several_materials(frequency_hz: float) -> None:
+    """Its absorption is the sum of the absorptions of its layers."""
+    slab = slab_of_layers([Layer("Plaster", 0.03), Layer("Air", 0.05), Layer("Brick", 0.24)], None, None)
+    assert slab is not None
+
+    def absorption_db(material: sp.Material) -> float:
+        permittivity, conductivity_s_m = constants_at(material, frequency_hz)
+        return 1636.0 * conductivity_s_m * material.thickness_m / np.sqrt(permittivity)
+
+    parts = [sp.Material(itu="plasterboard", thickness_m=0.03), sp.Material(itu="brick", thickness_m=0.24)]
+    assert slab.thickness_m == 0.27
+    assert absorption_db(slab) == pytest.approx(sum(map(absorption_db, parts)), rel=0.08)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("Holzständer", "frame"),
+        ("Metal - Furring", "frame"),
+        ("Concrete frame", "concrete frame"),
+        ("Laine de verre", "insulation"),
+        ("Insulation / Thermal Barriers - Rigid", "insulation"),
+        ("Insulating glass", "glass"),
+        ("Isolierverglasung", "glass"),
+        ("Glass fibre reinforced concrete", "concrete"),
+        ("Masonry - Concrete Masonry Units", "concrete"),
+        ("Concrete with insulation", "concrete"),
+        ("Aluminium foil", "metal foil"),
+        ("Structure, Wood Joist/Rafter Layer", "frame"),
+        ("Generic", None),
+    ],
+)
+def test_names_of_layers(text: str, name: str | None) -> None:
+    assert Layer(text, 0.0).name == name
+
+
+def test_boards_on_studs_lose_what_boards_lose() -> None:
+    """ITU-R P.2040 has 1.1 dB for each board of 12.5 mm at 5.2 GHz, the metal stud between them nothing."""
+    partial = sp.load_map(REPORTS / "ifc_studs" / "metal_stud.ifc")
+    settings = sp.TraceSettings(frequency_hz=5.2e9, max_depth=0, diffraction=False)
+    found = sp.trace_links(partial, (2.0, 1.0, 1.5), [(5.5, 1.0, 1.5)], trace_settings=settings)
+    free_db = 20 * np.log10(299792458 / 5.2e9 / (4 * np.pi * 3.5))
+    assert free_db - found.gain_db[0] == pytest.approx(2.2, abs=0.5)
+    layers = "Plasterboard 12.5 mm + Metal Stud Layer 70 mm (no loss) + Plasterboard 12.5 mm"
+    slab = f"1 x IfcWall of {layers}: plasterboard of 25 mm, 1.2, 1.9, 5.4 dB at 2.4, 5.2, 28 GHz"
+    assert slab in partial.import_report.notes
+
+
+def test_walls_side_by_side(tmp_path: Path) -> None:
+    """Insulation that is a wall of its own beside concrete does not open it from its side."""
+    building = Building(0.0)
+    inner = building.rooms(0.0, 0)[-1]
+    building.made_of(inner, ("Concrete", 100.0))
+    building.made_of(building.part("IfcWall", (4.1, 0.0, 0.0), (4.1, 2.0, 2.8), 0, 0.1), ("Mineral wool", 100.0))
+    building.model.write(str(tmp_path / "a.ifc"))
+    partial = sp.load_map(tmp_path / "a.ifc")
+    assert [material_at(partial, x, 1.0) for x in (4.0, 4.1)] == [thick("concrete", 0.1)] * 2
+    assert material_at(partial, 2.0, 0.0) is None
+
+
+def test_members_of_stairs_are_no_walls() -> None:
+    partial = sp.load_map(REPORTS / "ifc_studs" / "stair.ifc")
+    assert states(partial, *((x, 4.0) for x in (4.5, 5.5, 6.5, 7.5))) == [FREE] * 4
+    assert ("IfcMember", 2) in {(row.name, row.count) for row in partial.import_report.skipped}
+
+
+def test_curtain_walls_alone(tmp_path: Path) -> None:
+    building = Building(0.0)
+    corners = [(0.0, 0.0), (8.0, 0.0), (8.0, 5.0), (0.0, 5.0)]
+    for a, b in zip(corners, [*corners[1:], corners[0]], strict=True):
+        wall = building.part("IfcCurtainWall", (*a, 0.0), (*a, 0.0))
+        wall.Representation = None
+        plate = building.part("IfcPlate", (*a, 0.0), (*b, 2.8))
+        whole_of(building, wall, plate)
+    building.model.write(str(tmp_path / "a.ifc"))
+    partial = sp.load_map(tmp_path / "a.ifc")
+    assert states(partial, (4.0, 2.5), (4.0, 0.0)) == [FREE, WALL]
+    assert material_at(partial, 4.0, 0.0) == thick("glass")
 
 
 def test_loss_of_layers(tmp_path: Path) -> None:

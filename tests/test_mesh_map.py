@@ -1,6 +1,7 @@
 """Meshes on cells: walls without gaps, and what has been observed."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,13 +11,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from meshes import OBSERVED, box, room, scene_mesh
 from scipy import ndimage
+from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.tracing.simulation import trace_links
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 ROOM = scene_mesh(*room().geometry.values())
@@ -86,6 +90,7 @@ class TestState:
         rows = np.nonzero((partial.state == WALL).any(axis=1))[0]
         np.testing.assert_array_equal(rows * 0.5 + partial.origin_m[1], [1.0])
 
+    @pytest.mark.filterwarnings("ignore:the mesh has no floor")
     @settings(max_examples=60)
     @given(
         st.lists(st.tuples(st.integers(0, 40), st.integers(0, 40)), min_size=2, max_size=5),
@@ -137,7 +142,7 @@ class TestKnown:
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        ({"up": "x"}, 'up = \'x\' is not allowed: choose "z" or "y".'),
+        ({"up": "x"}, 'up = \'x\' is not allowed: choose "z", "y", "-z" or "-y".'),
         ({"height_band_m": (2, 1)}, "height_band_m = (2, 1) is not allowed: give (low, high), z in metres, low <"),
         ({"observed": [(0, 0), (1, 1), (1, 0), (0, 1)]}, "] is no polygon (Self-intersection"),
         ({"observed": [(9, 9), (10, 9), (9, 10)]}, "observed holds no cell of the map, which spans x -0.05 to 5.1 m"),
@@ -166,6 +171,7 @@ def test_feet() -> None:
     assert partial.height_range_m == pytest.approx((0.0, 18 * 0.3048))
     assert partial.bounds_m[2] == pytest.approx(40 * 0.3048, abs=0.21)
     mesh_map(scene_mesh(box((0, 0, 0), (12, 8, 9))), MeshReading(resolution_m=0.5))
+    mesh_map(house, MeshReading(resolution_m=0.5), is_metric=True)  # as scenes of Mitsuba are
 
 
 def test_receivers_are_between_the_ends_of_the_mesh() -> None:
@@ -175,3 +181,75 @@ def test_receivers_are_between_the_ends_of_the_mesh() -> None:
     np.testing.assert_array_equal(partial.state, mesh_map(ROOM, MeshReading()).state)
     with pytest.raises(SettingsError, match=r"rx_height_m = 1.5 is not allowed: give a number in \(7, 10\]"):
         predict_map(partial, (1.0, 1.0, 8.5), rx_height_m=1.5)
+
+
+REPORTS = Path(__file__).parent / "reports"
+
+
+@pytest.mark.parametrize("suffix", ["ply", "glb"])
+def test_scans_whose_y_points_down(suffix: str) -> None:
+    """The door of the flat is at y = 2.05 m, as with z up, and not mirrored to -2.05 m."""
+    path = REPORTS / "upside_down" / f"y_down.{suffix}"
+    with pytest.warns(MapWarning, match='looks as if -y pointed up.*: give up="-y" to turn it'):
+        load_map(path)
+    right, found = load_map(REPORTS / "upside_down" / "z_up.ply"), load_map(path, up="-y")
+    assert states(found, (0.02, 2.05), (0.02, -2.05)) == [FREE, WALL]
+    assert found.import_report.free_area_m2 == pytest.approx(right.import_report.free_area_m2)
+    np.testing.assert_allclose(found.mesh.bounds_m, right.mesh.bounds_m, atol=1e-6)
+
+
+@pytest.mark.parametrize("lean_deg", [2, 5])
+def test_leaning_scans_are_levelled(lean_deg: int) -> None:
+    with pytest.warns(MapWarning, match=rf"leans by {lean_deg}\.0 degrees, and is levelled about its middle"):
+        partial = load_map(REPORTS / "leaning" / f"lean{lean_deg}_mesh.ply")
+    assert 158.0 <= partial.import_report.free_area_m2 <= 161.0
+    assert np.ptp(partial.mesh.height_range_m) == pytest.approx(2.8, abs=0.01)  # with floor and ceiling of 0.1 m
+
+
+def test_scans_that_lean_too_far(tmp_path: Path) -> None:
+    scan = trimesh.load(REPORTS / "leaning" / "lean5_mesh.ply")
+    up = scan.face_normals[np.argmax(scan.area_faces)]
+    axis = np.cross((0.0, 0.0, 1.0), up * np.sign(up[2]))
+    scan.apply_transform(trimesh.transformations.rotation_matrix(np.radians(10.0), axis))
+    scan.export(tmp_path / "scan.ply")
+    with pytest.raises(
+        MapError, match=r"leans by 15\.0 degrees, so that its floor is not level: turn it in the program"
+    ):
+        load_map(tmp_path / "scan.ply")
+
+
+def test_roofs_are_no_lean(tmp_path: Path) -> None:
+    """Both slopes of a roof have more area than the floor, but walls are upright."""
+    corners = [(0, 0, 0), (10, 0, 0), (10, 8, 0), (0, 8, 0), *((x, y, 2.5) for x in (0, 10) for y in (0, 8))]
+    corners += [(0, 8, 5.5), (10, 8, 5.5)]
+    faces = [
+        (0, 1, 2),
+        (0, 2, 3),
+        (4, 6, 9),
+        (4, 9, 8),
+        (0, 1, 6),
+        (0, 6, 4),
+        (3, 2, 7),
+        (3, 7, 5),
+        (5, 7, 9),
+        (5, 9, 8),
+    ]
+    trimesh.Trimesh(corners, faces, process=False).export(tmp_path / "roof.ply")
+    mesh = load_map(tmp_path / "roof.ply").mesh
+    np.testing.assert_allclose(mesh.bounds_m, [[0, 0, 0], [10, 8, 5.5]], atol=1e-6)
+
+
+def test_walls_without_a_floor() -> None:
+    """Space between them is observed, as with a floor."""
+    with pytest.warns(MapWarning, match="has no floor, so that all space between its walls is observed: give its obs"):
+        alone = load_map(REPORTS / "walls_alone" / "walls.ply")
+    floor = load_map(REPORTS / "walls_alone" / "walls_and_floor.ply")
+    assert alone.import_report.free_area_m2 == floor.import_report.free_area_m2 == pytest.approx(43.8, abs=0.1)
+    rx, gain_db = [(6.0, 3.0, 1.5), (2.0, 4.5, 1.5), (6.0, 5.0, 1.5)], [-89.6, -70.5, -75.7]
+    found = trace_links(alone, (2.0, 1.5, 1.5), rx)
+    assert found.gain_db == pytest.approx(gain_db, abs=0.8)  # without the reflection at the floor
+
+
+def test_triangle_strips() -> None:
+    with pytest.raises(MapError, match=r"tristrips.ply' holds triangle strips, which are not read: save it with faces"):
+        load_map(REPORTS / "strips" / "tristrips.ply")

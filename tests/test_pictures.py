@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from scipy import ndimage
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
@@ -44,6 +45,26 @@ def test_walls_by_threshold(tmp_path: Path, name: str, shades: tuple[int, int]) 
     assert partial.state_at(np.array([room, door, table, letter, outside])).tolist() == [FREE] * 4 + [UNKNOWN]
     assert partial.state_at(np.array([(0.9, 2.0), (5.1, 1.0)])).tolist() == [WALL, WALL]
     assert "separate marks: 1 (text or symbols up to 0.5 m)" in str(report)
+
+
+@pytest.mark.parametrize("spacing", [6, 10])
+def test_thin_lines_beside_hatched_walls(tmp_path: Path, spacing: int) -> None:
+    """Walls 20 cm thick, hatched at 45 degrees, with a door leaf, its arc and a threshold in thin lines."""
+    solid = np.repeat(np.repeat(plan(), 2, axis=0), 2, axis=1) < 100
+    solid &= ndimage.binary_opening(solid, np.ones((8, 8)))
+    solid[300:330, 600:616] = False  # the letter
+    row, column = np.indices(solid.shape)
+    dark = solid & ((row + column) % round(spacing * np.sqrt(2)) == 0) | (solid & ~ndimage.binary_erosion(solid))
+    dark[120:210, 500] = dark[120, 410:500] = True
+    angle = np.linspace(0, np.pi / 2, 500)
+    dark[np.rint(120 + 90 * np.sin(angle)).astype(int), np.rint(500 - 90 * np.cos(angle)).astype(int)] = True
+    report = sp.load_map(
+        write(tmp_path / "plan.png", np.where(dark, 30, 240).astype(np.uint8)), resolution_m=0.01
+    ).import_report
+    assert report.rooms == 2
+    assert report.door_widths_m == pytest.approx((0.9,), abs=0.1)
+    assert report.free_area_m2 == pytest.approx(4 * 3 + 2 * 3 + 0.2 * 0.9, abs=0.7)
+    assert {row.name for row in report.skipped} == {"thin lines"}
 
 
 def test_other_pictures(tmp_path: Path) -> None:

@@ -127,6 +127,44 @@ def test_y_up() -> None:
         map_from_points(turned)
 
 
+@pytest.mark.parametrize("lean_deg", [2.0, 9.0])
+def test_leaning_clouds_are_levelled(lean_deg: float) -> None:
+    turn = trimesh.transformations.rotation_matrix(np.radians(lean_deg), (1.0, 0.3, 0.0))[:3, :3]
+    with pytest.warns(
+        MapWarning,
+        match=rf"points leans by ({lean_deg - 0.1:.1f}|{lean_deg:.1f}|{lean_deg + 0.1:.1f}) degrees, and is levelled",
+    ):
+        partial = map_from_points(ROOM @ turn.T)
+    assert partial.wall_height_m == pytest.approx(2.6, abs=0.02)
+    assert partial.import_report.free_area_m2 == pytest.approx(
+        map_from_points(ROOM).import_report.free_area_m2, rel=0.04
+    )
+    assert {row.name: row.count for row in partial.import_report.used} == {"points": len(ROOM)}
+
+
+def test_clouds_that_lean_too_far() -> None:
+    turn = trimesh.transformations.rotation_matrix(np.radians(14.0), (1.0, 0.0, 0.0))[:3, :3]
+    with pytest.raises(MapError, match=r"points leans by 1[34]\.\d degrees, so that its floor is not level: turn it"):
+        map_from_points(ROOM @ turn.T)
+
+
+@pytest.mark.parametrize(
+    ("up", "axes"), [("-z", [(1, 0, 0), (0, -1, 0), (0, 0, -1)]), ("-y", [(1, 0, 0), (0, 0, -1), (0, 1, 0)])]
+)
+def test_clouds_upside_down(up: str, axes: list[tuple[int, int, int]]) -> None:
+    """Furniture stands on the floor."""
+    low = np.concatenate([ROOM, shell((0.3, 2.0, 0.4), (2.3, 2.9, 0.45), np.random.default_rng(1))])
+    cloud = low @ np.array(axes).T
+    with pytest.warns(MapWarning, match=f'looks as if {up} pointed up: give up="{up}" to turn it'):
+        map_from_points(cloud)
+    require_room(map_from_points(cloud, up=up))
+
+
+def test_degrees() -> None:
+    with pytest.raises(MapError, match="as if in degrees of longitude and latitude: project it to metres"):
+        map_from_points(ROOM * (1e-5, 1e-5, 1.0) + (11.57, 48.15, 0.0))
+
+
 def test_two_storeys() -> None:
     upper = np.add(ROOM, (10.0, 0.0, 2.9))
     both = np.concatenate([ROOM, upper])
@@ -139,7 +177,8 @@ def test_two_storeys() -> None:
 def test_walls_alone() -> None:
     walls = ROOM[(ROOM[:, 2] > 0.3) & (ROOM[:, 2] < 2.3)]
     walls = walls[(np.abs(walls[:, :2] - (1.4, 1.3)) > 0.6).any(axis=1)]
-    assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
+    with pytest.warns(MapWarning, match="has 0 m2 free in an extent of 5.05 x 3.05 m: give .* sensor_positions_m"):
+        assert states(map_from_points(walls), INSIDE) == [UNKNOWN]
     partial = map_from_points(walls, sensor_positions_m=[(1.0, 1.25, 0.9), (1.01, 1.25, 0.9)])
     assert states(partial, INSIDE, IN_WALL, OUTSIDE, (4.5, 1.25)) == [FREE, WALL, UNKNOWN, UNKNOWN]
     around = map_from_points(walls, sensor_positions_m=[(1.0, 1.25), (4.5, 2.0)])

@@ -137,6 +137,19 @@ def test_205_stays_unknown(tmp_path: Path, colour: str) -> None:
     assert letter == [[WALL, FREE, FREE], [FREE, FREE, FREE]]
 
 
+@pytest.mark.parametrize("mode", ["trinary", "scale", "raw"])
+def test_205_of_reports(mode: str) -> None:
+    """A free_thresh of 0.25 makes 4,400 unknown cells around a room free; 205 in mode raw is above 100 percent."""
+    path = Path(__file__).parent / "reports" / "shade_205" / f"{mode}.yaml"
+    message = "and no wall, so that" if mode == "raw" else "4400 cells of shade 205 would read as free"
+    with pytest.warns(MapWarning, match=message):
+        partial = load_map(path)
+    free, unknown = {"raw": (396, 13604)}.get(mode, (9204, 4400))
+    assert np.bincount(partial.state.ravel(), minlength=3)[[FREE, UNKNOWN]].tolist() == [free, unknown]
+    if mode != "raw":
+        assert (load_map(path, strict=True).state == FREE).sum() == 13604
+
+
 def test_dark_grey_walls(tmp_path: Path) -> None:
     shades = np.repeat(np.array([[90, 90, 254], [0, 205, 254]], dtype=np.uint8), 60, axis=0)
     path = write_map(tmp_path, 255 - shades, negate=1)

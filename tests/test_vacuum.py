@@ -1,8 +1,12 @@
 """Maps of vacuum robots, and the received powers that they recorded."""
 
+import base64
 import copy
 import logging
 import re
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -109,6 +113,28 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
     with pytest.raises(MeasurementError, match=r"access_point = 'home' is for a recording \(\.vwm\) and not a CSV"):
         sp.load_measurements(tmp_path / "home.csv", access_point="home")
+
+
+@pytest.mark.parametrize("pack", [zlib.compress, lambda raw: base64.b64encode(zlib.compress(raw))])
+def test_maps_over_mqtt(tmp_path: Path, pack: Callable[[bytes], bytes]) -> None:
+    path = write_json(tmp_path / "home.json", valetudo_map())
+    packed = tmp_path / "packed.json"
+    packed.write_bytes(pack(path.read_bytes()))
+    assert sp.load_map(packed) == sp.load_map(path)
+    packed.write_bytes(pack(path.read_bytes())[:-400])
+    with pytest.raises(MapError, match=r"packed.json' is damaged or no JSON"):
+        sp.load_map(packed)
+
+
+def test_rooms_with_names_of_floors() -> None:
+    """A segment named "all" is not the whole floor."""
+    partial = replace(sp.make_home(0), room=None, room_names=())
+    room = 1 + (np.indices(partial.shape)[1] > partial.shape[1] // 2)
+    named = [replace(partial, room=room, room_names=names) for names in (("all", "bath"), ("den", "bath"))]
+    marked, usual = (sp.predict_map(home, (3.0, 3.0, 1.5), spacing_m=0.6).radio.area(-60.0) for home in named)
+    assert marked.floor.values.tolist() == ["observed", "all", "all_1", "bath"]
+    assert marked.area_m2.sel(floor="all").item() == usual.area_m2.sel(floor="all").item()
+    assert marked.area_m2.sel(floor="all_1").item() == usual.area_m2.sel(floor="den").item()
 
 
 def test_coverage_of_rooms(tmp_path: Path) -> None:

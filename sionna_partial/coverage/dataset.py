@@ -43,6 +43,9 @@ ROOM = "room"
 ANTENNA = "tx_antenna"
 """Antenna: attribute for one transmitter, coordinate along "tx" for several."""
 
+FLOORS = ("observed", "all")
+"""Floors of `radio.area` besides the rooms of the map."""
+
 _OF_ALL = ("observed", "cell_state", "wall_parts", ROOM)
 
 _LOWEST = {"spacing_m": 0.0, "frequency_hz": 0.0, "rx_height_m": -1e15}
@@ -405,8 +408,9 @@ class CoverageAccessor:
         -------
         xarray.Dataset
             On `floor`: "observed" (free cells), "all" (weighted by `p_indoor`; 1 in free cells) and the rooms of the
-            map. `fraction` has at least that probability, `fraction_mean` is the mean probability, `area_m2` the size.
-            Fractions are NaN on an empty floor. Several transmitters are on `tx`.
+            map, with their number if a room has such a name ("all_1"). `fraction` has at least that probability,
+            `fraction_mean` is the mean probability, `area_m2` the size. Fractions are NaN on an empty floor. Several
+            transmitters are on `tx`.
         """
         require_number("threshold_dbm", threshold_dbm, -400.0, 400.0)
         require_number("probability", probability, 0.0, 1.0)
@@ -425,7 +429,7 @@ class CoverageAccessor:
                 (weights * np.nan_to_num(each)).sum(axis=(-2, -1)) / total for each in (above >= probability, above)
             ]
         values = {"fraction": shares[0], "fraction_mean": shares[1], "area_m2": total * self._coverage.spacing_m**2}
-        coordinates = {"floor": ["observed", "all", *rooms]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
+        coordinates = {"floor": [*FLOORS, *rooms]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
         settings = {"threshold_dbm": float(threshold_dbm), "probability": float(probability)}
         return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
 
@@ -434,7 +438,11 @@ class CoverageAccessor:
             return {}
         room = self._coverage[ROOM]
         numbers = zip(str(room.attrs["flag_meanings"]).split(), room.attrs["flag_values"], strict=True)
-        return {name: room.to_numpy() == number for name, number in numbers if number}
+        return {
+            f"{name}_{number}" if name in FLOORS else name: room.to_numpy() == number
+            for name, number in numbers
+            if number
+        }
 
     def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
         maps = transmitters_of(self._coverage)

@@ -24,25 +24,72 @@ MAX_PIECES, MAX_PARTS, MAX_NESTING = 1_000_000, 2_000_000, 16
 FLAT_FRACTION = 0.001
 """Distance of a polygon from its curve, relative to the extent of the curve."""
 
-LINE_TYPES = {"LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "MLINE"}
+LINE_TYPES = {
+    *("LINE", "LWPOLYLINE", "POLYLINE", "ARC", "CIRCLE", "ELLIPSE", "SPLINE", "HATCH", "SOLID", "TRACE", "MLINE"),
+    *("3DFACE", "MESH"),
+}
+"""Types with lines in the plan; of faces, the upright ones."""
 
-XREF = "external reference"
+XREF, HIDDEN = "external reference", "hidden"
+"""Kinds of entities that are not read: external references, and those that AutoCAD does not show."""
 
 Segments = Floats
 """Ends (N, 2, 2) of pieces of lines."""
 
-WALL_NAMES = re.compile(
-    r"wall|wand|wänd|mauer|mur(?!al)|pared|parete|vägg|vegg|muur|sciana|ściana|стен|colum|pillar|s-cols|stütze|partition|"
-    r"window|glaz|fenster|fenetre|fenêtre|ventana|finestra",
-    re.IGNORECASE,
-)
-"""Words in names of layers with walls, columns and windows."""
+WALL_WORDS = {
+    "English": "wall partition colum pillar s-cols window glaz",
+    "German": "wand wänd mauer stütze säule fenster",
+    "French": "mur(?!al) cloison poteau fenêtre vitr",
+    "Spanish": "pared muro tabique pilar ventana",
+    "Italian": "parete pareti tramezz pilastr finestra",
+    "Portuguese": "parede alvenaria janela",
+    "Dutch": "muur kolom <raam>",
+    "Swedish": "vägg pelare fönster",
+    "Norwegian": "vegg søyle vindu",
+    "Danish": "væg søjle",
+    "Finnish": "seinä pilari ikkuna",
+    "Estonian": "<sein <aken",
+    "Latvian, Lithuanian": "<sien[aou]",
+    "Polish": "ścian słup <okn",
+    "Czech, Slovak": "<stěn[aoy] <zeď> <zdi zdiv příčk priečk sloup <stĺp",
+    "Hungarian": "<fal> <fala válaszfal főfal oszlop pillér ablak",
+    "Romanian": "perete pereți zidăr <stâlp fereastr ferestre",
+    "Croatian, Serbian, Slovenian": "<zid <stup(?!id) prozor зид прозор",
+    "Russian, Bulgarian": "стен перегород колон окн окон",
+    "Ukrainian": "стін стін вікн вікон",
+    "Greek": "τοίχο τοιχ κολών παράθυρ toich toix",
+    "Turkish": "duvar kolon pencere",
+    "Indonesian, Malay": "dinding tembok jendela",
+    "Vietnamese": "tường tuong vách <cột> cửa_sổ",
+    "Chinese": "墙 牆 柱 窗",
+    "Japanese": "壁 柱 窓",
+    "Korean": "벽 기둥 창문",
+    "Thai": "ผนัง กำแพง เสา หน้าต่าง",
+    "Arabic, Persian": "جدار حائط عمود نافذة دیوار",
+    "Hebrew": "קיר עמוד חלון",
+    "Hindi": "दीवार",
+}
+"""Patterns of names of layers with walls, columns and windows; < and > are ends of words, accents do not count."""
+
+
+def _plain(text: str) -> str:
+    """Return text in lower case without accents."""
+    kept = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
+    return "".join(kept).casefold().translate(str.maketrans({"ł": "l", "ø": "o", "æ": "ae", "\u0131": "i"}))
+
+
+_ENDS = {"<": "(?<![^\\W\\d_])", ">": "(?![^\\W\\d_])", "_": "[ _-]?"}
+_WALLS = "|".join(word for words in WALL_WORDS.values() for word in _plain(words).split())
+WALL_NAMES = re.compile(re.sub("[<>_]", lambda found: _ENDS[found[0]], _WALLS))
+"""Words in names of layers with walls, columns and windows, for `_plain` names."""
 
 NO_WALL_NAMES = {
     reason: re.compile(words, re.IGNORECASE)
     for reason, words in {
         "texts, dimensions or door headers": r"head|text|dim|anno|iden|note",
         "furniture": r"furn|möbel|mobel|schrank",
+        "doors": r"门窗|門窗",
+        "axes": r"芯|轴|軸",
         "lamps or sockets": r"-lite|light|lamp|leucht|lumin|sconce|socket|steckdose|outlet",
         "above the room": r"ovhd|overhead",
         "to be demolished": r"demo(?![a-z])|demol|démol|abbruch|abriss|rückbau|sloop|rivning|wyburz",
@@ -85,6 +132,9 @@ MARGIN, DOUBT, UNIQUE_MARGIN = 5.0, 2.5, 1.0
 """Differences of misfits from which the header's unit is rejected; from which it gives a warning, or is rejected if it
 is inches or feet in a metric drawing; and from which one unit is better than all others."""
 
+UPRIGHT_RATIO = 0.1
+"""Largest vertical part of the normal of an upright face."""
+
 RASTER_CELLS = 1000
 """Number of cells along the longer side of the plan in which openings are found."""
 
@@ -99,13 +149,14 @@ def skip_reason(name: str) -> str:
     """
     name = unicodedata.normalize("NFC", _REFERENCE.split(name)[-1])
     parts = _AIA.fullmatch(name)
-    if parts and parts[2].upper() not in AIA_WALLS and not WALL_NAMES.search(parts[2]):
+    if parts and parts[2].upper() not in AIA_WALLS and not WALL_NAMES.search(_plain(parts[2])):
         return "major group of no wall (AIA/NCS)"
+    is_wall = WALL_NAMES.search(_plain(name))
     for reason, words in NO_WALL_NAMES.items():
         if words.search(name):
-            return reason if WALL_NAMES.search(name) else f"{NO_WALL}: {reason}"
+            return reason if is_wall else f"{NO_WALL}: {reason}"
     if not parts:
-        return "" if WALL_NAMES.search(name) else NO_WALL
+        return "" if is_wall else NO_WALL
     status = "D" if parts[1].upper() in AIA_DEMOLITION else (parts[4] or "").upper()
     return AIA_STATUS.get(status, "")
 
@@ -140,6 +191,7 @@ class DrawnLines:
     def __init__(self, path: Path, drawing: Any) -> None:
         self._path, self._drawing = path, drawing
         self.names = {layer.dxf.name.lower(): layer.dxf.name for layer in drawing.layers}
+        self._frozen = {layer.dxf.name.lower() for layer in drawing.layers if layer.is_frozen()}
         self._counted: dict[str, Counter[tuple[str, str]]] = {}
         self._read: dict[str, dict[str, Segments]] = {}
         space = drawing.modelspace()
@@ -168,6 +220,9 @@ class DrawnLines:
             name, kind = _layer_of(entity), entity.dxftype()
             layer = name.lower()
             self.names.setdefault(layer, name)
+            if not self._shows(entity):
+                found[layer, HIDDEN] += entity.mcount if kind == "INSERT" else 1
+                continue
             if kind != "INSERT":
                 found[layer, kind] += 1
                 continue
@@ -184,11 +239,19 @@ class DrawnLines:
                     found[layer if own == "0" else own, inner] += count * times
         return found
 
+    def _shows(self, entity: Any) -> bool:
+        """Return whether an entity is visible, and no INSERT on a frozen layer, which hides its block on any layer."""
+        is_insert = entity.dxftype() == "INSERT"
+        is_invisible = entity.dxf.hasattr("invisible") and entity.dxf.invisible
+        return not is_invisible and not (is_insert and _layer_of(entity).lower() in self._frozen)
+
     def _lines(self, entities: Iterable[Any], layers: set[str], nesting: int) -> dict[str, Segments]:
         parts: dict[str, list[Segments]] = {}
         pieces = 0
         for entity in entities:
             layer = _layer_of(entity).lower()
+            if not self._shows(entity):
+                continue
             if entity.dxftype() == "INSERT":
                 found = self._inserted(entity, layer, layers, nesting)
             elif layer in layers or layer == "0":
@@ -249,17 +312,34 @@ def _pieces(entity: Any) -> Iterator[Segments]:
     kind = entity.dxftype()
     if kind == "LINE":
         yield np.array([[entity.dxf.start.xyz, entity.dxf.end.xyz]])
-    elif kind == "MLINE":
+    elif kind == "MLINE" or (kind == "POLYLINE" and (entity.is_poly_face_mesh or entity.is_polygon_mesh)):
         for part in entity.virtual_entities():
             yield from _pieces(part)
+    elif kind == "3DFACE":
+        yield from _upright([corner.xyz for corner in entity.wcs_vertices()])
+    elif kind == "MESH":
+        for face in entity.faces:
+            yield from _upright([tuple(entity.vertices[number]) for number in face])
     elif kind in LINE_TYPES:
         for corners in _curves(entity):
             yield np.stack([corners[:-1], corners[1:]], axis=1)
 
 
+def _upright(corners: list[tuple[float, ...]]) -> Iterator[Segments]:
+    """Yield the line under an upright face."""
+    points = np.array(corners, dtype=np.float64)
+    normal = np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0)
+    if np.isfinite(points).all() and abs(normal[2]) < UPRIGHT_RATIO * np.linalg.norm(normal):
+        apart = np.linalg.norm(points[:, None, :2] - points[None, :, :2], axis=2)
+        yield points[[[*np.unravel_index(np.argmax(apart), apart.shape)]]]
+
+
 def _curves(entity: Any) -> Iterator[Floats]:
     from ezdxf.path import from_hatch, make_path
 
+    if entity.dxftype() in ("LWPOLYLINE", "POLYLINE") and entity.has_width:
+        yield from _wide(entity)
+        return
     for path in from_hatch(entity) if entity.dxftype() == "HATCH" else [make_path(entity)]:
         corners = np.array([corner.xyz for corner in path.control_vertices()])
         if len(corners) > 1 and path.has_curves:
@@ -267,6 +347,18 @@ def _curves(entity: Any) -> Iterator[Floats]:
             corners = np.array([corner.xyz for corner in path.flattening(flat, segments=4)])
         if len(corners) > 1:
             yield corners
+
+
+def _wide(entity: Any) -> Iterator[Floats]:
+    """Yield the outlines of the segments of a polyline with widths."""
+    from ezdxf.math import Vec3
+    from ezdxf.render.trace import TraceBuilder
+
+    ocs = entity.ocs()
+    for trace in TraceBuilder.from_polyline(entity, segments=16):
+        for face in trace.faces():
+            corners = [Vec3(corner) for corner in face]
+            yield np.array([ocs.to_wcs(corner).xyz for corner in [*corners, corners[0]]])
 
 
 class _Scale(NamedTuple):

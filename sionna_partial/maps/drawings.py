@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 from PIL import Image, ImageOps
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Indices, States, largest_by_area
+from sionna_partial.arrays import Bools, Indices, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
 from sionna_partial.maps.drawing_lines import (
+    HIDDEN,
     LINE_TYPES,
     NO_WALL,
     PARTIAL_HEIGHT,
@@ -33,7 +34,14 @@ from sionna_partial.maps.drawing_lines import (
     wall_thickness,
 )
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
-from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, crossed_cells, fitted_grid, require_unit
+from sionna_partial.maps.mesh.cells import (
+    DEFAULT_RESOLUTION_M,
+    crossed_cells,
+    fitted_grid,
+    require_no_degrees,
+    require_unit,
+    states_of_lines,
+)
 from sionna_partial.maps.mesh.cut import BORDER_M
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import bare_image, opened_image
@@ -44,15 +52,16 @@ MAX_DRAWING_BYTES = 100_000_000
 FOREIGN = "AEC_", "ACAD_PROXY"
 """Prefixes of types of objects that the DXF does not contain as lines."""
 
-OPENING_M, SOLID_M = 2.0, 0.5
-"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
-
 MAX_ADDED, MAX_GROWTH = 8, 2.5
 """Most layers tried if walls enclose hardly any area, and their largest relative extent."""
 
 THIN_M, FILLED_FRACTION = 0.06, 0.3
 """Width of thin lines (furniture, doors, dimensions) [m], and least fraction of dark pixels in wider lines on plans
 with filled walls."""
+
+HATCH_M, THINNEST_M, HATCHED_FRACTION = 0.15, 0.1, 0.02
+"""Widest space between the lines of a hatch, least thickness of hatched walls [m], and least fraction of dark pixels
+inside them: walls of two lines have none."""
 
 MARK_M = 0.5
 """Largest extent along x and y of text or symbols [m]."""
@@ -81,8 +90,9 @@ def map_from_drawing(
         DXF, text or binary.
     wall_layers : sequence of str or None
         Layers with the walls, with wildcards `*` and `?`. By default visible layers named as walls, columns or
-        windows, in European languages or the AIA/NCS standard, except demolished ones. Without any, all visible
-        ones; if they enclose hardly any area, also the layer that closes most rooms: both raise a `MapWarning`.
+        windows, in one of 38 languages or by the AIA/NCS standard, except demolished ones. If they enclose hardly any
+        area, also the layer that closes most rooms, with a `MapWarning`. Without such names, the only layer with lines,
+        with a `MapWarning`; several are refused, with a list of their lines.
     layer_materials : mapping of str to Material or str, or None
         Materials of the walls on layers, with wildcards; the last layer wins.
     layer_heights_m : mapping of str to float, or None
@@ -123,6 +133,7 @@ def map_from_drawing(
         segments, on_layer = plan.segments(layers)
         notes = ImportNotes(source, unit or 0.0, "unit_m")
         if unit is None:
+            require_no_degrees(f"path = '{source}'", np.stack([segments.min(axis=(0, 1)), segments.max(axis=(0, 1))]))
             notes.unit_m, notes.unit_source = plan.unit(segments)
         state, empty = _cells(source, segments * notes.unit_m, notes.unit_m, resolution_m)
         if names is None and _enclosed(state) < ENCLOSED_FRACTION:
@@ -160,7 +171,7 @@ class _Plan(NamedTuple):
     @classmethod
     def of(cls, path: Path, drawing: Any) -> "_Plan":
         lines = DrawnLines(path, drawing)
-        visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF)}
+        visible = {layer: True for layer, kind in lines.counts if kind not in ("INSERT", XREF, HIDDEN)}
         visible |= {layer.dxf.name.lower(): layer.is_on() and not layer.is_frozen() for layer in drawing.layers}
         return cls(path, drawing, visible, lines)
 
@@ -177,6 +188,21 @@ class _Plan(NamedTuple):
         texts = (f"{self.lines.names.get(name, name)} ({counts[name]:,} lines)" for name in names[:40])
         return f"{len(names)} layers: {', '.join(texts)}"
 
+    def preview(self, layers: set[str]) -> str:
+        """Return number, length and extent of the lines on layers, the longest first."""
+        segments, on_layer = self.lines.segments(layers)
+        counts, found = self.lines.line_counts(), []
+        for layer in layers:
+            own = segments[on_layer == layer]
+            if len(own):
+                x, y = np.ptp(own.reshape(-1, 2), axis=0)
+                length = float(np.linalg.norm(own[:, 1] - own[:, 0], axis=1).sum())
+                name = self.lines.names.get(layer, layer)
+                found.append((-length, f"'{name}' ({counts[layer]:,} lines, {length:.4g} long, on {x:.4g} x {y:.4g})"))
+        texts = [text for _, text in sorted(found)]
+        more = f", and {len(texts) - 20} more" if len(texts) > 20 else ""
+        return f"{', '.join(texts[:20])}{more} [units of the drawing]"
+
     def skip_reasons(self, names: Sequence[str] | None) -> dict[str, str]:
         if names is not None:
             found = {
@@ -189,7 +215,13 @@ class _Plan(NamedTuple):
             return found
         found = {layer: skip_reason(layer) if shows else "hidden" for layer, shows in self.visible.items()}
         if all(found.values()):
-            message = f"path = '{self.path}' has no layer whose name looks like walls, so all lines are walls"
+            counts = self.lines.line_counts()
+            shown_layers = {layer for layer, shows in self.visible.items() if shows and counts[layer]}
+            message = f"path = '{self.path}' has no layer whose name looks like walls"
+            if len(shown_layers) > 1:
+                remedy = f"give wall_layers (--wall-layer), one or more of {self.preview(shown_layers)}"
+                raise MapError(f"{message}: {remedy}.")
+            message = f"{message}, so all lines are walls"
             warnings.warn(f"{message}: name them as wall_layers; it has {self.listed()}.", MapWarning, stacklevel=4)
             found = {layer: "" if reason != "hidden" else reason for layer, reason in found.items()}
         return found
@@ -209,6 +241,8 @@ class _Plan(NamedTuple):
                 what, remedy = (kind, "explode them") if kind != XREF else (name, "bind it")
                 notes.skip(what, count, f"{'object of another program' if kind != XREF else kind}: {remedy}")
                 lost[what] = lost.get(what, 0) + count
+            elif kind == HIDDEN:
+                notes.skip(layer, count, "invisible, or blocks on a frozen layer")
             elif kind in LINE_TYPES:
                 notes.skip(layer, count, reasons.get(name, NO_WALL))
             elif kind != "INSERT" and not reasons.get(name, NO_WALL):
@@ -340,26 +374,6 @@ def _given_layers(wall_layers: Sequence[str] | None) -> Sequence[str] | None:
     return wall_layers
 
 
-def states_of_lines(segments: Segments, empty: PartialMap, solid: Bools | None = None) -> States:
-    """Return the cell states (ny, nx): walls including `solid`, enclosed area, and unknown cells."""
-    cell_m = empty.resolution_m
-    cells = crossed_cells((segments - empty.origin_m) / cell_m, empty.shape, BORDER_M / cell_m)
-    margin = math.ceil(OPENING_M / cell_m)
-    wall = np.pad(cells if solid is None else cells | solid, margin)
-    # A disc of half the opening's width that rolls along the outer walls does not enter the building.
-    radius = OPENING_M / 2 / cell_m
-    to_wall = ndimage.distance_transform_edt(~wall)
-    area, _ = ndimage.label(to_wall > radius)
-    outside = ndimage.distance_transform_edt(area != area[0, 0]) <= radius
-    area, count = ndimage.label(~(wall | outside))
-    widest_m = 2 * cell_m * largest_by_area(to_wall, area, count)
-    inside = area > 0
-    state = np.full(wall.shape, CellState.UNKNOWN, dtype=np.uint8)
-    state[inside] = CellState.FREE
-    state[wall | (inside & (widest_m <= SOLID_M)[area])] = CellState.WALL
-    return state[margin:-margin, margin:-margin]
-
-
 def read_picture(path: Path, *, resolution_m: float | None = None, threshold: int | None = None) -> PartialMap:
     """Read a floor plan from a picture with dark walls on bright ground, or the inverse.
 
@@ -417,7 +431,9 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
     width = round(THIN_M / pixel_m)
     if width > 1:
         wide = ndimage.binary_opening(wall, np.ones((width, width), dtype=bool))
-        if wide.sum() >= FILLED_FRACTION * wall.sum():
+        if wide.sum() < FILLED_FRACTION * wall.sum():
+            wide = _hatched(wall, pixel_m)
+        if wide.any():
             notes.skip("thin lines", ndimage.label(wall & ~wide)[1], f"narrower than {width * pixel_m:.2g} m")
             wall = wide
     pieces, _ = ndimage.label(wall, np.ones((3, 3), dtype=bool))
@@ -430,6 +446,25 @@ def _walls(path: Path, pixel_m: float, threshold: int | None, notes: ImportNotes
         what = f"path = '{path}' has no connected walls longer than {MARK_M:g} m with resolution_m = {pixel_m:g}"
         raise MapError(f"{what}: give the metres per pixel, or a picture with darker walls.")
     return np.asarray(wall)
+
+
+def _hatched(wall: Bools, pixel_m: float) -> Bools:
+    """Return the pixels (rows, columns) of hatched walls with the space between their lines, none without such walls.
+
+    Separate marks are left out first: the letters of a text would close to a wall.
+    """
+    margin = math.ceil(HATCH_M / pixel_m)
+    pieces, _ = ndimage.label(np.pad(wall, margin), np.ones((3, 3), dtype=bool))
+    longest = [0, *(max(side.stop - side.start for side in box) for box in ndimage.find_objects(pieces))]
+    lines = (np.array(longest) * pixel_m > MARK_M)[pieces]
+    radius, width = HATCH_M / 2 / pixel_m, max(2, round(THINNEST_M / pixel_m))
+    closed = ndimage.distance_transform_edt(ndimage.distance_transform_edt(~lines) <= radius) > radius
+    band = ndimage.binary_opening(closed, np.ones((width, width), dtype=bool))
+    inside = ndimage.distance_transform_edt(band) > THIN_M / pixel_m / 2
+    is_hatched = (lines & inside).sum() >= HATCHED_FRACTION * inside.sum() > 0
+    if not (is_hatched and (lines & band).sum() >= FILLED_FRACTION * lines.sum()):
+        return np.zeros_like(wall)
+    return np.asarray(band[margin:-margin, margin:-margin])
 
 
 def _shades(path: Path) -> States:

@@ -1,9 +1,8 @@
 """IFC building models -> PartialMap: a storey cut at the height of windows, by the types of its elements."""
 
 import math
-import re
+from collections import Counter
 from collections.abc import Mapping
-from dataclasses import replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,10 +16,11 @@ from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, read_bytes
 from sionna_partial.maps.drawing_lines import Segments
-from sionna_partial.maps.drawings import material_given, states_of_lines, with_materials
+from sionna_partial.maps.drawings import material_given, with_materials
 from sionna_partial.maps.environment import MAX_TRIANGLES
-from sionna_partial.maps.import_report import ImportNotes
-from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid
+from sionna_partial.maps.ifc_layers import Layer, described, slab
+from sionna_partial.maps.import_report import SHOWN_ROWS, ImportNotes
+from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, states_of_lines
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
 from sionna_partial.process import core_count
 from sionna_partial.resources import optional_packages
@@ -34,7 +34,8 @@ CUT_M = 1.2001
 LEAST_STOREY_M = 2.0
 """Height from which the next storey is the ceiling [m]; closer levels belong to stairs or foundations."""
 
-MAX_THICKNESS_M = 10.0
+BESIDE_M, BESIDE_RATIO = 0.02, 2.0
+"""Distance of walls side by side [m], and least length along them over the thickness: others are corners."""
 
 DOOR = "IfcDoor"
 
@@ -49,24 +50,12 @@ TYPES = {
 }
 """Types that are walls, with their subtypes, and the name of their material; None is the default."""
 
-NAMES = {
-    "coated glass": r"coated glass|low.?e\b",
-    "glass": r"glas|glaz|vitr",
-    "reinforced concrete": r"reinforced|stahlbeton",
-    "concrete": r"concrete|beton|\bcmu\b",
-    "brick": r"brick|masonry|ziegel|mauerwerk|klinker|brique",
-    "drywall": r"drywall|dry wall|gypsum|plasterboard|gips",
-    "wood": r"wood|timber|lumber|holz|\bbois",
-    "metal": r"metal|steel|stahl|alumini|iron",
-}
-"""Patterns of material names by our names; the first match counts."""
-
+CURTAIN_PARTS = {"IfcPlate": "CURTAIN_PANEL", "IfcMember": "MULLION"}
+"""Types that are walls as parts of curtain walls only, and their predefined types there; others are in stairs, roofs
+and railings."""
 
 PANES = ("IfcWindow", "IfcCurtainWall")
 """Types whose panes count instead of their frames."""
-
-SOLID = ("concrete", "reinforced concrete", "brick", "wood")
-"""Materials whose walls are as thick as their bodies if no layer has a thickness."""
 
 
 class _Cut(NamedTuple):
@@ -75,6 +64,20 @@ class _Cut(NamedTuple):
     product: Any
     segments: Segments
     area: shapely.Geometry
+
+
+class _Wall(NamedTuple):
+    """Type of an element in the file and in `TYPES`, its layers, and its area in the plane of the cut [m]."""
+
+    name: str
+    kind: str
+    is_wall: bool
+    layers: list[Layer]
+    area: shapely.Geometry
+
+    @property
+    def width_m(self) -> float:
+        return _width_m(self.area)
 
 
 class _Piece(NamedTuple):
@@ -137,7 +140,7 @@ def _storey(path: Path, model: Any, name: str | None, notes: ImportNotes) -> tup
     unit_m = notes.unit_m
     every = model.by_type("IfcBuildingStorey")
     level_m = {storey: float(get_local_placement(storey.ObjectPlacement)[2, 3]) * unit_m for storey in every}
-    walls = model.by_type("IfcWall")
+    walls = [wall for kind in ("IfcWall", "IfcCurtainWall") for wall in model.by_type(kind)]
     if not walls or not every:
         raise MapError(f"path = '{path}' has {len(walls)} walls on {len(every)} storeys: export a building with both.")
     used = {get_container(wall, ifc_class="IfcBuildingStorey") for wall in walls}
@@ -173,7 +176,7 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
     of_owner: dict[tuple[int, int], list[_Cut]] = {}
     for body, (number, owner) in owner_of.items():
         of_owner.setdefault((-number, owner.id()), []).extend([cuts[body]] if body in cuts else [])
-    pieces = []
+    found, lines_m = list[_Wall](), list[Segments]()
     for (number, owner_id), bodies in sorted(of_owner.items()):
         owner, kind = model.by_id(owner_id), kinds[-number]
         if not any(len(body.segments) for body in bodies):
@@ -184,19 +187,60 @@ def _pieces(model: Any, height_m: float, given: dict[str, Material], notes: Impo
         bodies = own or [body for body in bodies if len(body.segments)]
         for name in [owner.is_a(), *(body.product.is_a() for body in bodies if not own)]:
             notes.use(name)
-        material = given.get(kind) or _material(owner, TYPES[kind], bodies, notes.unit_m)
-        segments = np.concatenate([body.segments for body in bodies])
-        pieces.append(_Piece(material, segments, shapely.union_all([body.area for body in bodies])))
+        area, segments = shapely.union_all([body.area for body in bodies]), [body.segments for body in bodies]
+        is_wall = owner.is_a("IfcWall")
+        found.append(_Wall(owner.is_a(), kind, is_wall, _layers_of(owner, bodies, notes.unit_m), area))
+        lines_m.append(np.concatenate(segments))
     for element in model.by_type("IfcElement"):
         if element.id() not in owner_of and element.Representation and not element.is_a("IfcFeatureElement"):
             is_door = element.is_a(DOOR)
             notes.skip(element.is_a(), 1, "open; layer_materials for IfcDoor closes it" if is_door else "no wall")
+    return _with_slabs(found, lines_m, given, notes)
+
+
+def _with_slabs(
+    found: list[_Wall], lines_m: list[Segments], given: dict[str, Material], notes: ImportNotes
+) -> list[_Piece]:
+    pieces, sets = [], Counter[str]()
+    for wall, beside, segments_m in zip(found, _beside(found), lines_m, strict=True):
+        layers = wall.layers + beside
+        width_m = _width_m(wall.area) if wall.is_wall else None
+        material = given.get(wall.kind) or slab(layers, TYPES[wall.kind], width_m)
+        sets[described(wall.name, layers, material)] += 1
+        pieces.append(_Piece(material, segments_m, wall.area))
+    lines = [f"{count} x {text}" for text, count in sets.most_common()]
+    more = [f"and {len(lines) - SHOWN_ROWS} more sets of layers"] if len(lines) > SHOWN_ROWS else []
+    notes.notes += [*lines[:SHOWN_ROWS], *more]
     return pieces
+
+
+def _beside(walls: list[_Wall]) -> list[list[Layer]]:
+    """Return the layers of the wall at the side of each wall: finishes and insulation may be walls of their own."""
+    solid = [index for index, wall in enumerate(walls) if wall.is_wall and not wall.area.is_empty]
+    around = [shapely.buffer(walls[index].area, BESIDE_M, cap_style="flat", join_style="mitre") for index in solid]
+    found: list[list[Layer]] = [[] for _ in walls]
+    if not solid:
+        return found
+    overlaps: dict[int, list[tuple[float, int]]] = {}
+    for one, other in shapely.STRtree(around).query(around, predicate="intersects").T.tolist():
+        if one != other:
+            length_m = shapely.intersection(around[one], around[other]).area / (2 * BESIDE_M)
+            overlaps.setdefault(one, []).append((length_m, solid[other]))
+    for one, lengths_m in overlaps.items():
+        wall, (length_m, other) = walls[solid[one]], max(lengths_m)
+        if sum(length for length, _ in lengths_m) > _length_m(wall.area) / 2 and length_m > BESIDE_RATIO * wall.width_m:
+            found[solid[one]] = walls[other].layers or [Layer("unnamed", round(walls[other].width_m, 3))]
+    return found
 
 
 def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
     """Return type number and wall of each element that may have a body: walls and their parts."""
-    owner_of = {element.id(): (number, element) for number, kind in enumerate(kinds) for element in model.by_type(kind)}
+    owner_of = {
+        element.id(): (number, element)
+        for number, kind in enumerate(kinds)
+        for element in model.by_type(kind)
+        if kind not in CURTAIN_PARTS or _is_of_curtain_wall(element)
+    }
     waiting = [(element, *owner) for owner in owner_of.values() for element in owner[1:]]
     while waiting:
         element, number, owner = waiting.pop()
@@ -206,6 +250,13 @@ def _bodies(model: Any, kinds: list[str]) -> dict[int, tuple[int, Any]]:
                     owner_of[part.id()] = number, owner
                     waiting.append((part, number, owner))
     return owner_of
+
+
+def _is_of_curtain_wall(element: Any) -> bool:
+    if getattr(element, "PredefinedType", None) in CURTAIN_PARTS.values():
+        return True
+    wholes = [relation.RelatingObject for relation in getattr(element, "Decomposes", None) or ()]
+    return any(whole.is_a("IfcCurtainWall") or _is_of_curtain_wall(whole) for whole in wholes)
 
 
 def _cuts(model: Any, height_m: float, products: list[Any], notes: ImportNotes) -> dict[int, _Cut]:
@@ -256,36 +307,39 @@ def _covered(areas: list[shapely.Geometry], empty: PartialMap) -> Bools:
     return cells
 
 
-def _material(owner: Any, usual: str | None, bodies: list[_Cut], unit_m: float) -> Material | None:
-    """Return the material of a wall, with the thickness of its layers.
+def _layers_of(owner: Any, bodies: list[_Cut], unit_m: float) -> list[Layer]:
+    """Return the layers of a wall, or of its parts, which are as thick as their area over the length of the wall.
 
-    Types name it, else the thickest layers of a known name. Drywall is a whole wall with its cavity.
+    Members of walls are their studs.
     """
     from ifcopenshell.util.element import get_material
 
-    thickness_m = dict[str, float]()
     found = get_material(owner, should_skip_usage=True)
-    sources = (
-        [(found, bodies)]
-        if found is not None
-        else [(get_material(body.product, should_skip_usage=True), [body]) for body in bodies]
-    )
-    for source, of_source in sources:
-        layers = [] if source is None else _layers(source)
-        names = [(thickness * unit_m, name) for thickness, text in layers if (name := _known(text))]
-        if len({name for _, name in names}) == 1 and not any(thickness for thickness, _ in names):
-            is_solid = owner.is_a("IfcWall") and names[0][1] in SOLID
-            names = [(sum(_width_m(body.area) for body in of_source) if is_solid else 0.0, names[0][1])]
-        for thickness, name in names:
-            thickness_m[name] = thickness_m.get(name, 0.0) + thickness
-    if any(owner.is_a(kind) for kind in PANES):
-        thickness_m = {name: thickness for name, thickness in thickness_m.items() if "glass" in name}
-    if usual is None and not thickness_m:
-        return None
-    name = usual if usual is not None and (not thickness_m or usual in thickness_m) else ""
-    name = name or max(thickness_m, key=thickness_m.__getitem__)
-    material, thick_m = Material.named(name), min(round(thickness_m.get(name, 0.0), 3), MAX_THICKNESS_M)
-    return material if not thick_m or name == "drywall" else replace(material, thickness_m=thick_m)
+    if found is not None:
+        layers = _layers(found, unit_m)
+        is_pane = any(owner.is_a(kind) for kind in PANES)
+        return [layer for layer in layers if "glass" in (layer.name or "")] if is_pane else layers
+    layers, length_m = list[Layer](), _length_m(shapely.union_all([body.area for body in bodies]))
+    for body in bodies:
+        source = get_material(body.product, should_skip_usage=True)
+        of_part = [] if source is None else _layers(source, unit_m)
+        if owner.is_a("IfcWall") and body.product.is_a("IfcMember"):
+            of_part = [Layer("stud", 0.0)]
+        if len(of_part) == 1 and not of_part[0].thickness_m and owner.is_a("IfcWall") and length_m > 0:
+            of_part = [of_part[0]._replace(thickness_m=body.area.area / length_m)]
+        layers += of_part
+    total_m = dict[str, float]()
+    for layer in layers:
+        total_m[layer.text] = total_m.get(layer.text, 0.0) + layer.thickness_m
+    return [Layer(text, round(thickness_m, 3)) for text, thickness_m in total_m.items()]
+
+
+def _length_m(area: shapely.Geometry) -> float:
+    """Return the length of a wall, bent or straight, from the area of its parts [m]."""
+    width_m = _width_m(area)
+    strip_m = area.area / width_m / max(1, len(shapely.get_parts(area))) if width_m > 0 else 0.0
+    corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(area))
+    return max(strip_m, *np.linalg.norm(np.diff(corners, axis=0), axis=1).tolist(), 0.0)
 
 
 def _width_m(area: shapely.Geometry) -> float:
@@ -294,9 +348,9 @@ def _width_m(area: shapely.Geometry) -> float:
     return float(perimeter_m - math.sqrt(max(0.0, perimeter_m**2 - 16 * count * area.area))) / (4 * count)
 
 
-def _layers(found: Any) -> list[tuple[float, str]]:
+def _layers(found: Any, unit_m: float) -> list[Layer]:
     if found.is_a("IfcMaterial"):
-        return [(0.0, found.Name or "")]
+        return [Layer(found.Name or "", 0.0)]
     of_kind = {
         "IfcMaterialLayerSet": "MaterialLayers",
         "IfcMaterialConstituentSet": "MaterialConstituents",
@@ -308,9 +362,5 @@ def _layers(found: Any) -> list[tuple[float, str]]:
         material = getattr(part, "Material", part)
         role = getattr(part, "Name", None) if part.is_a("IfcMaterialConstituent") else None
         names = [name for name in (material.Name if material is not None else None, role) if name]
-        layers.append((float(getattr(part, "LayerThickness", None) or 0.0), " ".join(names)))
+        layers.append(Layer(" ".join(names), round(float(getattr(part, "LayerThickness", None) or 0.0) * unit_m, 4)))
     return layers
-
-
-def _known(text: str) -> str | None:
-    return next((name for name, pattern in NAMES.items() if re.search(pattern, text, re.IGNORECASE)), None)

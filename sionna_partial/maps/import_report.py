@@ -32,6 +32,9 @@ SIZES_M, DOORS_M = (3.0, 300.0), (0.5, 3.0)
 ENCLOSED_FRACTION = 0.1
 """Smallest free fraction of the extent of a building."""
 
+FREE_FRACTION = 0.01
+"""Smallest free fraction of the extent of any map."""
+
 SHOWN_ROWS = 30
 
 _Map = TypeVar("_Map", bound=Any)
@@ -167,7 +170,7 @@ class ImportReport(ImportSource, Shown):
         ]
         return "\n".join(f"{name:11}{text}" for name, (_, text) in zip(names, rows, strict=True))
 
-    def faults(self, size: str, doors: str, area: str) -> Iterable[str]:
+    def faults(self, size: str, doors: str, area: str, free: str) -> Iterable[str]:
         """Yield implausible results with their remedies; an empty remedy skips its check."""
         (x, y), widths = self.extent_m, self.door_widths_m
         if size and not SIZES_M[0] <= max(x, y) <= SIZES_M[1]:
@@ -176,6 +179,8 @@ class ImportReport(ImportSource, Shown):
             yield f"has doors of {widths[0]:.2f} to {widths[-1]:.2f} m, with {self._unit}: {doors}"
         if area and self.free_area_m2 < ENCLOSED_FRACTION * x * y:
             yield f"encloses {self.free_area_m2:.3g} m2 in an extent of {x:.4g} x {y:.4g} m: {area}"
+        elif free and max(x, y) > 0 and self.free_area_m2 < FREE_FRACTION * x * y:
+            yield f"has {self.free_area_m2:.3g} m2 free in an extent of {x:.4g} x {y:.4g} m: {free}"
 
     @property
     def _unit(self) -> str:
@@ -198,14 +203,14 @@ class ImportNotes:
     def skip(self, name: str, count: int, reason: str) -> None:
         self._counts[name, reason] = self._counts.get((name, reason), 0) + count
 
-    def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "") -> _Map:
+    def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "", free: str = "") -> _Map:
         """Return a PartialMap with its report, and warn of implausible results, as `ImportReport.faults`."""
         rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
         used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
         source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))
         partial = replace(partial, import_source=source)
-        if size or doors or area:
-            for fault in partial.import_report.faults(size, doors, area):
+        if size or doors or area or free:
+            for fault in partial.import_report.faults(size, doors, area, free):
                 warning = MapWarning(f"path = '{self.file}' {fault}")
                 warning.report = partial.import_report
                 warnings.warn(warning, stacklevel=4)

@@ -121,9 +121,10 @@ def load_map(
     resolution_m : float or None
         Edge of the cells of a mesh, cloud, drawing or building model [m], by default 0.05; for a picture, metres per
         pixel (required).
-    up : {"z", "y"} or None
+    up : {"z", "y", "-z", "-y"} or None
         Axis of a mesh or cloud that points up: by default y for glTF (its specification) and z for others, with a
-        `MapWarning` if that looks wrong.
+        `MapWarning` if floor, ceiling or furniture show another one. Scans that lean by up to 10 degrees are levelled,
+        with a `MapWarning`; others are refused.
     layer_materials : mapping of str to Material or str, or None
         Materials by layers of a drawing (see `map_from_drawing`), or by types of a building model, such as "IfcWall";
         "IfcDoor" closes the doors.
@@ -385,8 +386,9 @@ def _read_mesh(source: Path, **options: Any) -> PartialMap:
 
     reading, suffix = MeshReading(**options), source.suffix.lower()
     notes = reading.notes(source, _UNIT_SOURCES.get(suffix, "taken for metres"))
-    mesh = read_mitsuba_scene(source, notes) if suffix == ".xml" else read_mesh(source, reading.up, notes)
-    return reading.attached(notes, mesh_map(mesh, reading))
+    is_scene = suffix == ".xml"  # the unit of Sionna RT's scenes is the metre
+    mesh = read_mitsuba_scene(source, notes) if is_scene else read_mesh(source, reading.up, notes)
+    return reading.attached(notes, mesh_map(mesh, reading, is_metric=is_scene))
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:

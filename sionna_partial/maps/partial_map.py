@@ -648,9 +648,11 @@ def warn_of_odd_states(what: str, partial: PartialMap) -> None:
     """Warn of a map without walls or free cells, or that looks inverted."""
     count = np.bincount(partial.state.ravel(), minlength=len(CellState))
     free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
-    if partial.state.size < ODD_CELLS or not free + wall:
+    if partial.state.size < ODD_CELLS:
         return
-    if not wall:
+    if not free + wall:
+        seen = "has no free cell and no wall, so that everything is unknown"
+    elif not wall:
         seen = f"has {free:,} free cells and no wall, so that nothing obstructs or reflects"
     elif wall > 2 * free:
         seen = f"has {wall:,} wall cells and {free:,} free ones, as if inverted"

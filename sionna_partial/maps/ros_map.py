@@ -133,7 +133,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
     state = _fitted_state(pixels, sheet, notes, strict=strict)
     if state is None:
         state = _classify(pixels, sheet)
-        if sheet.mode == "trinary" and not strict:
+        if sheet.mode != "raw" and not strict:
             _keep_unknown(state, pixels, sheet)
         if not (strict or _warn_of_inflation(state, sheet)):
             _warn_of_dark_unknown(state, pixels, sheet)

@@ -1,11 +1,14 @@
-"""Maps of vacuum robots: ValetudoMap JSON, alone or in a recording of Valeronoi -> PartialMap."""
+"""Maps of vacuum robots: ValetudoMap JSON, alone, packed for MQTT, or in a recording of Valeronoi -> PartialMap."""
 
 from __future__ import annotations
 
+import base64
 import json
 import os
+import zlib
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -48,7 +51,7 @@ def read_json(
     path: str | os.PathLike[str], field: str, error: type[SionnaPartialError]
 ) -> tuple[dict[str, Any], dict[str, Any], VacuumFrame]:
     """Return the content of a JSON file, its ValetudoMap and its frame."""
-    content = read_bytes(path, field, error, MAX_BYTES)
+    content = _inflated(read_bytes(path, field, error, MAX_BYTES))
     try:
         raw = json.loads(content)
     except (ValueError, RecursionError) as cause:
@@ -63,6 +66,22 @@ def read_json(
         if not 0.1 <= number_of(value) <= 1e6:
             raise error(f"{path}: {name} = {shown(value)} is not allowed: give a length in centimetres.")
     return raw, found, VacuumFrame(*(number_of(value) / CENTIMETRES for value in lengths_cm.values()))
+
+
+def _inflated(content: bytes) -> bytes:
+    """Return the JSON of a message over MQTT, which Valetudo packs by zlib, and some brokers in base64."""
+    packed = content
+    if content.strip()[:2] in (b"eJ", b"eN", b"eA", b"eF"):  # the first byte of zlib, 0x78
+        with suppress(ValueError):
+            packed = base64.b64decode(b"".join(content.split()), validate=True)
+    if packed[:1] != b"\x78":
+        return content
+    unpacker = zlib.decompressobj()
+    try:
+        found = unpacker.decompress(packed, MAX_BYTES)
+    except zlib.error:
+        return content
+    return found if unpacker.eof else content
 
 
 def read_vacuum_map(path: Path) -> PartialMap:

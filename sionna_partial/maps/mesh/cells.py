@@ -16,7 +16,7 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.environment import SceneMesh, height_pair
-from sionna_partial.maps.import_report import ImportNotes, MapWarning
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
 from sionna_partial.maps.wall_cells import row_runs
@@ -27,12 +27,14 @@ DEFAULT_BAND_M = (1.0, 1.8)
 
 DEFAULT_RESOLUTION_M = 0.05
 
+DEGREES = 0.1
+"""Largest extent of a building in degrees."""
+
 SMALLEST_M, HIGHEST_M = 0.1, 100.0
 """Smallest extent along x or y, and largest height, of a mesh in metres [m]."""
 
-LOWEST_CEILING_M, HIGHEST_ROOM_M, FLOORS_RATIO = 2.2, 6.0, 1.5
-"""Heights of the lowest rooms and of usual storeys [m]; ratio of floors to walls from which y of a taller scan points
-up."""
+LOWEST_CEILING_M = 2.2
+"""Height of the lowest rooms [m]."""
 
 FEET_STOREY, FOOT_M, WIDE_RATIO = (7.0, 11.0), 0.3048, 2.0
 """Height of a storey in feet, length of a foot [m], and ratio of width to height above that of tall halls."""
@@ -44,6 +46,12 @@ ceiling."""
 RIM_M = 0.3
 """Largest width of free rims between walls and unknown cells, which become unknown [m]."""
 
+
+OPENING_M, SOLID_M = 2.0, 0.5
+"""Widest opening of outer walls that leaves rooms indoors; width of the widest wall drawn by both faces [m]."""
+
+UPS = ("z", "y", "-z", "-y")
+"""Axes of a file that may point up."""
 
 UNIT_REMEDY = "give unit_m, the length of its unit in metres"
 
@@ -59,8 +67,8 @@ class MeshReading:
     unit_m: float | None = None
 
     def __post_init__(self) -> None:
-        if self.up is not None and not (isinstance(self.up, str) and self.up in ("z", "y")):
-            raise MapError(f'up = {shown(self.up)} is not allowed: choose "z" or "y".')
+        if self.up is not None and not (isinstance(self.up, str) and self.up in UPS):
+            raise MapError(f'up = {shown(self.up)} is not allowed: choose "z", "y", "-z" or "-y".')
         require_unit(self.unit_m)
 
     def notes(self, file: str | os.PathLike[str], unit_source: str = "taken for metres") -> ImportNotes:
@@ -68,7 +76,8 @@ class MeshReading:
 
     def attached(self, notes: ImportNotes, partial: PartialMap) -> PartialMap:
         """Return a map with its report; the extent is checked if all of the file is observed."""
-        return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.")
+        free = "give the observed area, the height_band_m of its walls, or sensor_positions_m of a cloud."
+        return notes.attached_to(partial, size="" if self.observed is not None else f"{UNIT_REMEDY}.", free=free)
 
 
 def require_unit(unit_m: object) -> None:
@@ -77,8 +86,8 @@ def require_unit(unit_m: object) -> None:
         raise MapError(f"unit_m = {shown(unit_m)} is not allowed: {remedy}")
 
 
-def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
-    """Convert a mesh to a map that carries it, cut to its known cells.
+def mesh_map(mesh: SceneMesh, reading: MeshReading, *, is_metric: bool = False) -> PartialMap:
+    """Convert a mesh to a map that carries it, cut to its known cells; `is_metric` if its format has metres.
 
     Walls along lattice lines are in the cells above or to the right, or on the other side if those are unknown.
     """
@@ -86,29 +95,43 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading) -> PartialMap:
         mesh = replace(mesh, vertices_m=mesh.vertices_m * reading.unit_m, height_range_m=None)
     empty = fitted_grid(mesh.bounds_m, DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m)
     require_metres("the mesh", mesh.bounds_m, reading.height_band_m)
-    warn_of_feet("the mesh", mesh.bounds_m, _storey_m(mesh), reading)
+    if not is_metric:
+        warn_of_feet("the mesh", mesh.bounds_m, _storey_m(mesh), reading)
     band_m = _band(mesh, reading.height_band_m)
-    if reading.observed is None:
-        known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
-    else:
-        known = observed_cells(empty, reading.observed)
     upper = _cells_with_surfaces(mesh, empty, band_m, upper=True)
+    if reading.observed is not None:
+        known = observed_cells(empty, reading.observed)
+    else:
+        known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
+        known |= _without_floor(known, upper, empty)
     lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
     lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
     state = np.where(known, CellState.FREE, CellState.UNKNOWN).astype(np.uint8)
     state[known & (upper | (lower & (lost[1:, :-1] | lost[:-1, 1:] | lost[1:, 1:])))] = CellState.WALL
-    state[_rims(state, empty.resolution_m)] = CellState.UNKNOWN
+    narrow, is_rim = _narrow(state, empty.resolution_m)
+    state[narrow] = np.where(is_rim, CellState.UNKNOWN, CellState.WALL)[narrow]
     partial = replace(empty, state=state, mesh=mesh)
     return partial if reading.observed is None else cut_to_known(partial)
 
 
 def require_metres(what: str, bounds_m: Floats, height_band_m: object) -> None:
     x, y, z = (float(extent) for extent in np.ptp(bounds_m, axis=0))
+    require_no_degrees(what, bounds_m)
     if max(x, y) < SMALLEST_M or (z > HIGHEST_M and height_band_m is None):
         raise MapError(
             f"{what} spans {x:g} x {y:g} x {z:g} m: {UNIT_REMEDY}, 0.01 for centimetres, 1000 for kilometres"
             + (", or give the height_band_m of the walls if it is so high." if z > HIGHEST_M else ".")
         )
+
+
+def require_no_degrees(what: str, bounds: Floats) -> None:
+    """Raise a MapError for longitudes and latitudes: an extent far below a unit, far from the origin of the globe."""
+    (low, high), size = bounds[:, :2], np.ptp(bounds[:, :2], axis=0)
+    is_on_globe = (np.abs(bounds[:, :2]) <= (180.0, 90.0)).all() or (np.abs(bounds[:, :2]) <= (90.0, 180.0)).all()
+    if is_on_globe and size.max() < DEGREES and (np.abs(low + high) / 2 > max(20.0 * size.max(), 1.0)).all():
+        where = f"x {low[0]:.7g} to {high[0]:.7g} and y {low[1]:.7g} to {high[1]:.7g}"
+        remedy = "project it to metres (such as UTM) in the program that it comes from."
+        raise MapError(f"{what} spans {where}, as if in degrees of longitude and latitude: {remedy}")
 
 
 def warn_of_feet(what: str, bounds_m: Floats, storey_m: float, reading: MeshReading) -> None:
@@ -131,13 +154,6 @@ def _storey_m(mesh: SceneMesh) -> float:
     levels_m = LEVEL_M * np.flatnonzero(areas >= max(LEVEL_FRACTION * areas.max(), 1e-9))
     above_m = levels_m[levels_m >= levels_m.min(initial=np.inf) + LOWEST_CEILING_M]
     return float(above_m[0] - levels_m[0] if len(above_m) else high_m - low_m)
-
-
-def looks_y_up(extent_m: Floats, across_y: float, across_z: float) -> bool:
-    """Return whether a scan is lowest along y, as high as a room, and has most area across y."""
-    x, y, z = extent_m
-    ratio = 1.0 if y <= HIGHEST_ROOM_M else FLOORS_RATIO
-    return bool(LOWEST_CEILING_M <= y < min(x, z) and across_y > ratio * across_z)
 
 
 def cut_to_known(partial: PartialMap) -> PartialMap:
@@ -163,13 +179,14 @@ def narrow_areas(free: Bools, resolution_m: float, width_m: float = RIM_M) -> Bo
     return narrow
 
 
-def _rims(state: States, resolution_m: float) -> Bools:
+def _narrow(state: States, resolution_m: float) -> tuple[Bools, Bools]:
+    """Return free cells (ny, nx) of narrow areas, and which are rims beside unknown cells; others are inside walls."""
     free = state == CellState.FREE
     unknown = np.pad(state == CellState.UNKNOWN, 1)
     area, count = ndimage.label(free)
     beside = np.zeros(count + 1, dtype=bool)
     beside[area[ndimage.binary_dilation(unknown)[1:-1, 1:-1]]] = True
-    return narrow_areas(free, resolution_m) & beside[area]
+    return narrow_areas(free, resolution_m), beside[area]
 
 
 def fitted_grid(bounds_m: Floats, resolution_m: float) -> PartialMap:
@@ -222,6 +239,24 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
     return cells
 
 
+def _without_floor(known: Bools, wall: Bools, empty: PartialMap) -> Bools:
+    """Return the extent of walls (ny, nx) with hardly any floor or ceiling, with a warning; else no cells."""
+    state = states_of_lines(np.zeros((0, 2, 2)), empty, wall)
+    inside, apart = state == CellState.FREE, ~ndimage.binary_dilation(wall, np.ones((3, 3)))
+    if not (inside & apart).any():
+        row, column = np.nonzero(wall)
+        inside[row.min(initial=0) : row.max(initial=-1) + 1, column.min(initial=0) : column.max(initial=-1) + 1] = True
+        inside &= ~wall
+    solid = state == CellState.WALL
+    if not (inside & apart).any() or (known & inside).sum() >= ENCLOSED_FRACTION * min(inside.sum(), solid.sum()):
+        return np.zeros_like(known)
+    remedy = "give its observed area as observed if that is less."
+    warnings.warn(
+        f"the mesh has no floor, so that all space between its walls is observed: {remedy}", MapWarning, stacklevel=5
+    )
+    return inside | solid
+
+
 def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upper: bool) -> Bools:
     """Return the cells (ny, nx) with a surface between two heights; touching borders does not count."""
     corners = mesh.corners_m
@@ -234,6 +269,26 @@ def _cells_with_surfaces(mesh: SceneMesh, empty: PartialMap, band_m: Any, *, upp
     cells = np.zeros(empty.shape, dtype=np.bool_)
     mark_cells(flat, sizes, cells, BORDER_M / empty.resolution_m, upper)
     return cells
+
+
+def states_of_lines(segments: Floats, empty: PartialMap, solid: Bools | None = None) -> States:
+    """Return the cell states (ny, nx): walls including `solid`, enclosed area, and unknown cells."""
+    cell_m = empty.resolution_m
+    cells = crossed_cells((segments - empty.origin_m) / cell_m, empty.shape, BORDER_M / cell_m)
+    margin = math.ceil(OPENING_M / cell_m)
+    wall = np.pad(cells if solid is None else cells | solid, margin)
+    # A disc of half the opening's width that rolls along the outer walls does not enter the building.
+    radius = OPENING_M / 2 / cell_m
+    to_wall = ndimage.distance_transform_edt(~wall)
+    area, _ = ndimage.label(to_wall > radius)
+    outside = ndimage.distance_transform_edt(area != area[0, 0]) <= radius
+    area, count = ndimage.label(~(wall | outside))
+    widest_m = 2 * cell_m * largest_by_area(to_wall, area, count)
+    inside = area > 0
+    state = np.full(wall.shape, CellState.UNKNOWN, dtype=np.uint8)
+    state[inside] = CellState.FREE
+    state[wall | (inside & (widest_m <= SOLID_M)[area])] = CellState.WALL
+    return state[margin:-margin, margin:-margin]
 
 
 def crossed_cells(lines: Floats, shape: tuple[int, int], margin: float) -> Bools:

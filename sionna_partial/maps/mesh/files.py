@@ -26,9 +26,8 @@ from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, lies_in, read_bytes
 from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
-from sionna_partial.maps.import_report import ImportNotes
-from sionna_partial.maps.mesh.cells import looks_y_up
-from sionna_partial.maps.partial_map import MapWarning
+from sionna_partial.maps.import_report import ImportNotes, MapWarning
+from sionna_partial.maps.mesh.upright import TURNS, levelling, looks_y_up, mesh_ends, surfaces_of, warn_of_axis
 from sionna_partial.settings import Material
 
 CUT = "cut or simplify the mesh."
@@ -74,14 +73,17 @@ def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = Non
     """Read a mesh file, without colours and textures; `up` as in `load_map`."""
     notes = notes or ImportNotes(path)
     kind = path.suffix.lower().removeprefix(".")
-    axis, other = (up or "y", "z") if kind in Y_UP_KINDS else (up or "z", "y")
     vertices, triangles = _read_triangles(path, kind, notes)
-    if axis == "y":
-        vertices = vertices[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
-    if up is None and _looks_y_up(vertices, triangles):
-        what = f"looks as if {other} pointed up" + (", against the specification of glTF" if axis == "y" else "")
-        message = f'path = \'{path}\' {what}: give up="{other}" to turn it, or up="{axis}" to read it as it is.'
-        warnings.warn(message, MapWarning, stacklevel=3)
+    usual = "y" if kind in Y_UP_KINDS else "z"
+    axis, what = up or usual, f"path = '{path}'"
+    if len(triangles) and np.isfinite(vertices[triangles]).all():
+        if up is None:
+            why = ", against the specification of glTF" if usual == "y" else ""
+            warn_of_axis(what, _axis_up(vertices * notes.unit_m, triangles, usual), axis, why)
+        vertices = vertices @ TURNS[axis].T
+        turn = levelling(what, surfaces_of(vertices[triangles] * notes.unit_m), notes)
+        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        vertices = (vertices - middle) @ turn.T + middle if turn[2, 2] < 1.0 else vertices
     reason = "up" if up else "the specification of glTF" if axis == "y" else "the default"
     notes.notes.append(f"{axis} of the file points up ({reason})")
     return _joined(path, [(vertices, triangles)], [0], (None,), notes)
@@ -168,14 +170,15 @@ def _joined(
     return mesh
 
 
-def _looks_y_up(vertices_m: Floats, triangles: NDArray[np.int64]) -> bool:
+def _axis_up(vertices_m: Floats, triangles: NDArray[np.int64], usual: str) -> str:
     corners = vertices_m[triangles]
-    if not np.isfinite(corners).all() or not len(corners):
-        return False
     extent = corners.max(axis=(0, 1)) - corners.min(axis=(0, 1))
     area = np.abs(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]))
     facing = np.bincount(np.argmax(area, axis=1), weights=np.linalg.norm(area, axis=1), minlength=3)
-    return looks_y_up(extent, facing[1], facing[2])
+    other = "z" if usual == "y" else "y"
+    order = [0, 1, 2] if other == "y" else [0, 2, 1]
+    axis = other if looks_y_up(extent[order], *facing[order[1:]]) else usual
+    return f"-{axis}" if mesh_ends(corners @ TURNS[axis].T).upside_down else axis
 
 
 def read_mitsuba_scene(path: Path, notes: ImportNotes | None = None) -> SceneMesh:

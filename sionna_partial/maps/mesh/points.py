@@ -9,10 +9,10 @@ import os
 import re
 import struct
 import warnings
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -30,13 +30,23 @@ from sionna_partial.maps.mesh.cells import (
     DEFAULT_RESOLUTION_M,
     MeshReading,
     fitted_grid,
-    looks_y_up,
     narrow_areas,
     observed_cells,
     require_metres,
     warn_of_feet,
 )
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.mesh.upright import (
+    END_M,
+    FURNITURE_M,
+    TURNS,
+    Ends,
+    levelling,
+    looks_y_up,
+    plateaus_m2,
+    surfaces_of_points,
+    warn_of_axis,
+)
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.process import njit
 
 MAX_CLOUD_BYTES = 20_000_000_000
@@ -80,7 +90,25 @@ area."""
 POSE_M = 0.25
 """Sensor positions closer than this are merged [m]."""
 
+SAMPLED = 50_000
+"""Points of a part from which the direction up is found."""
+
+PLATE_LAYERS, MAX_PLATE_CELLS = 3, 25_000_000
+"""Most layers of a flat surface, and most cells in which such surfaces are searched."""
+
 _HALF, _BITS = 1 << 20, 21
+
+
+class _Axes(NamedTuple):
+    """Rotation and shift [m] from the axes of a cloud to the world."""
+
+    turn: Floats
+    shift_m: Floats
+
+    def world(self, points_m: Floats) -> Floats:
+        if np.array_equal(self.turn, np.eye(3)):
+            return points_m
+        return points_m @ self.turn.T + self.shift_m
 
 
 def map_from_points(
@@ -135,7 +163,10 @@ def map_from_points(
         cloud = real_array("points", points, MapError, "give x, y, z in metres, (N, 3), or the path of a file.")
         if cloud.ndim != 2 or cloud.shape[1] != 3:
             raise MapError(f"points has shape {cloud.shape}: give x, y, z in metres, (N, 3), or the path of a file.")
-        parts = (cloud[start : start + PART] for start in range(0, len(cloud), PART))
+
+        def parts() -> Iterator[NDArray[Any]]:
+            return (cloud[start : start + PART] for start in range(0, len(cloud), PART))
+
         partial = _cloud_map("points", parts, reading, sensor_positions_m, reading.notes("points"))
     return partial if wall_height_m is None else replace(partial, wall_height_m=wall_height_m)
 
@@ -150,12 +181,20 @@ def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None
         open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream,
         decoding(path, f"no {kind.upper()}", MapError),
     ):
-        return _cloud_map(f"path = '{path}'", reader(stream), reading, sensor_positions_m, reading.notes(path))
+
+        def parts() -> Iterator[Floats]:
+            stream.seek(0)
+            return reader(stream)
+
+        return _cloud_map(f"path = '{path}'", parts, reading, sensor_positions_m, reading.notes(path))
 
 
 def is_cloud(path: Path) -> bool:
     with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
         header, end, _ = stream.read(100_000).partition(b"end_header")
+    if end and re.search(rb"^element\s+tristrips\s+[1-9]", header, re.MULTILINE):
+        remedy = "save it with faces, such as by MeshLab or Blender."
+        raise MapError(f"path = '{path}' holds triangle strips, which are not read: {remedy}")
     return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
 
 
@@ -273,21 +312,26 @@ def _require_count(count: int, announced: int) -> None:
 
 def _cloud_map(
     what: str,
-    parts: Iterable[NDArray[Any]],
+    parts: Callable[[], Iterable[NDArray[Any]]],
     reading: MeshReading,
     sensor_positions_m: ArrayLike | None,
     notes: ImportNotes,
 ) -> PartialMap:
     cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
     cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
-    sensors = _sensors(sensor_positions_m, reading.up)
-    voxels, count, heights_m = _occupied_voxels(what, parts, cell, reading, notes)
+    axes = _Axes(TURNS[reading.up or "z"], np.zeros(3))
+    voxels, count, heights_m, sample = _occupied_voxels(what, parts(), cell, axes, reading, notes)
     size = np.array([cell, cell, LAYER_M])
     bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
     require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
-    if reading.up is None and _looks_y_up(voxels, bounds):
-        message = f'{what} looks as if y pointed up: give up="y" to turn it, or up="z" to read it as it is.'
-        warnings.warn(message, MapWarning, stacklevel=4)
+    found = "z" if reading.up is not None else _axis_up(voxels, bounds, cell)
+    warn_of_axis(what, found, "z")
+    turn = levelling(what, surfaces_of_points(sample), notes) if found.endswith("z") else np.eye(3)
+    if turn[2, 2] < 1.0:
+        axes = _Axes(turn @ axes.turn, bounds.mean(axis=0) - turn @ bounds.mean(axis=0))
+        voxels, count, heights_m, _ = _occupied_voxels(what, parts(), cell, axes, reading, ImportNotes(what))
+        bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
+    sensors = _sensors(sensor_positions_m, reading.up, axes)
     empty = fitted_grid(bounds, cell)
     if sensors is not None:
         x0, y0, x1, y1 = empty.bounds_m
@@ -319,26 +363,35 @@ def _cloud_map(
     return reading.attached(notes, replace(empty, state=state, wall_height_m=round(height_m, 2)))
 
 
-def _sensors(given: ArrayLike | None, up: str | None) -> Floats | None:
+def _sensors(given: ArrayLike | None, up: str | None, axes: _Axes) -> Floats | None:
     if given is None:
         return None
     remedy = "give x, y (and z) in metres, (M, 2) or (M, 3)."
     positions = float_array("sensor_positions_m", given, MapError, remedy)
     if positions.ndim != 2 or positions.shape[1] not in (2, 3) or not np.isfinite(positions).all():
         raise MapError(f"sensor_positions_m has shape {positions.shape} or values that are not finite: {remedy}")
-    if up == "y":
-        if positions.shape[1] == 2:
-            raise MapError('sensor_positions_m has shape (M, 2) with up = "y": give x, y, z of the cloud, (M, 3).')
-        positions = positions[:, [0, 2]] * (1.0, -1.0)
+    if positions.shape[1] == 2 and up not in (None, "z"):
+        raise MapError(f'sensor_positions_m has shape (M, 2) with up = "{up}": give x, y, z of the cloud, (M, 3).')
+    if positions.shape[1] == 3:
+        positions = axes.world(positions)
     flat = positions[:, :2]
     return flat[np.unique(np.floor(flat / POSE_M), axis=0, return_index=True)[1]]
 
 
 def _occupied_voxels(
-    what: str, parts: Iterable[NDArray[Any]], cell_m: float, reading: MeshReading, notes: ImportNotes
-) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]]]:
-    """Return voxels x, y, z (V, 3), their numbers of points, and count and sum of heights [m] of each layer."""
+    what: str,
+    parts: Iterable[NDArray[Any]],
+    cell_m: float,
+    axes: _Axes,
+    reading: MeshReading,
+    notes: ImportNotes,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]], Floats]:
+    """Return voxels x, y, z (V, 3), their numbers of points, count and sum of heights [m] of each layer, and a sample.
+
+    Points are in the world's axes.
+    """
     heights_m: dict[int, tuple[int, float]] = {}
+    sample: list[Floats] = []
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
     for part in parts:
         points = part[np.isfinite(part).all(axis=1)].astype(np.float64) * (reading.unit_m or 1.0)
@@ -348,8 +401,8 @@ def _occupied_voxels(
             continue
         if np.abs(points).max() > MAX_COORDINATE_M:
             raise MapError(f"{what} holds coordinates above {MAX_COORDINATE_M:g} m: give a cloud in metres.")
-        if reading.up == "y":
-            points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
+        points = axes.world(points)
+        sample.append(points[:: max(1, len(points) // SAMPLED)])
         index = np.floor(points / (cell_m, cell_m, LAYER_M) + 1e-9).astype(np.int64)
         base = index[0].copy() if base is None else base
         layers, inverse = np.unique(index[:, 2], return_inverse=True)
@@ -369,7 +422,8 @@ def _occupied_voxels(
         raise MapError(f"{what} holds no finite point: give a cloud with x, y, z in metres.")
     keys, counts = _merged(pending)
     mask = (1 << _BITS) - 1
-    return np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base, counts, heights_m
+    voxels = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base
+    return voxels, counts, heights_m, np.concatenate(sample)
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -413,10 +467,33 @@ def _floor_and_ceiling(
     return floor_m, next((slab for slab in slabs_m if slab >= floor_m + LOWEST_CEILING_M), None)
 
 
-def _looks_y_up(voxels: NDArray[np.int64], bounds: Floats) -> bool:
+def _axis_up(voxels: NDArray[np.int64], bounds: Floats, cell_m: float) -> str:
     layers = [np.bincount(voxels[:, axis] - voxels[:, axis].min()) for axis in (1, 2)]
     fullest = [np.convolve(cells, (1, 1)).max() for cells in layers]
-    return looks_y_up(np.ptp(bounds, axis=0), *fullest)
+    axis = "y" if looks_y_up(np.ptp(bounds, axis=0), *fullest) else "z"
+    size = (cell_m, cell_m, LAYER_M)
+    centres = (voxels + 0.5) * size @ TURNS[axis].T
+    ends = []
+    for height_m in (centres[:, 2] - centres[:, 2].min(), centres[:, 2].max() - centres[:, 2]):
+        plates = _plates(centres[height_m < END_M], cell_m)
+        ends.append((plates, _plates(centres[(height_m > FURNITURE_M[0]) & (height_m < FURNITURE_M[1])], cell_m)))
+    (floor_m2, low_m2), (ceiling_m2, high_m2) = ends
+    return f"-{axis}" if Ends(floor_m2, ceiling_m2, low_m2, high_m2).upside_down else axis
+
+
+def _plates(points_m: Floats, cell_m: float) -> float:
+    """Return the area of flat surfaces between two heights [m²]: columns with few points, as wide as furniture."""
+    if not len(points_m):
+        return 0.0
+    cell_m = max(cell_m, LAYER_M)
+    index = np.floor(points_m[:, :2] / cell_m).astype(np.int64)
+    index -= index.min(axis=0)
+    nx, ny = (index.max(axis=0) + 1).tolist()
+    if nx * ny > MAX_PLATE_CELLS:
+        return 0.0
+    layers = np.bincount(index[:, 0] * ny + index[:, 1], minlength=nx * ny).reshape(nx, ny)
+    cells = (layers > 0) & (layers <= PLATE_LAYERS)
+    return plateaus_m2(cells, cell_m)
 
 
 def _without_strays(free: Bools, cell_m: float) -> Bools:
