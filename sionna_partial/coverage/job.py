@@ -43,7 +43,7 @@ from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
-from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.assimilation import GAIN_OFFSET_STD_DB, Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
     Measurements,
@@ -64,8 +64,8 @@ TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAnten
 POSITIONS = 8
 """Number of positions over which the coverage of an unknown transmitter is averaged."""
 
-LARGE_OFFSET_DB = 15.0
-"""Smallest offset of measurements that is logged [dB]."""
+OFFSET_DEVIATIONS = 2.0
+"""Offset of measurements that is logged, in standard deviations of its estimate and of the offset of path gains."""
 
 UNSURE_P = 0.05
 """Smallest logged probability of the less probable kind of measurements."""
@@ -459,10 +459,14 @@ def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: floa
 def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
     of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
     noise_db, offset_db, shadow_scale = source.weights @ of_each
-    if abs(offset_db) > LARGE_OFFSET_DB:
+    square_db2 = source.weights @ [each.offset_std_db**2 + each.offset_db**2 for each in source.assimilations]
+    error_db = math.sqrt(max(0.0, square_db2 - offset_db**2))
+    if abs(offset_db) > OFFSET_DEVIATIONS * math.hypot(error_db, GAIN_OFFSET_STD_DB):
         _log.warning(
-            "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
+            "measured gains are %.0f ± %.1f dB %s the predicted ones: taken for an offset, as of transmit power and "
+            "antennas",
             abs(offset_db),
+            error_db,
             "above" if offset_db > 0 else "below",
         )
     return {

@@ -116,14 +116,18 @@ class Kind(NamedTuple):
         return log_p, mean + left @ change, left + within
 
 
+GAIN_OFFSET_STD_DB = 2.0
+"""Prior standard deviation of a common offset of path gains [dB]."""
+
 KINDS = (
-    Kind((0.0, 1.0), np.diag([2.0, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
+    Kind((0.0, 1.0), np.diag([GAIN_OFFSET_STD_DB, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
     Kind((0.0, 0.5), np.diag([40.0, 0.2]) ** 2, 4.0, 3.0, math.inf, True),
 )
 """Traced path gains, and powers at a real radio, with shadows filled by objects missing on maps."""
 
 KINDS_THROUGH_WALLS = tuple(
-    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False) for offset_db in (2.0, 40.0)
+    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False)
+    for offset_db in (GAIN_OFFSET_STD_DB, 40.0)
 )
 """Gains and powers through walls whose loss is from zero to over twice the expected loss."""
 
@@ -484,6 +488,14 @@ class Assimilation(Shown):
     def tx_m(self) -> Floats:
         """Transmitter (3,) [m]."""
         return self._links.tx_m
+
+    @property
+    def offset_std_db(self) -> float:
+        """Standard error of `offset_db` [dB]."""
+        fits = [fit for fit in self._fits if fit is not None]
+        weights = self.material_weights[self.material_weights > 0.0]
+        square_db2 = weights @ [fit.common[0, 0] + fit.offset_db**2 for fit in fits]
+        return math.sqrt(max(0.0, float(square_db2) - self.offset_db**2))
 
     @classmethod
     def fit(
