@@ -6,24 +6,21 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr, logsumexp
 
-from sionna_partial.arrays import Bools, Floats, States, grid_edges, read_only
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
+from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.wall_materials import (
@@ -37,12 +34,6 @@ from sionna_partial.prediction.wall_materials import (
     mean_square,
 )
 from sionna_partial.settings import FREQUENCIES_HZ
-
-CELL_M = 0.3
-"""Smallest edge of the cells of walks [m]."""
-
-UNKNOWN_COST = 3.0
-"""Cost of a walk through unknown cells, relative to free cells."""
 
 UNSEEN_RANGE_M = 12.0
 """Correlation length of residuals if both links have an end in an unseen cell [m]."""
@@ -159,59 +150,12 @@ _LEAST_EXPLAINED = 1e-6
 _LEAST_P = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Walks:
-    """Lengths of walks from P points around walls, longer through unknown cells."""
-
-    partial: PartialMap
-    points_m: Floats
-    longest_m: float
-
-    def lengths_m(self, points_m: Floats) -> Floats:
-        """Return the lengths (P, N) of walks to points (N, 3) [m], infinite beyond `longest_m`."""
-        straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
-        return np.maximum(self._lengths_m[:, self._cell_at(points_m)], straight_m)
-
-    def correlation(self, points_m: Floats, kind: Kind, *, tx_seen: bool) -> Floats:
-        """Return the correlation (P, N) of residuals at points (N, 3) [m]."""
-        walks_m = self.lengths_m(points_m)
-        seen = [tx_seen & (self.partial.state_at(each_m) == CellState.FREE) for each_m in (self.points_m, points_m)]
-        range_m = np.where(seen[0][:, None] | seen[1], kind.seen_range_m, UNSEEN_RANGE_M)
-        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
-
-    @cached_property
-    def _step(self) -> int:
-        return max(1, round(CELL_M / self.partial.resolution_m))
-
-    @cached_property
-    def _blocks(self) -> tuple[States, Floats]:
-        return aligned_blocks(self.partial, self._step)
-
-    @cached_property
-    def _cost(self) -> Floats:
-        blocks, _ = self._blocks
-        unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
-        return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
-
-    @cached_property
-    def _nearest(self) -> NDArray[np.intp]:
-        cell = ndimage.distance_transform_edt(self._cost == 0.0, return_distances=False, return_indices=True)
-        return np.ravel_multi_index(tuple(cell), self._cost.shape)
-
-    @cached_property
-    def _lengths_m(self) -> NDArray[np.float32]:
-        ends, costs = grid_edges(self._cost)
-        lengths_m = costs * self._step * self.partial.resolution_m
-        graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
-        cells, index = np.unique(self._cell_at(self.points_m), return_inverse=True)
-        if not len(cells):
-            return np.zeros((0, self._cost.size), dtype=np.float32)
-        return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
-
-    def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:
-        cells = np.round(points_m[:, :2] - self._blocks[1], 9) / (self._step * self.partial.resolution_m)
-        column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._cost.shape)[::-1] - 1).T
-        return self._nearest[row, column]
+def correlation(walks: Walks, points_m: Floats, kind: Kind, *, tx_seen: bool) -> Floats:
+    """Return the correlation (P, N) of residuals at the points of walks and at points (N, 3) [m]."""
+    walks_m = walks.lengths_m(points_m)
+    seen = [tx_seen & (walks.partial.state_at(each_m) == CellState.FREE) for each_m in (walks.points_m, points_m)]
+    range_m = np.where(seen[0][:, None] | seen[1], kind.seen_range_m, UNSEEN_RANGE_M)
+    return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +172,7 @@ class _Links:
         return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
 
     def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
-        return self.walks.correlation(rx_m, kind, tx_seen=self.tx_seen)
+        return correlation(self.walks, rx_m, kind, tx_seen=self.tx_seen)
 
 
 class _Sample(NamedTuple):
@@ -658,13 +602,13 @@ class Assimilation(Shown):
 
 
 def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Group measurements (M,) by the cells of the finest grid with at most `most` groups.
+    """Group measurements (M,) by the cells of the finest grid about their middle with at most `most` groups.
 
     Return the first measurement of each group, the group of each measurement, and the group sizes.
     """
-    edge_m = 0.01
+    edge_m, middle_m = 0.01, 0.5 * (rx_m.min(axis=0, initial=np.inf) + rx_m.max(axis=0, initial=-np.inf))
     while True:
-        keys = np.column_stack([np.floor(rx_m / edge_m), received])
+        keys = np.column_stack([np.round((rx_m - middle_m) / edge_m), received])
         _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
         if len(first) <= most:
             return first, group.ravel(), count

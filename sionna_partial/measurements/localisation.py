@@ -18,12 +18,13 @@ from sionna_partial.measurements.assimilation import (
     FREE_P_POWERS,
     LIKELY_NOISE_DB,
     Kind,
-    Walks,
+    correlation,
     grouped,
     kinds_through_walls,
     positive,
 )
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.wall_materials import FADINGS_DB, OWN_WEIGHT, RESIDUAL_DB, Residuals, log_std_prior
@@ -182,12 +183,12 @@ def _log_process(
     kinds = kinds_through_walls(len(materials[0]))
     log_p = np.empty((len(kinds), len(points_m)))
     for tx_seen in (True, False):
-        correlation = positive(walks.correlation(measured.rx, kinds[0], tx_seen=tx_seen))
+        correlated = positive(correlation(walks, measured.rx, kinds[0], tx_seen=tx_seen))
         at = np.flatnonzero(seen == tx_seen)
         for some in (at[first : first + BLOCK] for first in range(0, len(at), BLOCK)):
             residuals_db = above_db[some], below_db[some], std_db[some]
             for number, kind in enumerate(kinds):
-                of_material = _log_evidence(kind, correlation, received, *residuals_db, noise_db)
+                of_material = _log_evidence(kind, correlated, received, *residuals_db, noise_db)
                 log_p[number, some] = logsumexp(of_material + np.log(weights[0]), axis=1)
     return log_p
 
