@@ -61,7 +61,7 @@ RECEIVERS = ("indoor", "anywhere")
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
 
-POSITIONS = 8
+POSITIONS = 4
 """Number of positions over which the coverage of an unknown transmitter is averaged."""
 
 OFFSET_DEVIATIONS = 2.0
@@ -117,7 +117,7 @@ def predict_map(
     255.
 
     Without `tx`, measurements locate the transmitter: `p_transmitter` is the posterior of its position, and
-    probabilities and gains are averaged over 8 positions drawn from it.
+    probabilities and gains are averaged over 4 positions drawn from it.
 
     Parameters
     ----------
@@ -327,7 +327,8 @@ class CoverageJob:
             measured = Measurements(position_m, np.zeros((0, 3)), np.zeros(0))
         if measured is not None:
             for at_m, p in zip(tx_m, p_powers, strict=True):
-                options = {"p_powers": p, "others": others}
+                walks = assimilations[0].walks if assimilations else None  # of the same receivers
+                options = {"p_powers": p, "others": others, "walks": walks}
                 assimilations.append(self._assimilated(at_m, measured, transmitter.antenna, **options))
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 

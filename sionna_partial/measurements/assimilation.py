@@ -141,7 +141,7 @@ BETWEEN_STDS = tuple(itertools.product((1.5, 3.0, 6.0, 9.0), (0.1, 0.2, 0.3)))
 LIKELY_BETWEEN, BETWEEN_SPREAD = (3.0, 0.2), 0.5
 """Most probable of them a priori, and the standard deviation of their logarithms."""
 
-MOST_POINTS = 500
+MOST_POINTS = 300
 """Number of positions above which neighbours are averaged."""
 
 _SWEEPS, _DAMPING = 8, 0.5
@@ -434,6 +434,11 @@ class Assimilation(Shown):
         return self._links.tx_m
 
     @property
+    def walks(self) -> Walks:
+        """Walks from the measured receivers."""
+        return self._links.walks
+
+    @property
     def offset_std_db(self) -> float:
         """Standard error of `offset_db` [dB]."""
         fits = [fit for fit in self._fits if fit is not None]
@@ -454,6 +459,7 @@ class Assimilation(Shown):
         p_powers: float | None = None,
         through_walls: bool = False,
         others: Sequence[Assimilation] = (),
+        walks: Walks | None = None,
     ) -> Assimilation:
         """Fit the process to measurements.
 
@@ -475,6 +481,8 @@ class Assimilation(Shown):
             True for a trace through walls, of a real radio: the loss of walls is inferred, and no trace is certain.
         others : sequence of Assimilation
             Fits to other transmitters of the building through walls, which inform losses and offsets.
+        walks : Walks, optional
+            `walks` of a fit to the same receivers on the same map, which saves time.
 
         Raises
         ------
@@ -506,7 +514,9 @@ class Assimilation(Shown):
             p_powers = FREE_P_POWERS if through_walls else p_powers
         p_powers = min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P)
         longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in (*KINDS, *KINDS_THROUGH_WALLS)))
-        links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
+        if walks is None or walks.partial is not partial or not np.array_equal(walks.points_m, sample.rx_m):
+            walks = Walks(partial, sample.rx_m, longest_m)
+        links = _Links(walks, tx_m, float(frequency_hz))
         if through_walls:
             return cls._through_walls(sample, links, prior, p_powers, others)
         hypotheses = _hypotheses(sample, links, prior, KINDS, p_powers)

@@ -28,6 +28,10 @@ _HIDDEN, _SAME, _STEP_M = 10.0, 1e-6, 1e-9
 """Distance [blocks] added to blocks out of sight, difference of equal distances, and length of the step to a block."""
 
 
+_AT_ONCE = 32
+"""Number of points whose walks are found at once."""
+
+
 @dataclass(frozen=True, eq=False)
 class Walks:
     """Lengths of walks from P points around walls, longer through unknown cells."""
@@ -95,8 +99,11 @@ class Walks:
         lengths_m = np.concatenate([np.tile(steps * self._edge_m, 2), np.full(starts.shape[1], _STEP_M)])
         rows, columns = np.concatenate([ends, ends[::-1], starts], axis=1)
         graph = csr_array((lengths_m, (rows, columns)), shape=(costs.size + count,) * 2)
-        found_m = dijkstra(graph, indices=costs.size + np.arange(count), limit=self.longest_m)
-        return found_m[:, : costs.size].astype(np.float32)
+        found_m = np.empty((count, costs.size), dtype=np.float32)
+        for first in range(0, count, _AT_ONCE):  # its result has double precision
+            sources = costs.size + np.arange(first, min(first + _AT_ONCE, count))
+            found_m[first : first + _AT_ONCE] = dijkstra(graph, indices=sources, limit=self.longest_m)[:, : costs.size]
+        return found_m
 
     def _blocks_at(self, points_m: Floats) -> NDArray[np.intp]:
         """Return the open blocks (N, K) in sight whose centres are nearest to points (N, 3) [m].
