@@ -94,16 +94,16 @@ def _columns(
 ) -> Columns:
     _, header = next(rows, (0, [""]))
     header = [header[0].lstrip(f"{_COMMENT} "), *header[1:]] if header else [""]
-    columns = [(at, names[name.lower()]) for at, name in enumerate(header) if name.lower() in names]
-    for name in dict.fromkeys(name for _, name in columns if name not in texts):
-        same = [header[at] for at, other in columns if other == name]
+    known = [(at, names[name.lower()]) for at, name in enumerate(header) if name.lower() in names]
+    for name in dict.fromkeys(name for _, name in known if name not in texts):
+        same = [header[at] for at, other in known if other == name]
         if len(same) > 1:
             raise error(f"{given} has {len(same)} columns of {name} ({', '.join(same)}): keep one of them, or name it.")
-    columns = [*{name: at for at, name in reversed(columns)}.items()]
+    columns = {name: at for at, name in reversed(known)}
     others = [name for name in header if name.lower() not in names]
-    found = Columns({}, {}, {name: header[at] for name, at in columns}, [], others)
-    for name, _ in columns:
-        (found.texts if name in texts else found.numbers)[name] = []  # type: ignore[index]
+    found = Columns({}, {}, {name: header[at] for name, at in columns.items()}, [], others)
+    found.texts.update({name: [] for name in columns if name in texts})
+    found.numbers.update({name: [] for name in columns if name not in texts})
     for line, row in rows:
         if not any(row) or row[0].startswith(_COMMENT):
             continue
@@ -111,7 +111,7 @@ def _columns(
             what = f"has {len(row)} cells for {len(header)} columns"
             raise error(f"{given}, line {line} {what}: {_MEANT}.")
         found.lines.append(line)
-        for name, at in columns:
+        for name, at in columns.items():
             text = row[at] if at < len(row) else ""
             if name in texts:
                 found.texts[name].append(text)

@@ -293,6 +293,30 @@ def _hypotheses(
             yield each._replace(log_p=log_p + each.log_evidence(received))
 
 
+class _Posterior(NamedTuple):
+    """Probability of each kind, candidate material, and standard deviation of process and fading: (2, K, S, N)."""
+
+    joint: Floats
+
+    @classmethod
+    def of(cls, log_p: Floats) -> _Posterior:
+        return cls(np.exp(log_p - logsumexp(log_p)))
+
+    @property
+    def of_material(self) -> Floats:
+        """Probability (K,) of each material."""
+        kinds, _, processes, fadings = range(4)
+        return np.asarray(self.joint.sum(axis=(kinds, processes, fadings)))
+
+    def given(self, material: int) -> tuple[int, float, float]:
+        """Return the most probable kind given a material, and its deviations of process and fading [dB]."""
+        of_kind = self.joint[:, material].sum(axis=(1, 2))
+        kind = int(of_kind.argmax())
+        weights = self.joint[kind, material] if of_kind[kind] > 0.0 else np.ones(self.joint.shape[2:])
+        process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
+        return kind, process_db, mean_square(FADINGS_DB, weights.sum(axis=0))
+
+
 class _Compared(NamedTuple):
     """Measurements of one transmitter through walls, and their kinds under K candidate materials."""
 
@@ -318,7 +342,8 @@ class _Compared(NamedTuple):
         correlation = positive(links.correlation(sample.rx_m, kinds[0]))
         return cls(sample, links, materials, learnt, correlation)
 
-    def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def posterior(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[_Posterior, Floats]:
+        """Return the posterior, and the log-evidence (K, S, N) that these measurements are for other transmitters."""
         received = self.sample.received
         below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))
         parts = []
@@ -338,14 +363,14 @@ class _Compared(NamedTuple):
         log_prior = np.log(weights)[:, None, None] + log_std_prior()
         for other in others:
             log_prior = log_prior + OTHERS_WEIGHT * _fitting(other, len(weights))
-        return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
+        return _Posterior.of(OWN_WEIGHT * evidence + log_prior), logsumexp(evidence, axis=0)
 
-    def fit(self, k: int, p: Floats) -> _Fit:
-        best, fading_db = self._hypothesis(k, p)
+    def fit(self, material: int, posterior: _Posterior) -> _Fit:
+        best, fading_db = self._hypothesis(material, posterior)
         return _Fit.of(best, self.sample.received, fading_db)
 
-    def in_common(self, k: int, p: Floats) -> tuple[Floats, Floats]:
-        return self._hypothesis(k, p)[0].in_common(self.sample.received)
+    def in_common(self, material: int, posterior: _Posterior) -> tuple[Floats, Floats]:
+        return self._hypothesis(material, posterior)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
         """Return averages (P,) of prior above free space, measurement above prior, and the prior's deviation [dB]."""
@@ -358,16 +383,12 @@ class _Compared(NamedTuple):
         std_db = self.sample.measured.std_db
         return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
 
-    def _hypothesis(self, k: int, p: Floats) -> tuple[_Hypothesis, float]:
-        """Return the most probable kind under candidate k, and the fading [dB]."""
-        of_kind = p.sum(axis=(1, 2))
-        number = int(of_kind.argmax())
-        weights = p[number] if of_kind[number] > 0.0 else np.ones(p.shape[1:])
-        process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
-        fading_db = mean_square(FADINGS_DB, weights.sum(axis=0))
+    def _hypothesis(self, material: int, posterior: _Posterior) -> tuple[_Hypothesis, float]:
+        """Return the most probable kind under a candidate material, and the fading [dB]."""
+        number, process_db, fading_db = posterior.given(material)
         noise_db = float(np.hypot(fading_db, self._given_db))
-        below_db, above_db, std_db = self._levels(self.materials[k])
-        kind = self.kinds[k][number]._replace(trace_std_db=process_db)
+        below_db, above_db, std_db = self._levels(self.materials[material])
+        kind = self.kinds[material][number]._replace(trace_std_db=process_db)
         scale_db = np.hypot(std_db, process_db)
         residual = (above_db - kind.mean[0] - (kind.mean[1] - 1.0) * below_db) / scale_db
         design = np.stack([np.ones(len(residual)), below_db]) / scale_db
@@ -534,15 +555,14 @@ class Assimilation(Shown):
     ) -> Assimilation:
         materials, weights = prior.by_material
         compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
-        log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
-        p = np.exp(log_p - logsumexp(log_p))
-        of_material = p.sum(axis=(0, 2, 3))
+        posterior, evidence = compared.posterior(p_powers, weights, [other._log_evidence for other in others])
+        of_material = posterior.of_material
         kept = of_material > LEAST_WEIGHT * (len(materials) > 1)
-        fits = tuple(compared.fit(k, p[:, k]) if kept[k] else None for k in range(len(materials)))
+        fits = tuple(compared.fit(k, posterior) if kept[k] else None for k in range(len(materials)))
         of_material = np.where(kept, of_material, 0.0) / of_material[kept].sum()
         common = [(fit.noise_db, fit.offset_db, fit.factor) for fit in fits if fit is not None]
         noise_db, offset_db, factor = (of_material[kept] @ common).tolist()
-        in_common = tuple(compared.in_common(k, p[:, k]) for k in range(len(materials)))
+        in_common = tuple(compared.in_common(k, posterior) for k in range(len(materials)))
         return cls(noise_db, offset_db, factor, of_material, links, fits, in_common, evidence)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:

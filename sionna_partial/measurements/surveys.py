@@ -261,11 +261,11 @@ def _read_plan_survey(source: Path, pixel_m: float | None) -> Columns:
         raise MeasurementError(f"{given} has positions in pixels of the plan {plan!r}, which is not there: {remedy}.")
     with decoding(picture, "no picture", MeasurementError), Image.open(picture) as image:
         height = image.size[1]
-    numbers = {"rx_x": xy[:, 0] * pixel_m, "rx_y": (height - xy[:, 1]) * pixel_m, "power_dbm": power_dbm}
+    xy_m = [xy[:, 0] * pixel_m, (height - xy[:, 1]) * pixel_m]
+    numbers = {"rx_x": xy_m[0].tolist(), "rx_y": xy_m[1].tolist(), "power_dbm": power_dbm}
     headers = {"rx_x": "x", "rx_y": "y", "power_dbm": "rssi"}
     texts = {kind: [str(row.get(kind) or "") for row in rows] for kind in ("bssid", "ssid")}
-    lists = {name: [*map(float, values)] for name, values in numbers.items()}
-    return Columns(lists, texts, headers, [*range(1, len(rows) + 1)], [])
+    return Columns(numbers, texts, headers, [*range(1, len(rows) + 1)], [])
 
 
 def _read_recording(path: Path) -> Survey:
