@@ -22,10 +22,13 @@ predictions are Gaussian, with the standard deviation of their own errors for th
 
 With --locate, the position of each transmitter is unknown instead, and estimated from 40 of its 60 random powers, drawn
 several times; the 12 transmitters of procedural buildings have the same 60 receivers, and other errors in each draw.
+With --time, the processor time of a coverage from 20 and from all powers of the first transmitter, whose position is
+unknown, is printed instead, in predictions of its coverage.
 """
 
 import argparse
 import csv
+import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -77,6 +80,7 @@ def main() -> None:
     parser.add_argument("--material", default="unknown", help="of the walls; unknown is the default of SceneSettings")
     parser.add_argument("--opaque-walls", action="store_true")
     parser.add_argument("--locate", action="store_true", help="estimate positions of transmitters instead")
+    parser.add_argument("--time", action="store_true", help="time of coverages from an unknown position instead")
     parser.add_argument("--half", action="store_true", help="hide each half of the plan in turn: left, right, ...")
     parser.add_argument("--transmitters", type=int, help="number of transmitters that are read of each floor")
     parser.add_argument("--draws", type=int, default=20)
@@ -96,6 +100,9 @@ def main() -> None:
             print(f"\n{name}: no transmitter with a known position and {POINTS} powers")
             continue
         trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
+        if arguments.time:
+            print_times(name, sp.LinkModel(partial, None, trace, scene), next(iter(links.values())))
+            continue
         maps = halves(partial) if arguments.half else [partial]
         if arguments.locate:
             located.append(locate(sp.LinkModel(partial, None, trace, scene), links, arguments.draws))
@@ -114,7 +121,7 @@ def main() -> None:
             leads[method].append(figures[:2] - table["ours"][:2])
     if arguments.locate:
         print_located("all", np.concatenate(located))
-    if arguments.locate or arguments.repeats:
+    if arguments.locate or arguments.repeats or arguments.time:
         return
     print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
     print(
@@ -143,6 +150,18 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
             inside = likely_region(probability)[np.where(probability > 0.0, apart_m, np.inf).argmin()]
             found.append((np.linalg.norm(posterior.position_m - tx_m), inside))
     return np.array(found)
+
+
+def print_times(name: str, model: sp.LinkModel, rows: Floats) -> None:
+    """Print the times of coverages from an unknown position, in predictions."""
+    tx_m, nowhere, spent_s = rows[0, :3], (np.nan, np.nan, rows[0, 2]), []
+    measured = [sp.Measurements(nowhere, rows[:count, 3:6], rows[:count, 6]) for count in (20, len(rows))]
+    for tx, measurements in ((tx_m + 0.01, None), (tx_m, None), *((None, each) for each in measured)):
+        began_s = time.process_time()
+        model.coverage(tx, measurements=measurements)
+        spent_s.append(time.process_time() - began_s)
+    numbers = ", ".join(f"{each_s / spent_s[1]:.1f}" for each_s in spent_s[2:])
+    print(f"{name}: {numbers} predictions of {spent_s[1]:.1f} s from 20 and {len(rows)} powers", flush=True)
 
 
 def print_located(name: str, found: Floats) -> None:

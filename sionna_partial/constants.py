@@ -11,6 +11,9 @@ CARRIER_FREQUENCY_HZ = 28e9
 GAIN_FLOOR_DB = -150.0
 """Smallest omnidirectional path gain, and the gain of an outage [dB] (paper, eq. 5)."""
 
+LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
+"""Limits of measured gains [dB]; others have another unit or sign. Noise may take an outage below -150 dB."""
+
 NO_RECEIVER = 255
 """Link state where no receiver can be, or no link was traced."""
 

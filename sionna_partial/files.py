@@ -1,6 +1,5 @@
 """Input of bounded size; output that is written completely or not at all, by one process at a time."""
 
-import csv
 import errno
 import io
 import os
@@ -24,8 +23,6 @@ if TYPE_CHECKING:
 SCENE_FILES = ("scene.xml", "map.yaml")
 
 CALIBRATED_FILE = "calibrated.npz"
-
-MAX_CSV_BYTES = 100_000_000
 
 LOCK_FILE = ".lock"
 
@@ -206,60 +203,6 @@ def _blocks_written(sources: list[Any], targets: list[Any]) -> Iterator[None]:
         for target, region, block in zip(targets, regions, blocks, strict=True):
             target[region] = block
         yield
-
-
-def read_columns(
-    path: str | os.PathLike[str], field: str, error: type[SionnaPartialError], names: Mapping[str, str], remedy: str
-) -> tuple[dict[str, list[float]], list[str]]:
-    """Return the columns of a CSV by name, and the other headers, or raise an `error`.
-
-    `names` maps known headers, in lower case, to names of columns.
-    """
-    given = f"{field} = '{path}'"
-    try:
-        text = read_bytes(path, field, error, MAX_CSV_BYTES, "leave lines out.").decode("utf-8-sig")
-    except UnicodeDecodeError as cause:
-        raise error(f"{given} cannot be read ({cause}): {remedy}") from cause
-    if text and text[-1] not in "\r\n":
-        last = text.splitlines()[-1][-40:]
-        raise error(
-            f"{given} ends in {last!r}, without a line end: the file may be cut. Copy it again, or add a line end."
-        )
-    rows = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    try:
-        return _columns(given, rows, error, names)
-    except csv.Error as cause:
-        raise error(f"{given}, line {rows.line_num} cannot be read ({cause}): {remedy}") from cause
-
-
-def _columns(
-    given: str, rows: Any, error: type[SionnaPartialError], names: Mapping[str, str]
-) -> tuple[dict[str, list[float]], list[str]]:
-    header = [name.strip() for name in next(rows, [])]
-    commas = "separate columns by commas, and write decimal points."
-    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise error(f"{given} has the header {header[0][:80]!r}: {commas}")
-    columns = [(column, names[name.lower()]) for column, name in enumerate(header) if name.lower() in names]
-    found: dict[str, list[float]] = {name: [] for _, name in columns}
-    for name in found:
-        same = [header[column] for column, other in columns if other == name]
-        if len(same) > 1:
-            raise error(f"{given} has {len(same)} columns of {name} ({', '.join(same)}): keep one of them.")
-    for row in rows:
-        if len(row) > len(header):
-            raise error(f"{given}, line {rows.line_num} has {len(row)} cells for {len(header)} columns: {commas}")
-        for column, name in columns if row else ():
-            text = row[column] if column < len(row) else ""
-            try:
-                found[name].append(float(text))
-            except ValueError as cause:
-                meant = "write decimal points." if "," in text else "correct the line, or leave it out."
-                raise error(
-                    f"{given}, line {rows.line_num}: {name} = {text[:80]!r} is not a number: {meant}"
-                ) from cause
-    if found and not any(found.values()):
-        raise error(f"{given} has a header and no rows: check that it was written completely.")
-    return found, [name for name in header if name.lower() not in names]
 
 
 @contextmanager

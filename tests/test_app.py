@@ -511,6 +511,7 @@ def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> No
         (b'"x_m": 3.0', b'"x_m": NaN', "x_m"),
         (b'"x_m": 3.0', b'"y": 3.0', "damaged"),
         (b'"title"', b"[" * 100_000, "damaged"),
+        (b"2.5,\n", b"1e9,\n", "rx of the measurements[0] = (1.5, 1000000000.0, 1.5) is outside the map"),
     ):
         text = contents["project.json"]
         assert old in text
@@ -518,6 +519,14 @@ def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> No
         assert message in other.settle()
         assert after.status.is_error
         assert after.transmitters is transmitters
+
+    def fail() -> None:
+        raise ValueError("a fault of ours")
+
+    after.do(fail)
+    assert after.status == Status("a fault of ours", is_error=True)
+    after.upload_map([("mine.zip", content)])
+    assert other.settle() == "Ready."
     after.close()
 
 

@@ -1,6 +1,7 @@
 """Measured gains change correlated predictions, and no others."""
 
 import functools
+import logging
 from dataclasses import fields
 
 import numpy as np
@@ -113,6 +114,21 @@ def test_what_measurements_have_in_common_is_an_offset():
     after, other = (each.update(LEFT, prior(30, 0.0)).gain_mean_db for each in (truth, shifted))
     assert np.abs(after - gains_db).max() < 4.0
     assert np.abs(other + shifted.offset_db - gains_db - 60.0).max() < 4.0
+
+
+@pytest.mark.parametrize(("low_db", "is_logged"), [(0.0, False), (12.0, True)])
+def test_gains_that_are_low_everywhere_are_logged_by_the_error_of_their_offset(caplog, low_db, is_logged):
+    gain_db = wifi().predict(TX, LEFT).gain_mean_db - low_db
+    with caplog.at_level(logging.WARNING):
+        coverage = wifi().coverage(TX, spacing_m=1.6, measurements=sp.Measurements(TX, LEFT, gain_db))
+    assert ("dB below the predicted ones: taken for an offset" in caplog.text) == is_logged
+    assert coverage.attrs["measured_offset_db"] == pytest.approx(-low_db, abs=3.0)
+
+
+def test_an_offset_is_known_better_from_more_measurements():
+    gains_db = np.where(LEFT[:, 0] > 2.5, -60.0, -68.0)
+    errors_db = [fitted(LEFT[:count], gains_db[:count], p_outage=0.0).offset_std_db for count in (3, 30)]
+    assert 0.1 < errors_db[1] < errors_db[0] < 12.0
 
 
 def test_one_deep_value_is_no_offset():

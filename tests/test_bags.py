@@ -123,6 +123,34 @@ class TestPoses:
             load_map(bag)
 
 
+class TestTwoRobots:
+    """A bag with /robot1/tf and /robot2/tf: robot 1 drives at y = 1, robot 2 at y = 8."""
+
+    BAG = Path(__file__).parent / "reports" / "two_robots" / "two_mcap"
+
+    @pytest.mark.parametrize(("robot", "y_m"), [("robot1", 1.0), ("robot2", 8.0)])
+    def test_a_named_topic_is_the_only_one(self, robot: str, y_m: float) -> None:
+        topic = f"/{robot}/tf"
+        table = measurements_from_bag(self.BAG, f"/{robot}/rssi", tx_power_dbm=0.0, pose_topic=topic)
+        np.testing.assert_allclose(table.rx_y, y_m)
+        np.testing.assert_allclose(poses_from_bag(self.BAG, topic=topic).position_m[:, 1], y_m)
+
+    def test_without_a_name_the_user_is_asked(self) -> None:
+        message = r"'base_link' on several topics, as of several robots: name one of /robot1/tf, /robot2/tf as topic"
+        with pytest.raises(MeasurementError, match=message):
+            poses_from_bag(self.BAG)
+
+    def test_odometry_and_static_transforms_of_one_robot(self, tmp_path: Path) -> None:
+        make, rows = Messages(2), []
+        for robot, x in (("robot1", 1.0), ("robot2", 5.0)):
+            rows.append((f"/{robot}/tf_static", 0.0, make.transform(START_S, "map", "odom", x, 0.0, 0.0)))
+            rows.append((f"/{robot}/tf", 0.0, make.transform(START_S, "odom", "base_link", 0.5, 0.0, 0.0)))
+            rows += [(f"/{robot}/odom", time, make.odometry(START_S + time, time, 0.0, 0.0)) for time in (0.0, 1.0)]
+        bag = write_bag(tmp_path / "drive_mcap", rows)
+        assert poses_from_bag(bag, topic="/robot2/odom").position_m[:, 0].values.tolist() == [5.0, 6.0]
+        assert poses_from_bag(bag, topic="/robot2/tf").position_m[:, 0].values.tolist() == [5.5]
+
+
 class TestPowers:
     TX = (2.0, 2.5, 1.4)
 

@@ -225,11 +225,16 @@ class TestPredict:
         assert answer == f"{text} with probability 0.9, at 15 dBm; open {out / 'coverage.png'}"
 
     def test_frequencies(self) -> None:
-        for text, frequency_hz in {"5.2GHz": 5.2e9, "2400 MHz": 2.4e9, "60e9hz": 60e9, "900000kHz": 9e8}.items():
+        units = {"5.2GHz": 5.2e9, "2400 MHz": 2.4e9, "60e9hz": 60e9, "900000kHz": 9e8}
+        for text, frequency_hz in {**units, "ch36": 5.18e9, "CH 6": 2.437e9, "ch14": 2.484e9}.items():
             assert parse_frequency(text) == pytest.approx(frequency_hz)
         for text in ("GHz", "5,2GHz"):
             with pytest.raises(typer.BadParameter, match="is not a frequency: give hertz, or a number with its unit"):
                 parse_frequency(text)
+        with pytest.raises(typer.BadParameter, match=r"'6' is 6 Hz: give ch6 for this Wi-Fi channel \(2\.437 GHz\),"):
+            parse_frequency("6")
+        with pytest.raises(typer.BadParameter, match="'ch20' is no channel: give ch1 to ch14, ch32 to ch177, or"):
+            parse_frequency("ch20")
 
     @pytest.mark.parametrize(
         ("words", "tx"),

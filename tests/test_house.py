@@ -25,7 +25,19 @@ LOCK = (ROOT / "requirements.lock").read_text(encoding="utf-8")
 
 ROOMS = {
     "foundations": (
-        *("process", "arrays", "constants", "errors", "resources", "checks", "display", "settings", "files", "llvm"),
+        *(
+            "process",
+            "arrays",
+            "constants",
+            "errors",
+            "resources",
+            "checks",
+            "display",
+            "settings",
+            "files",
+            "columns",
+            "llvm",
+        ),
     ),
     "maps": (
         *(
@@ -55,7 +67,7 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
-    "measurements": ("measurements", "recordings", "assimilation", "localisation"),
+    "measurements": ("surveys", "measurements", "recordings", "walks", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
     "channels": ("responses", "files", "joint", "samples"),
     "networks": ("coverage.network",),

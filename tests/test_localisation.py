@@ -14,7 +14,13 @@ import sionna_partial as sp
 from sionna_partial.checks import no_progress
 from sionna_partial.cli import app
 from sionna_partial.errors import MeasurementError, PositionError
-from sionna_partial.measurements.localisation import TransmitterPosterior, likely_region, locate_transmitter
+from sionna_partial.measurements.localisation import (
+    MOST_GROUPS,
+    MOST_TRACED,
+    TransmitterPosterior,
+    likely_region,
+    locate_transmitter,
+)
 from sionna_partial.measurements.measurements import measurements_of
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.tracing.simulation import clear_of_walls
@@ -149,8 +155,47 @@ def test_moments_and_draws_of_a_posterior():
     assert posterior.position_m.tolist() == [2.0, 0.0, 1.5]
     assert posterior.std_m == pytest.approx(np.sqrt(0.05 * 4 + 0.28 * 26 + 0.02 * 25))
     positions_m, weights, _ = posterior.draw(10)
-    assert positions_m[:, :2].tolist() == [[0.0, 0.0], [2.0, 0.0], [1.0, 5.0]]
-    assert weights.tolist() == [0.1, 0.6, 0.3]
+    assert dict(zip(map(tuple, positions_m[:, :2].tolist()), weights.tolist(), strict=True)) == {
+        (0.0, 0.0): 0.1,
+        (2.0, 0.0): 0.6,
+        (1.0, 5.0): 0.3,
+    }
+
+
+def test_few_draws_have_the_spread_of_a_posterior():
+    x_m, y_m = np.arange(0.0, 10.0, 0.25), np.arange(0.0, 8.0, 0.25)
+    probability = np.exp(-0.5 * (((x_m - 5.0) / 1.2) ** 2 + ((y_m[:, None] - 4.0) / 0.8) ** 2))
+    posterior = TransmitterPosterior(x_m, y_m, 1.5, probability / probability.sum())
+    positions_m, weights, _ = posterior.draw(4)
+    assert weights.tolist() == [0.25] * 4
+    np.testing.assert_allclose(weights @ positions_m, posterior.position_m, atol=0.6)
+    square_m2 = weights @ ((positions_m - posterior.position_m) ** 2).sum(axis=1)
+    assert 0.5 < np.sqrt(square_m2) / posterior.std_m < 1.5
+
+
+@pytest.mark.parametrize("through_walls_hz", [None, 2.4e9])
+def test_hundreds_of_powers_take_no_more_links_than_some(through_walls_hz):
+    hall, links, errors_m = sp.map_from_array(np.zeros((24, 36), int), resolution_m=0.5), [], []
+    tx_m = np.array([[11.3, 4.2, 1.5]])
+    for count in (20, 500):
+        rng, asked = np.random.default_rng(3), []
+        rx_m = rng.uniform([1.0, 1.0, 1.5], [17.0, 11.0, 1.5], (count, 3))
+        power = free_space(tx_m, rx_m)[0].gain_mean_db + 4.0 * rng.normal(size=count) - 30.0
+
+        def predict(place_m, points_m, asked=asked):
+            asked.append(len(points_m))
+            return free_space(place_m, points_m)
+
+        clear = functools.partial(clear_of_walls, hall)
+        found = locate_transmitter(
+            hall, sp.Measurements(None, rx_m, power), clear, predict, no_progress, through_walls_hz=through_walls_hz
+        )
+        links.append(asked)
+        errors_m.append(np.linalg.norm(found.position_m - tx_m))
+        assert float(found.probability.sum()) == pytest.approx(1.0)
+    assert max(map(len, links)) <= 2 * (MOST_GROUPS if through_walls_hz is None else MOST_TRACED)
+    assert sum(links[1]) <= 1.3 * sum(links[0]) <= 1.3 * MOST_GROUPS * 1500 / 2
+    assert errors_m[1] < min(1.0, errors_m[0] + 0.3)
 
 
 def free_space(place_m, points_m):

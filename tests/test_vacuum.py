@@ -108,10 +108,10 @@ def test_recording(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     assert (len(other), other.tx[0].tolist()) == (8, [6.0, 9.0, 1.0])
     with pytest.raises(MeasurementError, match=r"access_point = 'home' names 2 access points of .*: give the BSSID"):
         sp.load_measurements(path, access_point="home")
-    with pytest.raises(MeasurementError, match=r"columns = .* is for a CSV and not a recording"):
+    with pytest.raises(MeasurementError, match=r"columns = .* is for a CSV, and not for 'home.vwm': leave it out"):
         sp.load_measurements(path, columns={"rx_x": "x"})
     (tmp_path / "home.csv").write_text("x,y,rssi\n1,2,-50\n")
-    with pytest.raises(MeasurementError, match=r"access_point = 'home' is for a recording \(\.vwm\) and not a CSV"):
+    with pytest.raises(MeasurementError, match=r"names 0 access points of measurements 'home\.csv': leave it out"):
         sp.load_measurements(tmp_path / "home.csv", access_point="home")
 
 
@@ -155,7 +155,7 @@ def test_coverage_of_rooms(tmp_path: Path) -> None:
     [
         ({"measurements": []}, "has no measurements: let the robot drive while Valeronoi records."),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 9, "data": [-5]}]}, "is damaged or no recording of Valeronoi ("),
-        ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx[0, 0] = nan is not allowed"),
+        ({"measurements": [{"x": "1", "y": 2, "wifi": 0, "data": [-5]}]}, "rx_x[0] = nan is not allowed"),
         ({"measurements": [{"x": 1, "y": 2, "wifi": 0, "data": ["-5"]}]}, "gain_db[0] = nan is not allowed"),
     ],
 )

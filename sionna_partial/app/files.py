@@ -24,6 +24,7 @@ from sionna_partial.constants import (
     PICTURE_SUFFIXES,
     POINT_SUFFIXES,
     VACUUM_SUFFIXES,
+    CellState,
 )
 from sionna_partial.errors import MapError
 from sionna_partial.export import save_coverage
@@ -94,6 +95,11 @@ def stored_map(files: Sequence[tuple[str, bytes]], folder: Path) -> Path:
         content = re.sub(rb"(?m)^image:.*$", f"image: map{images[0]}".encode(), content)
     path.write_bytes(content)
     return path
+
+
+def file_name(uploaded: str, default: str) -> str:
+    """Return the name of an uploaded file for a temporary folder, and for messages; other characters become _."""
+    return re.sub(r"[^\w. -]", "_", PurePath(uploaded).name)[-100:].lstrip(".") or default
 
 
 def _unzipped(content: bytes) -> list[tuple[str, bytes]]:
@@ -179,13 +185,11 @@ def _project(partial: PartialMap, record: dict[str, Any]) -> Project:
     for name, values in record["transmitters"].items():
         require_name(name)
         transmitters[name] = Transmitter(**values | {"antenna": Antenna(**values["antenna"])})
-    return Project(
-        partial,
-        title,
-        transmitters,
-        None if settings is None else RadioSettings(**settings),
-        None if measured is None else Measurements(**measured),
-    )
+    links = None if measured is None else Measurements(**measured)
+    if links is not None:
+        outside = partial.state_at(links.rx) != CellState.WALL  # links in walls are kept, and not used
+        partial.require_positions("rx of the measurements", links.rx[outside], least=0)
+    return Project(partial, title, transmitters, None if settings is None else RadioSettings(**settings), links)
 
 
 def _measured_record(measured: Measurements) -> dict[str, Any]:

@@ -22,6 +22,7 @@ from sionna_partial.app.files import (
     FILES,
     Project,
     coverage_file,
+    file_name,
     project_file,
     script,
     uploaded_map,
@@ -110,7 +111,11 @@ class Session:
 
     def _do_all(self) -> None:
         while self._waiting:
-            self._waiting.popleft()()
+            try:
+                self._waiting.popleft()()
+            except Exception as error:  # shown by the page, which stays alive
+                self.cancel()
+                self.refuse(self._reason(error))
 
     def close(self) -> None:
         """Cancel the job, and accept no other one."""
@@ -490,7 +495,7 @@ class Session:
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, "reading measurements")
             with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-                path = Path(folder) / f"measured{'.vwm' if name.lower().endswith('.vwm') else '.csv'}"
+                path = Path(folder) / file_name(name, "measured.csv")
                 path.write_bytes(content)
                 measured = load_measurements(path)
                 if not measured.tx_known.any():
@@ -539,10 +544,15 @@ class Session:
         except CancelledError:
             return
         except Exception as error:  # shown by the page, which stays alive
-            if not isinstance(error, SionnaPartialError | OSError | MemoryError):
-                _log.exception("a job of the app failed")
-            end = functools.partial(self._conclude, Status(reason_of(error), is_error=True))
+            end = functools.partial(self._conclude, Status(self._reason(error), is_error=True))
         self.do(functools.partial(self._end, job, end))
+
+    @staticmethod
+    def _reason(error: Exception) -> str:
+        """Return the reason of an error, whose trace is logged if it is not ours."""
+        if not isinstance(error, SionnaPartialError | OSError | MemoryError):
+            _log.error("a job of the app failed", exc_info=error)
+        return reason_of(error)
 
     def _tell(self, job: Job, status: Status) -> None:
         def tell() -> None:

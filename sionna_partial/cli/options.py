@@ -23,7 +23,7 @@ GROUPS = {
     "Transmitter": ("tx", "tx_power", "power", "tx_antenna", "azimuth", "tilt"),
     "Radio": (
         *("frequency", "threshold", "rx_height", "spacing", "receivers", "max_depth", "diffraction", "predictor"),
-        *("measurements", "column", "access_point"),
+        *("measurements", "column", "access_point", "pixel"),
     ),
     "Walls": ("material", "through_walls", "material_of", "wall_layer", "wall_height", "obstacle_height"),
     "Map": ("strict", "resolution", "unit", "up", "height_band", "storey"),
@@ -46,11 +46,28 @@ _MATERIAL_HELP = (
 
 
 def parse_frequency(text: str) -> float:
-    """Return the frequency [Hz] of a number with or without a unit."""
+    """Return the frequency [Hz] of a number with or without a unit, or of a Wi-Fi channel such as ch36."""
+    channel = re.fullmatch(r"(ch)?\s*(\d{1,3})", str(text).strip().lower())
+    channel_hz = channel and _channel_hz(int(channel[2]))
+    if channel and channel_hz and not channel[1]:
+        what = f"ch{channel[2]} for this Wi-Fi channel ({channel_hz / 1e9:g} GHz), or a unit: {channel[2]}GHz"
+        raise typer.BadParameter(f"{str(text)!r} is {channel[2]} Hz: give {what}.")
+    if channel and channel[1]:
+        if channel_hz is None:
+            raise typer.BadParameter(f"{str(text)!r} is no channel: give ch1 to ch14, ch32 to ch177, or 5.955GHz.")
+        return channel_hz
     found = re.fullmatch(r"(.*?[\d.nf])\s*([kmg]?hz)?", str(text).strip().lower())
     if not found or not _is_number(found[1]):
         raise typer.BadParameter(f"{str(text)!r} is not a frequency: give hertz, or a number with its unit, as 5.2GHz.")
     return float(found[1]) * UNITS_HZ[found[2] or ""]
+
+
+def _channel_hz(number: int) -> float | None:
+    """Return the centre of a Wi-Fi channel at 2.4 or 5 GHz (IEEE 802.11-2020, 17.3.8.4 and 15.4.4.3)."""
+    if number == 14:
+        return 2.484e9
+    start_hz = 2.407e9 if 1 <= number <= 13 else 5e9 if 32 <= number <= 177 else None
+    return None if start_hz is None else start_hz + 5e6 * number
 
 
 def _is_number(text: str) -> bool:
@@ -99,7 +116,7 @@ MaterialText = Annotated[str, typer.Option(help=_MATERIAL_HELP)]
 Frequency = Annotated[
     float,
     typer.Option(
-        help="Carrier frequency [Hz], or with its unit: 5.2GHz.",
+        help="Carrier frequency [Hz], with its unit (5.2GHz), or a Wi-Fi channel (ch36).",
         parser=parse_frequency,
         metavar="HZ",
         show_default=f"{CARRIER_FREQUENCY_HZ / 1e9:g}GHz",
@@ -121,8 +138,8 @@ ThroughWalls = Annotated[
 Measured = Annotated[
     Path | None,
     typer.Option(
-        metavar="CSV|VWM",
-        help="Measured gains, or powers as a phone (x, y, rssi) or Valeronoi (.vwm) writes them.",
+        metavar="CSV|JSON|VWM",
+        help="Measured gains, or powers as a phone (x, y, rssi), wifi-survey-heatmap or Valeronoi (.vwm) writes them.",
         show_default=False,
     ),
 ]
@@ -133,10 +150,14 @@ Columns = Annotated[
 AccessPoint = Annotated[
     str | None,
     typer.Option(
-        metavar="BSSID|SSID",
-        help="Of a recording (.vwm): its access point. Default: the one with most measurements.",
+        metavar="BSSID|NAME",
+        help="Of measurements of several access points: the one to read. Default of a .vwm: that with most of them.",
         show_default=False,
     ),
+]
+Pixel = Annotated[
+    float | None,
+    typer.Option(help="Of a JSON survey on a plan: metres per pixel of the plan beside it.", show_default=False),
 ]
 RxHeight = Annotated[float, typer.Option(help="Height of the receivers [m].")]
 Memory = Annotated[float, typer.Option("--memory", help="Memory that the process may take [GB].")]
@@ -236,7 +257,11 @@ def parse_material(text: str) -> Material:
 
 
 def read_measurements(
-    path: Path | None, column: list[str] | None, tx: tuple[float, ...] | None = None, access_point: str | None = None
+    path: Path | None,
+    column: list[str] | None,
+    tx: tuple[float, ...] | None = None,
+    access_point: str | None = None,
+    pixel_m: float | None = None,
 ) -> Any:
     """Read the file of --measurements with the headers of --column; `tx` is the default position."""
     pairs = [text.partition("=") for text in column or ()]
@@ -246,7 +271,7 @@ def read_measurements(
     if path is None:
         return None
     options: dict[str, Any] = {"columns": {name: header for name, _, header in pairs} or None}
-    options["access_point"] = access_point
+    options |= {"access_point": access_point, "pixel_m": pixel_m}
     measured = sp.load_measurements(path, **options)
     if tx is not None and not measured.tx_known.any():
         return sp.load_measurements(path, **options, tx=tx)

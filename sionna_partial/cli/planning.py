@@ -119,6 +119,7 @@ def next_views(
     measurements: opt.Measured = None,
     column: opt.Columns = None,
     access_point: opt.AccessPoint = None,
+    pixel: opt.Pixel = None,
     goal: Annotated[str, typer.Option(metavar="coverage|state|area", help="What is to become known.")] = "coverage",
     count: Annotated[int, typer.Option(help="Largest number of poses.")] = 5,
     start: Annotated[
@@ -141,7 +142,7 @@ def next_views(
         views = sp.next_views(
             partial,
             position,
-            opt.read_measurements(measurements, column, position, access_point),
+            opt.read_measurements(measurements, column, position, access_point, pixel),
             goal,
             count,
             start=start,

@@ -11,6 +11,7 @@ import typer
 import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.checks import require_number
+from sionna_partial.columns import read_columns
 from sionna_partial.constants import (
     CARRIER_FREQUENCY_HZ,
     COST_THRESHOLD_DB,
@@ -21,7 +22,7 @@ from sionna_partial.constants import (
 )
 from sionna_partial.display import part_of
 from sionna_partial.errors import PositionError
-from sionna_partial.files import atomic_files, read_columns
+from sionna_partial.files import atomic_files
 from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
@@ -71,6 +72,7 @@ def predict(
     measurements: opt.Measured = None,
     column: opt.Columns = None,
     access_point: opt.AccessPoint = None,
+    pixel: opt.Pixel = None,
     receivers: Annotated[
         str,
         typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage."),
@@ -94,7 +96,7 @@ def predict(
             spacing_m=spacing,
             predictor=predictor or None,
             **settings,
-            measurements=opt.read_measurements(measurements, column, position, access_point),
+            measurements=opt.read_measurements(measurements, column, position, access_point, pixel),
             receivers=receivers,
             memory_gb=memory,
             progress=part_of(report, 0.0, 0.9),
@@ -394,7 +396,7 @@ def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
 
 def _read_positions(path: Path) -> list[tuple[float, ...]]:
     remedy = "give a CSV with the columns x,y,z in metres."
-    found, _ = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy)
+    found = read_columns(path, "--rx", PositionError, {name: name for name in sum(COLUMNS, ())}, remedy).numbers
     names = next((names for names in COLUMNS if found.keys() >= {*names}), None)
     if names is None:
         raise PositionError(f"--rx = '{path}' has no positions: {remedy}")

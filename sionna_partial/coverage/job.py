@@ -43,7 +43,7 @@ from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
-from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.assimilation import GAIN_OFFSET_STD_DB, Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
     Measurements,
@@ -62,11 +62,11 @@ OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 Area: TypeAlias = tuple[float, float, float, float]
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
 
-POSITIONS = 8
+POSITIONS = 4
 """Number of positions over which the coverage of an unknown transmitter is averaged."""
 
-LARGE_OFFSET_DB = 15.0
-"""Smallest offset of measurements that is logged [dB]."""
+OFFSET_DEVIATIONS = 2.0
+"""Offset of measurements that is logged, in standard deviations of its estimate and of the offset of path gains."""
 
 UNSURE_P = 0.05
 """Smallest logged probability of the less probable kind of measurements."""
@@ -119,7 +119,7 @@ def predict_map(
     255.
 
     Without `tx`, measurements locate the transmitter: `p_transmitter` is the posterior of its position, and
-    probabilities and gains are averaged over 8 positions drawn from it.
+    probabilities and gains are averaged over 4 positions drawn from it.
 
     Parameters
     ----------
@@ -334,7 +334,8 @@ class CoverageJob:
             measured = Measurements(position_m, np.zeros((0, 3)), np.zeros(0))
         if measured is not None:
             for at_m, p in zip(tx_m, p_powers, strict=True):
-                options = {"p_powers": p, "others": others}
+                walks = assimilations[0].walks if assimilations else None  # of the same receivers
+                options = {"p_powers": p, "others": others, "walks": walks}
                 assimilations.append(self._assimilated(at_m, measured, transmitter.antenna, **options))
         return _Source(tx_m, weights, assimilations, position_m, transmitter.antenna)
 
@@ -467,10 +468,14 @@ def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: floa
 def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
     of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
     noise_db, offset_db, shadow_scale = source.weights @ of_each
-    if abs(offset_db) > LARGE_OFFSET_DB:
+    square_db2 = source.weights @ [each.offset_std_db**2 + each.offset_db**2 for each in source.assimilations]
+    error_db = math.sqrt(max(0.0, square_db2 - offset_db**2))
+    if abs(offset_db) > OFFSET_DEVIATIONS * math.hypot(error_db, GAIN_OFFSET_STD_DB):
         _log.warning(
-            "measured gains are %.0f dB %s the predicted ones: taken for an offset, as of transmit power and antennas",
+            "measured gains are %.0f ± %.1f dB %s the predicted ones: taken for an offset, as of transmit power and "
+            "antennas",
             abs(offset_db),
+            error_db,
             "above" if offset_db > 0 else "below",
         )
     return {

@@ -6,24 +6,21 @@ import itertools
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 from scipy.linalg import cho_factor, cho_solve
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import dijkstra
 from scipy.special import log_ndtr, logsumexp
 
-from sionna_partial.arrays import Bools, Floats, States, grid_edges, read_only
+from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.checks import float_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, aligned_blocks, position_array, require_map
+from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.wall_materials import (
@@ -37,12 +34,6 @@ from sionna_partial.prediction.wall_materials import (
     mean_square,
 )
 from sionna_partial.settings import FREQUENCIES_HZ
-
-CELL_M = 0.3
-"""Smallest edge of the cells of walks [m]."""
-
-UNKNOWN_COST = 3.0
-"""Cost of a walk through unknown cells, relative to free cells."""
 
 UNSEEN_RANGE_M = 12.0
 """Correlation length of residuals if both links have an end in an unseen cell [m]."""
@@ -116,14 +107,18 @@ class Kind(NamedTuple):
         return log_p, mean + left @ change, left + within
 
 
+GAIN_OFFSET_STD_DB = 2.0
+"""Prior standard deviation of a common offset of path gains [dB]."""
+
 KINDS = (
-    Kind((0.0, 1.0), np.diag([2.0, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
+    Kind((0.0, 1.0), np.diag([GAIN_OFFSET_STD_DB, 0.0]) ** 2, 0.8, 1.0, 3.0, True),
     Kind((0.0, 0.5), np.diag([40.0, 0.2]) ** 2, 4.0, 3.0, math.inf, True),
 )
 """Traced path gains, and powers at a real radio, with shadows filled by objects missing on maps."""
 
 KINDS_THROUGH_WALLS = tuple(
-    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False) for offset_db in (2.0, 40.0)
+    Kind((0.0, 1.0), np.diag([offset_db, 1.0]) ** 2, 4.0, LIKELY_STD_DB, math.inf, False)
+    for offset_db in (GAIN_OFFSET_STD_DB, 40.0)
 )
 """Gains and powers through walls whose loss is from zero to over twice the expected loss."""
 
@@ -146,7 +141,7 @@ BETWEEN_STDS = tuple(itertools.product((1.5, 3.0, 6.0, 9.0), (0.1, 0.2, 0.3)))
 LIKELY_BETWEEN, BETWEEN_SPREAD = (3.0, 0.2), 0.5
 """Most probable of them a priori, and the standard deviation of their logarithms."""
 
-MOST_POINTS = 500
+MOST_POINTS = 300
 """Number of positions above which neighbours are averaged."""
 
 _SWEEPS, _DAMPING = 8, 0.5
@@ -155,59 +150,12 @@ _LEAST_EXPLAINED = 1e-6
 _LEAST_P = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class Walks:
-    """Lengths of walks from P points around walls, longer through unknown cells."""
-
-    partial: PartialMap
-    points_m: Floats
-    longest_m: float
-
-    def lengths_m(self, points_m: Floats) -> Floats:
-        """Return the lengths (P, N) of walks to points (N, 3) [m], infinite beyond `longest_m`."""
-        straight_m = np.linalg.norm(self.points_m[:, None, :2] - points_m[:, :2], axis=-1)
-        return np.maximum(self._lengths_m[:, self._cell_at(points_m)], straight_m)
-
-    def correlation(self, points_m: Floats, kind: Kind, *, tx_seen: bool) -> Floats:
-        """Return the correlation (P, N) of residuals at points (N, 3) [m]."""
-        walks_m = self.lengths_m(points_m)
-        seen = [tx_seen & (self.partial.state_at(each_m) == CellState.FREE) for each_m in (self.points_m, points_m)]
-        range_m = np.where(seen[0][:, None] | seen[1], kind.seen_range_m, UNSEEN_RANGE_M)
-        return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
-
-    @cached_property
-    def _step(self) -> int:
-        return max(1, round(CELL_M / self.partial.resolution_m))
-
-    @cached_property
-    def _blocks(self) -> tuple[States, Floats]:
-        return aligned_blocks(self.partial, self._step)
-
-    @cached_property
-    def _cost(self) -> Floats:
-        blocks, _ = self._blocks
-        unknown = (blocks == CellState.UNKNOWN).mean(axis=(1, 3))
-        return np.where((blocks == CellState.WALL).any(axis=(1, 3)), 0.0, 1.0 + (UNKNOWN_COST - 1.0) * unknown)
-
-    @cached_property
-    def _nearest(self) -> NDArray[np.intp]:
-        cell = ndimage.distance_transform_edt(self._cost == 0.0, return_distances=False, return_indices=True)
-        return np.ravel_multi_index(tuple(cell), self._cost.shape)
-
-    @cached_property
-    def _lengths_m(self) -> NDArray[np.float32]:
-        ends, costs = grid_edges(self._cost)
-        lengths_m = costs * self._step * self.partial.resolution_m
-        graph = csr_array((lengths_m, ends), shape=(self._cost.size,) * 2)
-        cells, index = np.unique(self._cell_at(self.points_m), return_inverse=True)
-        if not len(cells):
-            return np.zeros((0, self._cost.size), dtype=np.float32)
-        return dijkstra(graph, directed=False, indices=cells, limit=self.longest_m).astype(np.float32)[index]
-
-    def _cell_at(self, points_m: Floats) -> NDArray[np.intp]:
-        cells = np.round(points_m[:, :2] - self._blocks[1], 9) / (self._step * self.partial.resolution_m)
-        column, row = np.clip(np.floor(cells).astype(np.intp), 0, np.array(self._cost.shape)[::-1] - 1).T
-        return self._nearest[row, column]
+def correlation(walks: Walks, points_m: Floats, kind: Kind, *, tx_seen: bool) -> Floats:
+    """Return the correlation (P, N) of residuals at the points of walks and at points (N, 3) [m]."""
+    walks_m = walks.lengths_m(points_m)
+    seen = [tx_seen & (walks.partial.state_at(each_m) == CellState.FREE) for each_m in (walks.points_m, points_m)]
+    range_m = np.where(seen[0][:, None] | seen[1], kind.seen_range_m, UNSEEN_RANGE_M)
+    return (1 - LOCAL_VARIANCE) * np.exp(-walks_m / range_m) + LOCAL_VARIANCE * np.exp(-walks_m / LOCAL_M)
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,7 +172,7 @@ class _Links:
         return free_space_gain_db(np.linalg.norm(rx_m - self.tx_m, axis=1), self.frequency_hz)
 
     def correlation(self, rx_m: Floats, kind: Kind) -> Floats:
-        return self.walks.correlation(rx_m, kind, tx_seen=self.tx_seen)
+        return correlation(self.walks, rx_m, kind, tx_seen=self.tx_seen)
 
 
 class _Sample(NamedTuple):
@@ -345,6 +293,30 @@ def _hypotheses(
             yield each._replace(log_p=log_p + each.log_evidence(received))
 
 
+class _Posterior(NamedTuple):
+    """Probability of each kind, candidate material, and standard deviation of process and fading: (2, K, S, N)."""
+
+    joint: Floats
+
+    @classmethod
+    def of(cls, log_p: Floats) -> _Posterior:
+        return cls(np.exp(log_p - logsumexp(log_p)))
+
+    @property
+    def of_material(self) -> Floats:
+        """Probability (K,) of each material."""
+        kinds, _, processes, fadings = range(4)
+        return np.asarray(self.joint.sum(axis=(kinds, processes, fadings)))
+
+    def given(self, material: int) -> tuple[int, float, float]:
+        """Return the most probable kind given a material, and its deviations of process and fading [dB]."""
+        of_kind = self.joint[:, material].sum(axis=(1, 2))
+        kind = int(of_kind.argmax())
+        weights = self.joint[kind, material] if of_kind[kind] > 0.0 else np.ones(self.joint.shape[2:])
+        process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
+        return kind, process_db, mean_square(FADINGS_DB, weights.sum(axis=0))
+
+
 class _Compared(NamedTuple):
     """Measurements of one transmitter through walls, and their kinds under K candidate materials."""
 
@@ -370,7 +342,8 @@ class _Compared(NamedTuple):
         correlation = positive(links.correlation(sample.rx_m, kinds[0]))
         return cls(sample, links, materials, learnt, correlation)
 
-    def log_p(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[Floats, Floats]:
+    def posterior(self, p_powers: float, weights: Floats, others: Sequence[Floats]) -> tuple[_Posterior, Floats]:
+        """Return the posterior, and the log-evidence (K, S, N) that these measurements are for other transmitters."""
         received = self.sample.received
         below_db, above_db, std_db = (np.stack(each) for each in zip(*map(self._levels, self.materials), strict=True))
         parts = []
@@ -390,14 +363,14 @@ class _Compared(NamedTuple):
         log_prior = np.log(weights)[:, None, None] + log_std_prior()
         for other in others:
             log_prior = log_prior + OTHERS_WEIGHT * _fitting(other, len(weights))
-        return OWN_WEIGHT * evidence + log_prior, logsumexp(evidence, axis=0)
+        return _Posterior.of(OWN_WEIGHT * evidence + log_prior), logsumexp(evidence, axis=0)
 
-    def fit(self, k: int, p: Floats) -> _Fit:
-        best, fading_db = self._hypothesis(k, p)
+    def fit(self, material: int, posterior: _Posterior) -> _Fit:
+        best, fading_db = self._hypothesis(material, posterior)
         return _Fit.of(best, self.sample.received, fading_db)
 
-    def in_common(self, k: int, p: Floats) -> tuple[Floats, Floats]:
-        return self._hypothesis(k, p)[0].in_common(self.sample.received)
+    def in_common(self, material: int, posterior: _Posterior) -> tuple[Floats, Floats]:
+        return self._hypothesis(material, posterior)[0].in_common(self.sample.received)
 
     def _levels(self, prior: LinkPrediction) -> tuple[Floats, Floats, Floats]:
         """Return averages (P,) of prior above free space, measurement above prior, and the prior's deviation [dB]."""
@@ -410,16 +383,12 @@ class _Compared(NamedTuple):
         std_db = self.sample.measured.std_db
         return 0.0 if std_db is None else float(np.sqrt(np.mean(std_db**2)))
 
-    def _hypothesis(self, k: int, p: Floats) -> tuple[_Hypothesis, float]:
-        """Return the most probable kind under candidate k, and the fading [dB]."""
-        of_kind = p.sum(axis=(1, 2))
-        number = int(of_kind.argmax())
-        weights = p[number] if of_kind[number] > 0.0 else np.ones(p.shape[1:])
-        process_db = mean_square(np.array(STDS_DB), weights.sum(axis=1))
-        fading_db = mean_square(FADINGS_DB, weights.sum(axis=0))
+    def _hypothesis(self, material: int, posterior: _Posterior) -> tuple[_Hypothesis, float]:
+        """Return the most probable kind under a candidate material, and the fading [dB]."""
+        number, process_db, fading_db = posterior.given(material)
         noise_db = float(np.hypot(fading_db, self._given_db))
-        below_db, above_db, std_db = self._levels(self.materials[k])
-        kind = self.kinds[k][number]._replace(trace_std_db=process_db)
+        below_db, above_db, std_db = self._levels(self.materials[material])
+        kind = self.kinds[material][number]._replace(trace_std_db=process_db)
         scale_db = np.hypot(std_db, process_db)
         residual = (above_db - kind.mean[0] - (kind.mean[1] - 1.0) * below_db) / scale_db
         design = np.stack([np.ones(len(residual)), below_db]) / scale_db
@@ -485,6 +454,19 @@ class Assimilation(Shown):
         """Transmitter (3,) [m]."""
         return self._links.tx_m
 
+    @property
+    def walks(self) -> Walks:
+        """Walks from the measured receivers."""
+        return self._links.walks
+
+    @property
+    def offset_std_db(self) -> float:
+        """Standard error of `offset_db` [dB]."""
+        fits = [fit for fit in self._fits if fit is not None]
+        weights = self.material_weights[self.material_weights > 0.0]
+        square_db2 = weights @ [fit.common[0, 0] + fit.offset_db**2 for fit in fits]
+        return math.sqrt(max(0.0, float(square_db2) - self.offset_db**2))
+
     @classmethod
     def fit(
         cls,
@@ -498,6 +480,7 @@ class Assimilation(Shown):
         p_powers: float | None = None,
         through_walls: bool = False,
         others: Sequence[Assimilation] = (),
+        walks: Walks | None = None,
     ) -> Assimilation:
         """Fit the process to measurements.
 
@@ -519,6 +502,8 @@ class Assimilation(Shown):
             True for a trace through walls, of a real radio: the loss of walls is inferred, and no trace is certain.
         others : sequence of Assimilation
             Fits to other transmitters of the building through walls, which inform losses and offsets.
+        walks : Walks, optional
+            `walks` of a fit to the same receivers on the same map, which saves time.
 
         Raises
         ------
@@ -550,7 +535,9 @@ class Assimilation(Shown):
             p_powers = FREE_P_POWERS if through_walls else p_powers
         p_powers = min(max(p_powers, _LEAST_P), 1.0 - _LEAST_P)
         longest_m = _RANGES * max(UNSEEN_RANGE_M, *(kind.seen_range_m for kind in (*KINDS, *KINDS_THROUGH_WALLS)))
-        links = _Links(Walks(partial, sample.rx_m, longest_m), tx_m, float(frequency_hz))
+        if walks is None or walks.partial is not partial or not np.array_equal(walks.points_m, sample.rx_m):
+            walks = Walks(partial, sample.rx_m, longest_m)
+        links = _Links(walks, tx_m, float(frequency_hz))
         if through_walls:
             return cls._through_walls(sample, links, prior, p_powers, others)
         hypotheses = _hypotheses(sample, links, prior, KINDS, p_powers)
@@ -568,15 +555,14 @@ class Assimilation(Shown):
     ) -> Assimilation:
         materials, weights = prior.materials
         compared = _Compared.of(sample, links, materials, [other._in_common for other in others])
-        log_p, evidence = compared.log_p(p_powers, weights, [other._log_evidence for other in others])
-        p = np.exp(log_p - logsumexp(log_p))
-        of_material = p.sum(axis=(0, 2, 3))
+        posterior, evidence = compared.posterior(p_powers, weights, [other._log_evidence for other in others])
+        of_material = posterior.of_material
         kept = of_material > LEAST_WEIGHT * (len(materials) > 1)
-        fits = tuple(compared.fit(k, p[:, k]) if kept[k] else None for k in range(len(materials)))
+        fits = tuple(compared.fit(k, posterior) if kept[k] else None for k in range(len(materials)))
         of_material = np.where(kept, of_material, 0.0) / of_material[kept].sum()
         common = [(fit.noise_db, fit.offset_db, fit.factor) for fit in fits if fit is not None]
         noise_db, offset_db, factor = (of_material[kept] @ common).tolist()
-        in_common = tuple(compared.in_common(k, p[:, k]) for k in range(len(materials)))
+        in_common = tuple(compared.in_common(k, posterior) for k in range(len(materials)))
         return cls(noise_db, offset_db, factor, of_material, links, fits, in_common, evidence)
 
     def update(self, rx_m: ArrayLike, prior: LinkPrediction) -> LinkPrediction:
@@ -646,13 +632,13 @@ class Assimilation(Shown):
 
 
 def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp]]:
-    """Group measurements (M,) by the cells of the finest grid with at most `most` groups.
+    """Group measurements (M,) by the cells of the finest grid about their middle with at most `most` groups.
 
     Return the first measurement of each group, the group of each measurement, and the group sizes.
     """
-    edge_m = 0.01
+    edge_m, middle_m = 0.01, 0.5 * (rx_m.min(axis=0, initial=np.inf) + rx_m.max(axis=0, initial=-np.inf))
     while True:
-        keys = np.column_stack([np.floor(rx_m / edge_m), received])
+        keys = np.column_stack([np.round((rx_m - middle_m) / edge_m), received])
         _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)
         if len(first) <= most:
             return first, group.ravel(), count

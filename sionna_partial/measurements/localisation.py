@@ -1,11 +1,15 @@
 """Localisation of a transmitter: measured gains -> posterior over positions."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from scipy.special import log_ndtr, logsumexp
 
@@ -18,12 +22,13 @@ from sionna_partial.measurements.assimilation import (
     FREE_P_POWERS,
     LIKELY_NOISE_DB,
     Kind,
-    Walks,
+    correlation,
     grouped,
     kinds_through_walls,
     positive,
 )
 from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.wall_materials import FADINGS_DB, OWN_WEIGHT, RESIDUAL_DB, Residuals, log_std_prior
@@ -38,8 +43,14 @@ Predict = Callable[[Floats, Floats], Links]
 MOST_POSITIONS, LEAST_SPACING_M, BEYOND_M = 1500, 0.25, 10.0
 """Number of candidates, their smallest spacing, and largest distance from free cells [m]."""
 
-MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 25, 40
-"""Number of groups of neighbouring measurements; one of each group is traced."""
+MOST_GROUPS, MOST_GROUPS_THROUGH_WALLS = 20, 40
+"""Number of groups of neighbouring measurements, whose means are compared with predictions."""
+
+MOST_TRACED = 16
+"""Number of positions that are traced through walls; other groups have the loss over free space of the nearest one."""
+
+REFINED = 12
+"""Largest likely region whose positions are all compared, in blocks of 2 x 2: a larger one needs no finer grid."""
 
 CORRELATION_M, FARTHEST_M = 3.0, 30.0
 """Correlation length of prediction errors along walks with opaque walls, with which the 90 % region holds 90 % of the
@@ -94,12 +105,26 @@ class TransmitterPosterior:
         return float(np.sqrt(square @ self.probability.ravel()))
 
     def draw(self, count: int) -> tuple[Floats, Floats, list[float | None]]:
-        """Draw positions (K, 3) systematically [m]; return also their weights (K,) and P(powers)."""
+        """Draw positions (K, 3) systematically, near ones in a row [m]; return also weights (K,) and P(powers)."""
         weights = self.probability.ravel()
-        drawn = np.searchsorted(np.cumsum(weights) / weights.sum(), (np.arange(count) + 0.5) / count)
+        order = _spatial_order(self.points_m[:, :2], weights, np.flatnonzero(weights > 0.0))
+        sums = np.cumsum(weights[order])
+        drawn = order[np.searchsorted(sums / sums[-1], (np.arange(count) + 0.5) / count)]
         chosen, times = np.unique(drawn, return_counts=True)
         p_powers = [None] * len(chosen) if self.p_powers is None else self.p_powers.ravel()[chosen].tolist()
         return self.points_m[chosen], times / count, p_powers
+
+
+def _spatial_order(points_m: Floats, weights: Floats, cells: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Return cells in an order that divides them by halves of their weight, along their greater extent."""
+    if len(cells) < 2:
+        return cells
+    axis = int(np.ptp(points_m[cells], axis=0).argmax())
+    cells = cells[np.argsort(points_m[cells, axis], kind="stable")]
+    sums = np.cumsum(weights[cells])
+    middle = int(np.clip(np.searchsorted(sums, 0.5 * sums[-1], side="right"), 1, len(cells) - 1))
+    parts = cells[:middle], cells[middle:]
+    return np.concatenate([_spatial_order(points_m, weights, part) for part in parts])
 
 
 def likely_region(probability: Floats) -> Bools:
@@ -122,39 +147,115 @@ def locate_transmitter(
 ) -> TransmitterPosterior:
     """Compare positions by the likelihood of measurements of one transmitter, weighted by P(indoor).
 
-    By reciprocity, links are predicted from the measured positions to all others that are `allowed`. Through walls, at
-    the frequency `through_walls_hz`, residuals are the process of `Assimilation`. With opaque walls, the log-likelihood
-    is divided by the number of correlated neighbours.
+    By reciprocity, links are predicted from some of the measured positions, each with the mean of its neighbours, to
+    one of four others that are `allowed`, then to all in the likely region if it is small. Through walls, at the
+    frequency `through_walls_hz`, residuals are the process of `Assimilation`. With opaque walls, the log-likelihood is
+    divided by the number of correlated neighbours.
     """
     posterior = _grid(partial, measured)
+    means = _Means.of(measured, MOST_GROUPS if through_walls_hz is None else MOST_GROUPS_THROUGH_WALLS)
+    traced = np.arange(len(means.size)) if through_walls_hz is None else means.traced(partial)
+    sources, of_group = np.unique(traced, return_inverse=True)
     points_m = posterior.points_m
-    received = measured.gain_db > measured.sensitivity_db
-    groups = MOST_GROUPS if through_walls_hz is None else MOST_GROUPS_THROUGH_WALLS
-    some = measured.take(grouped(measured.rx, received, groups)[0])
-    possible = np.flatnonzero(allowed(points_m))
-    if not len(possible):
+    noise_db = 0.0 if measured.std_db is None else float(np.sqrt(np.mean(measured.std_db**2)))
+    possible = allowed(points_m)
+    if not possible.any():
         raise PositionError("a transmitter can be nowhere: no position is away from walls and measurements.")
     partial.require_positions("tx", points_m[possible])
-    links = []
-    for index, each_m in enumerate(some.rx):
-        report(index / len(some), "comparing positions of the transmitter")
-        links.append(predict(each_m, points_m[possible]))
-    if through_walls_hz is None:
-        log_p = _log_independent(partial, some, links)
-    else:
-        log_p = _log_process(partial, some, links, points_m[possible], through_walls_hz)
-    log_p += np.log([[1.0 - FREE_P_POWERS], [FREE_P_POWERS]])
-    log_p += np.log(np.maximum(np.mean([indoor for *_, indoor in links], axis=0), OUTDOOR))
-    joint = np.exp(log_p - logsumexp(log_p))
-    posterior.probability.ravel()[possible] = joint.sum(axis=0)
-    p_powers = np.zeros(posterior.probability.shape)
-    p_powers.ravel()[possible] = joint[1] / np.maximum(joint.sum(axis=0), 1e-300)
-    return replace(posterior, p_powers=p_powers)
+
+    def compare(positions: NDArray[np.intp], begin: float) -> Floats:
+        """Return the log-probability (2, K) of positions, up to a constant."""
+        links = []
+        for index, each_m in enumerate(means.measured.rx[sources]):
+            report(begin + 0.5 * index / len(sources), "comparing positions of the transmitter")
+            links.append(predict(each_m, points_m[positions]))
+        if through_walls_hz is None:
+            log_p = _log_independent(partial, means, links)
+        else:
+            of_groups = [links[source] for source in of_group]
+            log_p = _log_process(partial, means, of_groups, traced, points_m[positions], through_walls_hz, noise_db)
+        log_p += np.log([[1.0 - FREE_P_POWERS], [FREE_P_POWERS]])
+        return log_p + np.log(np.maximum(np.mean([indoor for *_, indoor in links], axis=0), OUTDOOR))
+
+    block = _blocks(*posterior.probability.shape)
+    first, of_first = np.unique(block[possible], return_index=True)
+    log_p = np.full((2, block.max() + 1), -np.inf)
+    log_p[:, first] = compare(np.flatnonzero(possible)[of_first], 0.0)
+    log_p = np.where(possible, log_p[:, block], -np.inf)
+    likely = likely_region(np.bincount(block, weights=_normalised(log_p).sum(axis=0)))
+    if likely.sum() <= REFINED:
+        finer = np.flatnonzero(possible & likely[block])
+        log_p[:, finer] = compare(finer, 0.5)
+    joint = _normalised(log_p)
+    shape = posterior.probability.shape
+    p_powers = joint[1] / np.maximum(joint.sum(axis=0), 1e-300)
+    return replace(posterior, probability=joint.sum(axis=0).reshape(shape), p_powers=p_powers.reshape(shape))
 
 
-def _log_independent(partial: PartialMap, measured: Measurements, links: Sequence[Links]) -> Floats:
+class _Means(NamedTuple):
+    """Means of P groups of neighbouring measurements, each at the position nearest to the middle of its group.
+
+    `size` (P,) are the numbers of measurements, `received` (P,) whether these were received. `rx_m` (M, 3) are their
+    positions, `group` (M,) their groups.
+    """
+
+    measured: Measurements
+    size: Floats
+    received: Bools
+    rx_m: Floats
+    group: NDArray[np.intp]
+
+    @classmethod
+    def of(cls, measured: Measurements, most: int) -> _Means:
+        received = measured.of_paths(0.0)[1]
+        first, group, size = grouped(measured.rx, received, most)
+
+        def mean(values: Floats) -> Floats:
+            return np.bincount(group, weights=values) / size
+
+        middle_m = np.stack([mean(axis_m) for axis_m in measured.rx.T], axis=1)
+        apart_m = np.linalg.norm(measured.rx - middle_m[group], axis=1)
+        order = np.lexsort([apart_m, group])
+        nearest = order[np.searchsorted(group[order], np.arange(len(size)))]
+        std_db = np.full(len(group), LIKELY_NOISE_DB) if measured.std_db is None else measured.std_db
+        means = Measurements(
+            measured.tx[nearest],
+            measured.rx[nearest],
+            mean(measured.gain_db),
+            np.sqrt(mean(std_db**2) / size),
+            measured.sensitivity_db,
+        )
+        return cls(means, size.astype(np.float64), received[first], measured.rx, group)
+
+    def traced(self, partial: PartialMap) -> NDArray[np.intp]:
+        """Return for each group (P,) the group whose position is traced for it: of `MOST_TRACED`, on a short walk."""
+        rx_m = self.measured.rx
+        kept = np.sort(grouped(rx_m, np.ones(len(rx_m), dtype=bool), MOST_TRACED)[0])
+        walks_m = Walks(partial, rx_m[kept], FARTHEST_M).lengths_m(rx_m)
+        around_m = FARTHEST_M + np.linalg.norm(rx_m[kept, None] - rx_m, axis=-1)
+        nearest: NDArray[np.intp] = kept[np.where(np.isfinite(walks_m), walks_m, around_m).argmin(axis=0)]
+        return nearest
+
+    def free_space_db(self, points_m: Floats, frequency_hz: float) -> Floats:
+        """Return the mean free-space gain (N, P) of the links between positions (N, 3) and each group [dB]."""
+        member = (self.group[:, None] == np.arange(len(self.size))) / self.size
+        return free_space_gain_db(cdist(points_m, self.rx_m), frequency_hz) @ member
+
+
+def _blocks(ny: int, nx: int) -> NDArray[np.intp]:
+    """Return the number (ny nx,) of the block of 2 x 2 positions that each belongs to."""
+    row, column = np.divmod(np.arange(ny * nx), nx)
+    return row // 2 * ((nx + 1) // 2) + column // 2
+
+
+def _normalised(log_p: Floats) -> Floats:
+    joint: Floats = np.exp(log_p - logsumexp(log_p))
+    return joint
+
+
+def _log_independent(partial: PartialMap, means: _Means, links: Sequence[Links]) -> Floats:
     """Return the log-likelihood (2, N) of gains and of powers with opaque walls: residuals are independent."""
-    log_p = np.zeros(())
+    log_p, measured = np.zeros(()), means.measured
     for at, (prediction, antenna_db, _) in enumerate(links):
         log_p = log_p + _log_likelihood(prediction, measured.take(np.array([at])), antenna_db)
     walks_m = Walks(partial, measured.rx, FARTHEST_M).lengths_m(measured.rx)
@@ -165,29 +266,37 @@ def _log_independent(partial: PartialMap, measured: Measurements, links: Sequenc
 
 
 def _log_process(
-    partial: PartialMap, measured: Measurements, links: Sequence[Links], points_m: Floats, frequency_hz: float
+    partial: PartialMap,
+    means: _Means,
+    links: Sequence[Links],
+    traced: NDArray[np.intp],
+    points_m: Floats,
+    frequency_hz: float,
+    noise_db: float,
 ) -> Floats:
-    """Return the log-likelihood (2, N) of gains and of powers through walls: residuals are a Gaussian process."""
+    """Return the log-likelihood (2, N) of gains and of powers through walls: residuals are a Gaussian process.
+
+    `links` are those of the position that is `traced` for each group.
+    """
+    measured = means.measured
     materials, weights = zip(*(prediction.materials for prediction, *_ in links), strict=True)
     mean_db, std_db = (
         np.array([[getattr(each, name) for each in of_link] for of_link in materials]).transpose(2, 1, 0)
         for name in ("gain_mean_db", "gain_std_db")
     )
     levels_db = [measured.take(np.array([at])).of_paths(antenna_db)[0] for at, (_, antenna_db, _) in enumerate(links)]
-    above_db = np.transpose(levels_db)[:, None] - mean_db
-    below_db = mean_db - free_space_gain_db(cdist(points_m, measured.rx), frequency_hz)[:, None]
-    received = measured.of_paths(0.0)[1]
-    noise_db = 0.0 if measured.std_db is None else float(np.sqrt(np.mean(measured.std_db**2)))
+    below_db = mean_db - free_space_gain_db(cdist(points_m, measured.rx[traced]), frequency_hz)[:, None]
+    above_db = np.transpose(levels_db)[:, None] - below_db - means.free_space_db(points_m, frequency_hz)[:, None]
     walks, seen = Walks(partial, measured.rx, FARTHEST_M), partial.state_at(points_m) == CellState.FREE
     kinds = kinds_through_walls(len(materials[0]))
     log_p = np.empty((len(kinds), len(points_m)))
     for tx_seen in (True, False):
-        correlation = positive(walks.correlation(measured.rx, kinds[0], tx_seen=tx_seen))
+        correlated = positive(correlation(walks, measured.rx, kinds[0], tx_seen=tx_seen))
         at = np.flatnonzero(seen == tx_seen)
         for some in (at[first : first + BLOCK] for first in range(0, len(at), BLOCK)):
             residuals_db = above_db[some], below_db[some], std_db[some]
             for number, kind in enumerate(kinds):
-                of_material = _log_evidence(kind, correlation, received, *residuals_db, noise_db)
+                of_material = _log_evidence(kind, correlated, means, *residuals_db, noise_db)
                 log_p[number, some] = logsumexp(of_material + np.log(weights[0]), axis=1)
     return log_p
 
@@ -195,7 +304,7 @@ def _log_process(
 def _log_evidence(
     kind: Kind,
     correlation: Floats,
-    received: Bools,
+    means: _Means,
     above_db: Floats,
     below_db: Floats,
     std_db: Floats,
@@ -205,10 +314,11 @@ def _log_evidence(
 
     Residuals of links that were not received are independent, given the mean of the others.
     """
-    count = received.sum()
+    received = means.received
+    count, size = received.sum(), means.size[received]
     above, below, std = (each[..., received].reshape(-1, count) for each in (above_db, below_db, std_db))
     correlation, covariance = correlation[np.ix_(received, received)], kind.covariance[None]
-    residuals = Residuals(correlation, np.ones(count), above, below, std, covariance)
+    residuals = Residuals(correlation, size, above, below, std, covariance)
     log_p = OWN_WEIGHT * residuals.log_evidence(np.hypot(FADINGS_DB, noise_db)) + log_std_prior()
     prior_count = RESIDUAL_DB**2 / kind.covariance[0, 0]
     offset_db = above_db[..., received].sum(axis=-1, keepdims=True) / (count + prior_count)

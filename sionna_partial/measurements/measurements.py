@@ -5,26 +5,22 @@ from __future__ import annotations
 import logging
 import math
 import os
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.checks import float_array, number_of, shown
-from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB
+from sionna_partial.constants import DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, HIGHEST_DB, LOWEST_DB
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError
-from sionna_partial.files import decoding, is_path, read_columns
+from sionna_partial.files import is_path
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.tracing.simulation import clear_of_walls, nearest_m
-
-LOWEST_DB, HIGHEST_DB = GAIN_FLOOR_DB - 50.0, 0.0
-"""Limits of gains [dB]; others have another unit or sign. Noise may take an outage below -150 dB."""
 
 OUTAGE_DB = GAIN_FLOOR_DB + 10.0
 """Largest gain that counts as an outage, with noise [dB]."""
@@ -47,28 +43,16 @@ MOST_MEASUREMENTS = 20_000
 MOST_OTHERS, MOST_OF_OTHER = 12, 100
 """Number of other transmitters, and of their links, for the loss of walls."""
 
-VACUUM_HEIGHT_M = 0.1
+if TYPE_CHECKING:
+    from sionna_partial.measurements.surveys import Survey
 
 _log = logging.getLogger(__name__)
 
-_CSV_COLUMNS = ("tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "gain_db", "std_db")
-_OTHER_HEADERS = {
-    **{f"{axis}{unit}": f"rx_{axis}" for axis in "xyz" for unit in ("", "_m")},
-    **dict.fromkeys(("rssi", "rssi_dbm", "rsrp", "rsrp_dbm", "power_dbm"), "power_dbm"),
-}
-"""Headers of survey apps for the receiver's position and the received power."""
-
-_NAMES = (*_CSV_COLUMNS, "power_dbm")
-_NAME_COLUMNS = (
-    "name the headers of a file, as columns={{'{0}': 'HEADER'}} of load_measurements or --column {0}=HEADER on the "
-    "command line"
-)
-
-_STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 _GIVE = (
-    "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a CSV with the columns "
-    f"{', '.join(_CSV_COLUMNS)}, or of a recording of Valeronoi (.vwm)."
+    "give a mapping or data frame with tx (N, 3), rx (N, 3) and gain_db (N,), or the path of a file that "
+    "load_measurements reads."
 )
+_STD_REMEDY = f"give a standard deviation of more than 0 and up to {HIGHEST_STD_DB:g} dB, or none."
 
 
 @read_only
@@ -187,13 +171,14 @@ def measurements_of(source: Any) -> Measurements:
     """
     if isinstance(source, Measurements):
         return source
-    given = f"measurements of type {type(source).__name__}"
     if isinstance(source, str | os.PathLike):
-        given = f"measurements '{source}'"
-        source = _read(source)
+        return load_measurements(source)
+    given = f"measurements of type {type(source).__name__}"
     gain_db = _field(source, "gain_db")
     if gain_db is None:
         raise MeasurementError(f"gain_db is missing from {given}: {_GIVE}")
+    if all(_field(source, name) is None for name in ("tx", "tx_x")):
+        _require_one_transmitter(source, given)
     sensitivity_db = _field(source, "sensitivity_db")
     return Measurements(
         _ends(source, "tx"),
@@ -208,29 +193,34 @@ def load_measurements(
     path: str | os.PathLike[str],
     *,
     columns: Mapping[str, str] | None = None,
-    tx: ArrayLike | None = None,
+    tx: ArrayLike | Mapping[str, ArrayLike] | None = None,
     tx_power_dbm: float = 0.0,
     access_point: str | None = None,
+    pixel_m: float | None = None,
 ) -> Measurements:
-    r"""Read measurements from a CSV of a survey app, or from a recording of Valeronoi.
+    r"""Read measurements from a CSV of a survey app, a JSON survey on a plan, or a recording of Valeronoi.
 
     Parameters
     ----------
     path : path-like
         A CSV with a header: columns tx_x, tx_y, tx_z, rx_x, rx_y, rx_z (or x, y, z) [m], gain_db and std_db [dB], or
-        power_dbm, rssi or rsrp for received powers. Missing heights are 1.5 m. A recording (.vwm) has mean received
-        powers of a vacuum robot, 0.1 m high, on the map that `load_map` reads from the same file; transmitters are
-        unknown.
+        power_dbm, rssi or rsrp for received powers. Missing heights are 1.5 m. bssid, mac, tx or ssid tell access
+        points apart. A JSON survey of python-wifi-survey-heatmap has powers at pixels of the plan beside it, in the
+        frame of the map that `load_map` makes of the plan. A recording (.vwm) has mean received powers of a vacuum
+        robot, 0.1 m high, on the map that `load_map` reads from the same file; transmitters are unknown.
     columns : mapping, optional
         Headers of these columns, such as ``{"rx_x": "east", "power_dbm": "level"}``. A header for gain_db without the
         word "gain" is a received power.
-    tx : (3,) array-like, optional
-        Transmitter of all links [m].
+    tx : (3,) array-like, or mapping of names to them, optional
+        Transmitter of all links [m], or of each access point by BSSID or name; links of others are left out.
     tx_power_dbm : float
         Received power without path loss [dBm], subtracted from received powers only. Leave it out if unknown:
         `predict_map` and `calibrate_materials` estimate a common offset.
     access_point : str, optional
-        BSSID or SSID in a recording; by default the access point with most measurements.
+        BSSID or name of the access point to read. Required for a file of several without their positions; of a
+        recording, by default the one with most measurements.
+    pixel_m : float, optional
+        Edge of a pixel of the plan of a JSON survey [m].
 
     Raises
     ------
@@ -244,99 +234,37 @@ def load_measurements(
     >>> sp.load_measurements("survey.csv", tx=(1.0, 2.0, 1.5), tx_power_dbm=20.0).gain_db.tolist()
     [-72.0, -81.0]
     """
-    power_dbm = number_of(tx_power_dbm)
+    from sionna_partial.measurements.surveys import read_survey, require_one_transmitter
+
+    power_dbm, name = number_of(tx_power_dbm), Path(path).name if is_path(path) else ""
     if not math.isfinite(power_dbm):
         raise MeasurementError(f"tx_power_dbm = {shown(tx_power_dbm)} is not allowed: give a number of dBm.")
-    table = _read(path, columns, power_dbm, access_point)
-    if tx is not None and {"tx_x", "tx_y"} & {*table}:
-        _log.warning("measurements '%s': tx is used instead of the columns tx_x and tx_y", path)
-    return measurements_of(table if tx is None else table | {"tx": tx})
+    survey = read_survey(path, columns, power_dbm, pixel_m)
+    if access_point is not None:
+        survey = survey.of_access_point(name, access_point)
+    if isinstance(tx, Mapping):
+        return measurements_of(_of_transmitters(survey, tx, name))
+    has_tx = {"tx_x", "tx_y"} <= {*survey.table}
+    if access_point is None and name.lower().endswith(".vwm"):
+        survey = survey.of_most_measured(name)
+    if tx is not None or not has_tx:
+        require_one_transmitter(survey.transmitters, f"measurements '{name}'")
+    if tx is not None and has_tx:
+        _log.warning("measurements '%s': tx is used instead of the columns tx_x and tx_y", name)
+    return measurements_of(survey.table if tx is None else survey.table | {"tx": tx})
 
 
-def _read(
-    path: str | os.PathLike[str],
-    columns: Mapping[str, str] | None = None,
-    tx_power_dbm: float = 0.0,
-    access_point: str | None = None,
-) -> dict[str, Floats]:
-    """Read the columns of a file; subtract `tx_power_dbm` from received powers."""
-    is_recording = is_path(path) and Path(path).suffix.lower() == ".vwm"
-    for name, value, other in (("columns", columns, is_recording), ("access_point", access_point, not is_recording)):
-        if value is not None and other:
-            kinds = "a CSV and not a recording (.vwm)" if is_recording else "a recording (.vwm) and not a CSV"
-            raise MeasurementError(
-                f"{name} = {shown(value)} is for {kinds}, as measurements '{path}' is: leave it out."
-            )
-    if is_recording:
-        table = _read_recording(Path(path), access_point)
-        return table | {"gain_db": table["gain_db"] - tx_power_dbm}
-    names = _names_of_headers(columns)
-    found, others = read_columns(path, "measurements", MeasurementError, names, _GIVE)
-    absent = [header for header in (columns or {}).values() if not found.keys() & {names[header.strip().lower()]}]
-    if absent:
-        raise MeasurementError(f"measurements '{path}' has no column {absent[0]!r}: check columns.")
-    table = {name: np.array(values, dtype=np.float64) for name, values in found.items()}
-    if {"gain_db", "power_dbm"} <= {*table}:
-        raise MeasurementError(
-            f"measurements '{path}' has 2 columns of gain_db (a gain and a power): keep one of them."
-        )
-    if "power_dbm" in table:
-        table["gain_db"] = table.pop("power_dbm") - tx_power_dbm
-    elif tx_power_dbm and "gain_db" in table:
-        _log.warning("measurements '%s' are path gains: tx_power_dbm = %g is not subtracted", path, tx_power_dbm)
-    missing = [name for name in ("gain_db", "rx_x", "rx_y") if name not in table]
-    unused = f" (its other headers are {', '.join(others)[:200]})" if others else ""
-    if missing:
-        what = f"{missing[0]} is missing from measurements '{path}'{unused}"
-        raise MeasurementError(f"{what}: {_NAME_COLUMNS.format(missing[0])}; {_GIVE}")
-    if others:
-        message = "measurements '%s': columns that are not known are not used (%s); " + _NAME_COLUMNS.format("rx_x")
-        _log.warning(message, path, ", ".join(others)[:200])
-    return table
-
-
-def _read_recording(path: Path, access_point: str | None) -> dict[str, Floats]:
-    from sionna_partial.maps.vacuum import read_json  # rarely needed
-
-    raw, _, frame = read_json(path, "measurements", MeasurementError)
-    with decoding(path, "no recording of Valeronoi", MeasurementError):
-        rows = [row for row in raw["measurements"] if len(row["data"])]
-        points_m = frame.world_m([[number_of(row["x"]), number_of(row["y"])] for row in rows])
-        power_dbm = np.array([np.mean([number_of(value) for value in row["data"]]) for row in rows], dtype=np.float64)
-        points = {number: (str(wifi["bssid"]), str(wifi["ssid"])) for number, wifi in enumerate(raw["wifis"])}
-        of_row = [({-1: ("unknown", "unknown")} | points)[row["wifi"]] for row in rows]
-    if not rows:
-        raise MeasurementError(
-            f"measurements '{path}' has no measurements: let the robot drive while Valeronoi records."
-        )
-    counts = Counter(of_row).most_common()
-    listed = ", ".join(f"{ssid} ({bssid}): {count:,}" for (bssid, ssid), count in counts[:20])
-    asked = [point for point, _ in counts if access_point in (*point, None)]
-    remedy = "give the BSSID of one as access_point, or as --access-point on the command line"
-    if not asked or (access_point is not None and len(asked) > 1):
-        what = f"names {len(asked)} access points of measurements '{path}'"
-        raise MeasurementError(f"access_point = {shown(access_point)} {what}, which are {listed}: {remedy}.")
-    used = np.array([point == asked[0] for point in of_row])
-    if access_point is None and len(counts) > 1:
-        _log.warning(
-            "measurements '%s' are of %d access points (%s): the first is used; %s", path, len(counts), listed, remedy
-        )
-    height_m = np.full(len(rows), VACUUM_HEIGHT_M)
-    return {"rx": np.column_stack([points_m, height_m])[used], "gain_db": power_dbm[used]}
-
-
-def _names_of_headers(columns: Mapping[str, str] | None) -> dict[str, str]:
-    names = {name: name for name in _CSV_COLUMNS} | _OTHER_HEADERS
-    if not isinstance(columns, Mapping | None):
-        raise MeasurementError(f"columns = {shown(columns)} is no mapping: {_NAME_COLUMNS.format('rx_x')}.")
-    for name, header in (columns or {}).items():
-        if name not in _NAMES or not isinstance(header, str):
-            raise MeasurementError(f"columns = {shown(columns)}: give a header for some of {', '.join(_NAMES)}.")
-        key = header.strip().lower()
-        same = ("gain_db", "power_dbm") if name in ("gain_db", "power_dbm") else (name,)
-        name = "power_dbm" if name == "gain_db" and "gain" not in key else name
-        names = {other: value for other, value in names.items() if value not in same} | {key: name}
-    return names
+def _of_transmitters(survey: Survey, tx: Mapping[str, ArrayLike], given: str) -> dict[str, Floats]:
+    """Return the columns of the access points in `tx`, with their positions."""
+    parts = [survey.of_access_point(given, name) for name in tx]
+    used = sum(len(part.transmitters) for part in parts)
+    if used < len(survey.transmitters):
+        message = "measurements '%s': %d of %d rows are of access points without a position in tx, and not used"
+        _log.warning(message, given, len(survey.transmitters) - used, len(survey.transmitters))
+    rows = zip(tx.items(), parts, strict=True)
+    tx_m = np.concatenate([_positions(f"tx[{name!r}]", at_m, len(part.transmitters)) for (name, at_m), part in rows]).T
+    table = {column: np.concatenate([part.table[column] for part in parts]) for column in survey.table}
+    return table | dict(zip(("tx_x", "tx_y", "tx_z"), tx_m, strict=True))
 
 
 def merged(measured: Measurements) -> tuple[Measurements, NDArray[np.intp], NDArray[np.float64]]:
@@ -371,6 +299,15 @@ def _field(source: Any, name: str) -> Any:
         return source[name]
     except (KeyError, IndexError, TypeError, ValueError):
         return None
+
+
+def _require_one_transmitter(source: Any, given: str) -> None:
+    from sionna_partial.measurements.surveys import TRANSMITTER_HEADERS, require_one_transmitter, transmitters_of
+
+    keys = {str(key).lower(): key for key in source} if hasattr(source, "keys") else {}
+    headers = [header for header in TRANSMITTER_HEADERS if header in keys and header != "tx"]
+    texts = {TRANSMITTER_HEADERS[header]: np.asarray(source[keys[header]]).ravel().tolist() for header in headers}
+    require_one_transmitter(transmitters_of(texts), given)
 
 
 def _ends(source: Any, name: str) -> Any:

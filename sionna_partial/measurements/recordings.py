@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -23,7 +23,7 @@ from sionna_partial.measurements.measurements import Measurements
 if TYPE_CHECKING:
     import xarray as xr
 
-TF = "TFMessage"
+TF, _STATIC = "TFMessage", "_static"
 
 POSES = ("PoseWithCovarianceStamped", "PoseStamped", "Odometry")
 
@@ -32,12 +32,13 @@ ROBOT_FRAMES = ("base_link", "base_footprint")
 
 
 class _Track(NamedTuple):
-    """Poses of one frame in another: N times [s], x, y, z [m] (N, 3), N rotations."""
+    """Poses of one frame in another: N times [s], x, y, z [m] (N, 3), N rotations; topics of transforms."""
 
     parent: str
     time_s: NDArray[np.float64]
     position_m: NDArray[np.float64]
     rotation: Rotation
+    topics: tuple[str, ...] = ()
 
     def at(self, time_s: NDArray[np.float64]) -> _Track:
         """Interpolate; beyond the ends the pose stays."""
@@ -55,8 +56,9 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     ----------
     path : path-like
     topic : str or None
-        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or `/tf`; by default transforms from map to robot,
-        else the first topic of these types.
+        Topic of PoseStamped, PoseWithCovarianceStamped or Odometry, or of transforms: of `/robot2/tf` and
+        `/robot2/tf_static` alone for `/robot2/tf`. By default transforms from map to robot, else the first topic of
+        these types.
     frame : str or None
         Frame of the transforms, such as an antenna's; default `base_link`, or `base_footprint`.
 
@@ -186,11 +188,11 @@ def _power(message: Message, field: str, topic: str) -> float:
 
 def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, stamped: bool) -> _Track:
     kinds, target = recording.kinds, _map_frame(recording)
-    links = _transforms(recording, stamped=stamped) if TF in kinds.values() else {}
+    links = _transforms(recording, _transform_topics(kinds, topic), stamped=stamped)
     frames = [frame] if frame else [name for name in ROBOT_FRAMES if name in links]
     if kinds.get(topic or "", TF) == TF:
         for name in frames:
-            chain = _chain(links, name, target)
+            chain = _chain(recording, links, name, target)
             if chain:
                 return _composed(chain)
         if topic is not None or frame is not None:
@@ -201,7 +203,7 @@ def _robot_track(recording: Recording, topic: str | None, frame: str | None, *, 
         found = (name for kind in POSES for name in sorted(kinds) if kinds[name] == kind and "goal" not in name)
         topic = next(found, None)
     track = _pose_track(recording, recording.topic_of(topic, POSES), stamped=stamped)
-    chain = _chain(links, track.parent, target)
+    chain = _chain(recording, links, track.parent, target)
     if track.parent != target and not chain:
         message = f"path = '{recording.path}': poses of {topic} are in the frame {track.parent!r}, and no transform"
         warnings.warn(f"{message} leads to {target!r}; they are taken as they are.", MapWarning, stacklevel=4)
@@ -230,16 +232,25 @@ def _pose_track(recording: Recording, topic: str, *, stamped: bool) -> _Track:
     return _track(parent, rows)
 
 
-def _transforms(recording: Recording, *, stamped: bool) -> dict[str, _Track]:
+def _transform_topics(kinds: Mapping[str, str], topic: str | None) -> list[str]:
+    """Return the topics of transforms that belong to a topic of poses: its own, its namespace's, or all."""
+    every = [name for name, kind in kinds.items() if kind == TF]
+    own = topic if topic in every else f"{(topic or '').rpartition('/')[0]}/tf"
+    named = [name for name in every if name in (own, f"{own}{_STATIC}")]
+    return named if topic is not None and own in named else every
+
+
+def _transforms(recording: Recording, topics: Sequence[str], *, stamped: bool) -> dict[str, _Track]:
     rows: dict[tuple[str, str], list[Any]] = {}
-    topics = [topic for topic, kind in recording.kinds.items() if kind == TF]
+    sources: dict[tuple[str, str], dict[str, None]] = {}
     for message in recording.messages(*topics):
         for each in message.content.transforms:
             stamp = each.header.stamp
             time_s = stamp.sec + stamp.nanosec / 1e9 if stamped else message.time_s
             key = _frame(each.child_frame_id), _frame(each.header.frame_id)
             rows.setdefault(key, []).append((time_s, each.transform.translation, each.transform.rotation))
-    return {child: _track(parent, each) for (child, parent), each in rows.items()}
+            sources.setdefault(key, {})[message.topic.removesuffix(_STATIC)] = None
+    return {key[0]: _track(key[1], each)._replace(topics=(*sources[key],)) for key, each in rows.items()}
 
 
 def _track(parent: str, rows: Iterable[Any]) -> _Track:
@@ -254,12 +265,18 @@ def _track(parent: str, rows: Iterable[Any]) -> _Track:
     return _Track(parent, table[:, 0], table[:, 1:4], Rotation.from_quat(quaternion))
 
 
-def _chain(links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
+def _chain(recording: Recording, links: Mapping[str, _Track], frame: str, target: str) -> list[_Track]:
     chain: list[_Track] = []
     while frame != target:
         if frame not in links or len(chain) > len(links):
             return []
         chain.append(links[frame])
+        if len(links[frame].topics) > 1:
+            topics = ", ".join(links[frame].topics)
+            raise recording.error(
+                f"path = '{recording.path}' has transforms of the frame {frame!r} on several topics, as of several "
+                f"robots: name one of {topics} as topic of the poses (pose_topic of measurements_from_bag)."
+            )
         frame = links[frame].parent
     return chain
 
