@@ -11,6 +11,7 @@ from pkgutil import resolve_name
 from typing import Any, ClassVar
 
 from sionna_partial.checks import CountProgress, Progress, require, shown
+from sionna_partial.process import told_of_compilations
 from sionna_partial.resources import optional_packages
 
 LONGEST = 240
@@ -18,6 +19,8 @@ LONGEST = 240
 THUMBNAIL_PX = 640
 
 _FEW = 4
+
+_COMPILING = "compiling, once: kernel {} of about 200"
 
 WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
 """Delays of bars in calls and commands, and time between lines without a terminal [s]."""
@@ -83,16 +86,32 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
     without a terminal.
     """
     if callable(progress):
-        yield progress
+        with _compilations_reported_to(progress) as report:
+            yield report
         return
     with _bar(progress, command, total=1.0, bar_format="{percentage:3.0f}%|{bar}| {elapsed}<{remaining} {desc}") as bar:
 
-        def report(fraction: float, message: str) -> None:
-            bar.set_description_str(message, refresh=False)
+        def draw(fraction: float, message: str) -> None:
+            bar.set_description_str(message, refresh=message == _COMPILING.format(1))
             bar.update(fraction - bar.n)
 
-        yield report
+        with _compilations_reported_to(draw) as report:
+            yield report
         bar.update(1.0 - bar.n)
+
+
+@contextmanager
+def _compilations_reported_to(progress: Progress) -> Iterator[Progress]:
+    """Report compilations between other reports: the first call on a machine may take a minute longer."""
+    reached = 0.0
+
+    def report(fraction: float, message: str) -> None:
+        nonlocal reached
+        reached = fraction
+        progress(fraction, message)
+
+    with told_of_compilations(lambda number: progress(reached, _COMPILING.format(number))):
+        yield report
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from functools import cache
+from functools import cache, cached_property, update_wrapper
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -35,6 +35,7 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _cleanups: list[Callable[[], object]] = []
+_told: list[Callable[[int], None]] = []
 
 
 @contextmanager
@@ -162,16 +163,36 @@ def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> It
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Return numba's decorator with a cache, if necessary in a temporary folder.
+    """Return a decorator for functions that numba compiles, with a cache, if necessary in a temporary folder.
 
     Division by zero gives infinity or NaN as in NumPy: Python's checks take time in every loop. Wrappers for C would
     only take time to compile.
     """
-    import numba
+    return lambda function: _Kernel(function, {"error_model": "numpy", "no_cfunc_wrapper": True} | options)
 
-    options = {"error_model": "numpy", "no_cfunc_wrapper": True} | options
 
-    def decorate(function: Callable[..., Any]) -> Any:
+class _Kernel:
+    """A function that numba compiles; numba takes longer to import than a map to load, and is imported at first use."""
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._options = options
+        update_wrapper(self, function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._compiled(*arguments)
+
+    def __getattr__(self, name: str) -> Any:
+        """Return an attribute of numba's dispatcher, which compiled callers see as well (`_numba_type_`)."""
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return getattr(self._compiled, name)
+
+    @cached_property
+    def _compiled(self) -> Any:
+        import numba
+
+        _tell_of_compilations()
+        function, options = self.__wrapped__, self._options  # type: ignore[attr-defined]
         try:
             compiled = numba.njit(**options)(function)
         except RuntimeError:  # neither the package nor the home folder can be written
@@ -181,7 +202,33 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             return _with_wide_integers(numba.njit(**(options | {"cache": False}))(function))
         return _with_wide_integers(_outdated_by_others(compiled))
 
-    return decorate
+
+@contextmanager
+def told_of_compilations(tell: Callable[[int], None]) -> Iterator[None]:
+    """Call `tell` with a running number before each compilation; of nested receivers only the first is called."""
+    _told.append(tell)
+    try:
+        yield
+    finally:
+        _told.remove(tell)
+
+
+@cache
+def _tell_of_compilations() -> None:
+    from numba.core import event
+
+    class Listener(event.Listener):
+        number = 0
+
+        def on_start(self, event: object) -> None:
+            self.number += 1
+            for tell in _told[:1]:
+                tell(self.number)
+
+        def on_end(self, event: object) -> None:
+            """Do nothing: the next compilation begins, or the work goes on."""
+
+    event.register("numba:compile", Listener())
 
 
 def _with_wide_integers(compiled: Any) -> Any:

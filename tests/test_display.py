@@ -16,6 +16,7 @@ import sionna_partial as sp
 from sionna_partial import display
 from sionna_partial.display import LONGEST, THUMBNAIL_PX, counting, reporting
 from sionna_partial.errors import SettingsError
+from sionna_partial.process import njit
 
 LINKS = sp.LinkFeatures(np.ones(50), np.zeros(50), np.full(50, 3.0), np.full(50, -71.0))
 PARTIAL = map_of(PICTURE)
@@ -115,6 +116,23 @@ def test_a_callable_is_called() -> None:
     assert calls == [(0.5, "half"), (1, 2, "one")]
     with pytest.raises(SettingsError, match=r"progress = 1 is not allowed: give True, False or a callable"):
         reporting(1).__enter__()  # type: ignore[arg-type]
+
+
+@pytest.mark.usefixtures("at_once")
+def test_compilations_are_reported_where_work_stands() -> None:
+    """To the first receiver alone: it knows the whole work; without a terminal at once, in a command."""
+    calls: list[Any] = []
+    with reporting(lambda *call: calls.append(call)) as report:
+        report(0.5, "half")
+        with reporting(report) as part:
+            part(0.7, "a part")
+            assert njit()(lambda number: number + 1)(2.0) == 3.0
+    assert calls[:2] == [(0.5, "half"), (0.7, "a part")]
+    assert [fraction for fraction, _ in calls[2:]] == [0.7]
+    assert re.fullmatch(r"compiling, once: kernel \d+ of about 200", calls[2][1])
+    with redirect_stderr(Terminal()) as terminal, reporting(None):
+        assert njit()(lambda number: number + 2)(2.0) == 4.0
+    assert re.search("  0%.*compiling, once: kernel", terminal.getvalue())
 
 
 @pytest.mark.usefixtures("at_once")

@@ -5,9 +5,6 @@ from typing import Any
 import numpy as np
 import shapely
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats, Indices, cross
 from sionna_partial.process import njit
@@ -82,6 +79,10 @@ def clip_slab(corners_m, values, low, high):
 
 def merge_points(points_m: Floats, distance_m: float = MERGE_M) -> Indices:
     """Return for each point (V,) the first one within the distance."""
+    from scipy.sparse import coo_array  # plans do without these, which take long to import
+    from scipy.sparse.csgraph import connected_components
+    from scipy.spatial import cKDTree
+
     unique, first, inverse = np.unique(points_m, axis=0, return_index=True, return_inverse=True)
     if not len(unique):
         return np.zeros(0, np.intp)
