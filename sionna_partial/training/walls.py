@@ -16,7 +16,7 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.datasets.home_links import home_sensor, map_area, points_in
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.map_networks import adam_w, turned, turned_offsets
+from sionna_partial.prediction.map_networks import adam_w
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
@@ -165,6 +165,21 @@ def _part(lines: Lines, rng: np.random.Generator) -> Lines | None:
         turned_offsets((each - middle).astype(np.float32), turn) + IMAGE_CELLS / 2 for each in (part.start, part.end)
     )
     return part._replace(image=turned(image[None], turn)[0], start=start, end=end)
+
+
+def turned(image: NDArray[np.uint8], turn: int) -> NDArray[np.uint8]:
+    """Return one of the eight orientations of squares (K, S, S, C)."""
+    image = image[:, :, ::-1] if turn & 1 else image
+    image = image[:, ::-1] if turn & 2 else image
+    return image.transpose(0, 2, 1, 3) if turn & 4 else image
+
+
+def turned_offsets(offsets_m: NDArray[np.float32], turn: int) -> NDArray[np.float32]:
+    """Return offsets (N, 2) in the same orientation."""
+    x, y = offsets_m.T
+    x = -x if turn & 1 else x
+    y = -y if turn & 2 else y
+    return np.stack([y, x] if turn & 4 else [x, y], axis=1)
 
 
 if __name__ == "__main__":
