@@ -75,7 +75,7 @@ WALL_WORDS = {
 def _plain(text: str) -> str:
     """Return text in lower case without accents."""
     kept = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
-    return "".join(kept).casefold().translate(str.maketrans({"ł": "l", "ø": "o", "æ": "ae", "\u0131": "i"}))
+    return "".join(kept).casefold().translate(str.maketrans("łø\u0131", "loi")).replace("æ", "ae")
 
 
 _ENDS = {"<": "(?<![^\\W\\d_])", ">": "(?![^\\W\\d_])", "_": "[ _-]?"}

@@ -178,7 +178,7 @@ def _read(dataset: Any, most: int) -> Array:
 
 def _taken(weights: Iterator[Array], *shape: int | None) -> Array:
     """Return the next weights, which must have this shape; None is any length."""
-    found = np.asarray(next(weights, np.empty(0)))
+    found: Array = np.asarray(next(weights, np.empty(0, np.float32)))
     wanted = [length if size is None else size for size, length in itertools.zip_longest(shape, found.shape)]
     if list(found.shape) != wanted:
         raise ValueError(f"weights of shape {found.shape} instead of {shape}")
