@@ -201,10 +201,10 @@ def _overlaps(edges: Floats, count: int) -> Any:
 def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, ...]) -> Bools:
     """Return known walls at `_PARTS` x `_PARTS` points of each cell."""
     step = cells / _PARTS
-    if step > 1.0:  # thin walls between the points
-        wall = ndimage.maximum_filter(wall, size=2 * math.ceil(0.5 * (step - 1.0)) + 1)
+    spare = max(0, math.ceil(0.5 * (step - 1.0) - 1e-9))  # thin walls lie between points that are further apart
+    wall = ndimage.maximum_filter(np.pad(wall, spare), size=2 * spare + 1)
     sampled = np.zeros(tuple(_PARTS * count for count in shape), dtype=bool)
-    at = [first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
+    at = [spare + first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
     for aside in itertools.product((-_ASIDE_CELLS, _ASIDE_CELLS), repeat=2):
         rows, columns = (np.floor(axis + move).astype(np.intp) for axis, move in zip(at, aside, strict=True))
         inside = [(index >= 0) & (index < count) for index, count in zip((rows, columns), wall.shape, strict=True)]
