@@ -67,7 +67,9 @@ Strict = Annotated[bool, typer.Option("--strict", help="Read the map file to the
 HeightBand = Annotated[
     tuple[float, float] | None, typer.Option(metavar="LOW HIGH", help=_BAND_HELP, show_default=False)
 ]
-Up = Annotated[str | None, typer.Option(metavar="y|z|-y|-z", help="Of a mesh or cloud: the axis up.", show_default=False)]
+Up = Annotated[
+    str | None, typer.Option(metavar="y|z|-y|-z", help="Of a mesh or cloud: the axis up.", show_default=False)
+]
 WallHeight = Annotated[
     float | None, typer.Option(help="Height of walls and ceiling [m]. Default: the map's.", show_default=False)
 ]
