@@ -82,8 +82,9 @@ def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = Non
         warn_of_axis(what, _axis_up(vertices * notes.unit_m, triangles, usual), axis, why)
     vertices = vertices @ TURNS[axis].T
     if is_valid:
-        turn = levelling(what, surfaces_of(vertices[triangles] * notes.unit_m), notes)
-        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        corners = vertices[triangles]
+        turn = levelling(what, surfaces_of(corners * notes.unit_m), notes)
+        middle = (corners.min(axis=(0, 1), initial=np.inf) + corners.max(axis=(0, 1), initial=-np.inf)) / 2
         vertices = (vertices - middle) @ turn.T + middle if turn[2, 2] < 1.0 else vertices
     reason = "up" if up else "the specification of glTF" if axis == "y" else "the default"
     notes.notes.append(f"{axis} of the file points up ({reason})")
