@@ -72,10 +72,13 @@ WALL_WORDS = {
 """Patterns of names of layers with walls, columns and windows; < and > are ends of words, accents do not count."""
 
 
+_LETTERS = str.maketrans({"ł": "l", "ø": "o", "æ": "ae", "\u0131": "i"})
+
+
 def _plain(text: str) -> str:
     """Return text in lower case without accents."""
     kept = (letter for letter in unicodedata.normalize("NFKD", text) if not unicodedata.combining(letter))
-    return "".join(kept).casefold().translate(str.maketrans({"ł": "l", "ø": "o", "æ": "ae", "\u0131": "i"}))
+    return "".join(kept).casefold().translate(_LETTERS)
 
 
 _ENDS = {"<": "(?<![^\\W\\d_])", ">": "(?![^\\W\\d_])", "_": "[ _-]?"}
