@@ -314,7 +314,7 @@ def test_noise_near_is_local_continuous_and_turns_and_moves_with_the_map() -> No
     noise = partial.noise_near(points_m)
     assert noise[:300].min() > 0.6
     assert (noise[-300:] == 0.0).all()
-    assert np.abs(np.diff(noise)).max() < 0.02
+    assert np.abs(np.diff(noise)).max() < 0.03
     for transpose, rows, columns in SYMMETRIES:
         turned = PartialMap(transformed(state, transpose, rows, columns), 0.05, (-3.21, 1e3))
         there_m = transformed_points(points_m / 0.05, state.shape, transpose, rows, columns) * 0.05 + turned.origin_m
