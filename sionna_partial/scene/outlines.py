@@ -118,8 +118,9 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     move with the map, unless it equals its mirror image.
 
     `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
-    staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
-    ragged faces (`fit_runs`). Strong range noise puts cells before and behind walls: lines are then in their middle.
+    staircase of a tilted wall becomes one line. Thick walls that are rough there get up to twice as much, and again
+    twice for ragged faces (`fit_runs`). Range noise puts cells before and behind walls: lines move to their middle as
+    the noise within a few metres grows.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
