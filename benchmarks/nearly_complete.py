@@ -3,8 +3,8 @@
 Of links whose ends are both seen and that have no line of sight on the map: the errors of the trace between the mapped
 walls, of the networks alone and of the default predictor. Homes have a lidar of 12 m, and a drift of 0.2 % where the
 range noise is 2 cm. Halls and warehouses of at most `MOST_CELLS` have one of 20 m and, as SLAM closes loops, a drift of
-0.02 %. Truth is the trace of the complete building. FOLDER holds complete maps, one folder with a map.yaml for each, in place of procedural homes.
-Run it with
+0.02 %. Truth is the trace of the complete building. FOLDER holds complete maps, one folder with a map.yaml for each, in
+place of procedural homes. Run it with
 
     python benchmarks/nearly_complete.py --homes 8 --halls 8 --warehouses 8
     python benchmarks/nearly_complete.py --maps ../shared/gibson --homes 4 --halls 0 --warehouses 0
