@@ -386,10 +386,11 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     for index, box in enumerate(ndimage.find_objects(label), start=1):
         around = tuple(slice(side.start - 1, side.stop + 1) for side in box)
         cells = padded[around], label[around] == index, facing_there[around]
-        _, *turn = canonical((cells[0] + 2 * cells[1] + 4 * cells[2]).astype(np.uint8))
-        lengths = (height, width) if turn[0] else (width, height)
-        left = _thinned(*(turned_grid(part, *turn) for part in (*cells, lengths[0][around], lengths[1][around])))
-        thinned[around] &= _turned_back(left, *turn)
+        _, swap, flips = canonical((cells[0] + 2 * cells[1] + 4 * cells[2]).astype(np.uint8))
+        lengths = (height, width) if swap else (width, height)
+        parts = *cells, lengths[0][around], lengths[1][around]
+        left = _thinned(*(turned_grid(part, swap, flips) for part in parts))
+        thinned[around] &= _turned_back(left, swap, flips)
     thinned = thinned[1:-1, 1:-1]
     return thinned, wall & ~thinned & facing
 
