@@ -44,8 +44,9 @@ ROOMS = {
     "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "scene"),
     "tracing": (
-        *("interactions", "power", "paths", "select", "mesh.faces", "walls", "links", "engine", "antennas"),
-        *("plan.room", "plan.clipping", "plan.beams", "plan.reflections", "plan.edges"),
+        *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls", "links", "engine", "antennas"),
+        *("plan.room", "plan.clipping", "plan.views", "plan.layers", "plan.beams", "plan.reflections"),
+        *("plan.arrivals", "plan.joining", "plan.edges"),
         *("mesh.sequences", "mesh.reflections", "stock", "finder"),
         *("path_set", "simulation", "gradients"),
     ),

@@ -17,10 +17,11 @@ from sionna_partial.process import njit
 from sionna_partial.scene.outlines import Plan
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
-from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
+from sionna_partial.tracing.line import Slabs, group_faces, is_far_inside, is_free_between, reflects_inside
+from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, gain_towards
 from sionna_partial.tracing.select import Limits
-from sionna_partial.tracing.walls import Interior, group_faces, is_far_inside, is_free_between, reflects_inside
+from sionna_partial.tracing.walls import Interior
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
 """Surfaces: none, floor, ceiling, vertical edge; from `WALLS` on walls or entries of a trail."""
@@ -96,16 +97,19 @@ class Building(NamedTuple):
 class Rise(NamedTuple):
     """Heights along an unfolded path [m]: `height_m` in all, `to_first_m` to its first reflection at floor or ceiling.
 
-    `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections.
+    `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections. The path
+    begins at `start_m` in a room of the height `room_m`.
     """
 
     height_m: float
     to_first_m: float
     up: float
     bounces: int
+    start_m: float
+    room_m: float
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def has_variant(variant, room):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
@@ -115,61 +119,61 @@ def has_variant(variant, room):
     return room.floor and room.ceiling
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def rise_of(variant, room, target):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
         rise = target[2] - room.tx_m[2]
-        return Rise(abs(rise), 0.0, 1.0 if rise >= 0.0 else -1.0, bounces)
+        return Rise(abs(rise), 0.0, 1.0 if rise >= 0.0 else -1.0, bounces, room.tx_m[2], room.height_m)
     to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
     last_is_floor = (bounces % 2 == 1) == (first == FLOOR)
     from_last = target[2] if last_is_floor else room.height_m - target[2]
     height = to_first + (bounces - 1) * room.height_m + from_last
-    return Rise(height, to_first, -1.0 if first == FLOOR else 1.0, bounces)
+    return Rise(height, to_first, -1.0 if first == FLOOR else 1.0, bounces, room.tx_m[2], room.height_m)
 
 
-@njit(cache=True)
-def height_at(fraction, room, rise):
+@njit(cache=True, borrows=True)
+def height_at(fraction, rise):
     travelled = fraction * rise.height_m
     if rise.bounces == 0 or travelled <= rise.to_first_m:
-        return room.tx_m[2] + rise.up * travelled
-    legs = int((travelled - rise.to_first_m) // room.height_m)
-    rest = travelled - rise.to_first_m - legs * room.height_m
-    return rest if (legs % 2 == 0) == (rise.up < 0.0) else room.height_m - rest
+        return rise.start_m + rise.up * travelled
+    legs = int((travelled - rise.to_first_m) // rise.room_m)
+    rest = travelled - rise.to_first_m - legs * rise.room_m
+    return rest if (legs % 2 == 0) == (rise.up < 0.0) else rise.room_m - rest
 
 
-@njit(cache=True)
-def fraction_at_turn(turn, room, rise):
+@njit(cache=True, borrows=True)
+def fraction_at_turn(turn, rise):
     """Return the fraction of a path's length at reflection number `turn` at floor or ceiling; 2 if there is none."""
-    return (rise.to_first_m + turn * room.height_m) / rise.height_m if turn < rise.bounces else 2.0
+    return (rise.to_first_m + turn * rise.room_m) / rise.height_m if turn < rise.bounces else 2.0
 
 
-@njit(cache=True)
-def merge_heights(trail, count, room, target, rise, surface, vertices, row):
-    """Write one row in path order: the `count` entries of a trail, and the reflections at floor and ceiling."""
-    entry = turn = np.int64(0)
-    px, py, done = room.tx_m[0], room.tx_m[1], 0.0
+@njit(cache=True, borrows=True)
+def merge_heights(points, count, tx_m, target, rise, surface, vertices, row):
+    """Write one row in path order: the `count` points of a trail, and the reflections at floor and ceiling."""
+    entry = turn = 0
+    px, py, done = tx_m[0], tx_m[1], 0.0
     for depth in range(count + rise.bounces):
-        fraction = fraction_at_turn(turn, room, rise)
-        if entry < count and trail.points[entry, 2] <= fraction:
-            px, py, done = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+        fraction = fraction_at_turn(turn, rise)
+        if entry < count and points[entry, 2] <= fraction:
+            px, py, done = points[entry, 0], points[entry, 1], points[entry, 2]
             surface[row, depth] = WALLS + entry
             vertices[row, depth, 0], vertices[row, depth, 1] = px, py
-            vertices[row, depth, 2] = height_at(done, room, rise)
+            vertices[row, depth, 2] = height_at(done, rise)
             entry += 1
             continue
         nx, ny, stop = target[0], target[1], 1.0
         if entry < count:
-            nx, ny, stop = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+            nx, ny, stop = points[entry, 0], points[entry, 1], points[entry, 2]
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         is_floor = (turn % 2 == 0) == (rise.up < 0.0)
         surface[row, depth] = FLOOR if is_floor else CEILING
         vertices[row, depth, 0], vertices[row, depth, 1] = px + part * (nx - px), py + part * (ny - py)
-        vertices[row, depth, 2] = 0.0 if is_floor else room.height_m
+        vertices[row, depth, 2] = 0.0 if is_floor else rise.room_m
         turn += 1
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def gain_of_departure(room, x, y, rise, length):
     if len(room.gains.table) == 1:
         return 1.0
@@ -208,6 +212,7 @@ class Trail(NamedTuple):
     found: Floats
     wall: NDArray[np.int64]
     visit: NDArray[np.int64]
+    slabs: Slabs
 
 
 def trail_of(plan: Plan) -> Trail:
@@ -222,10 +227,11 @@ def trail_of(plan: Plan) -> Trail:
         np.empty(_ENTRIES),
         np.empty(_ENTRIES, np.int64),
         np.full(len(plan.pieces_m) + 1, -1, np.int64),
+        Slabs.empty(2 * _ENTRIES),
     )
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def cross_leg(plan, interior, leg, count, trail):
     """Add the faces that a leg crosses to `count` entries; return their number, -1 if too many, and walls crossed."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
@@ -240,11 +246,13 @@ def cross_leg(plan, interior, leg, count, trail):
         trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, _cosine(plan, i, dx, dy, length)
         trail.points[entry, 0], trail.points[entry, 1] = leg.start[0] + t * dx, leg.start[1] + t * dy
         trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
+        trail.same_wall[entry] = False
+    line, order = (leg.start, leg.end, length), (dx < 0.0 or (dx == 0.0 and dy < 0.0), False)
     cosine, same_wall = trail.cosine[count : count + n], trail.same_wall[count : count + n]
-    return count + n, group_faces(interior, leg.start, leg.end, trail.found[:n], cosine, same_wall)
+    return count + n, group_faces(interior, line, trail.found[:n], cosine, same_wall, order)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _faces_on(plan, leg, dx, dy, length, trail):
     """Write the pieces that a leg crosses in order, with fractions; return their number, -1 if too many."""
     (ax, ay), (bx, by) = leg.start, leg.end
@@ -286,7 +294,7 @@ def _faces_on(plan, leg, dx, dy, length, trail):
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _crossed_at(piece, ax, ay, dx, dy, length):
     """Return the fraction of a leg at which it crosses a piece of a wall, or -1.
 
@@ -300,14 +308,14 @@ def _crossed_at(piece, ax, ay, dx, dy, length):
     return ((px + u * (qx - px) - ax) * dx + (py + u * (qy - py) - ay) * dy) / (length * length)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _cosine(plan, piece, dx, dy, length):
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
     wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
     return abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def is_reflected_inside(plan, interior, count, trail):
     """Return whether a wall reflects a path in it or in another wall."""
     before, after = (False, False), (False, False)
@@ -320,7 +328,7 @@ def is_reflected_inside(plan, interior, count, trail):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _is_inside(plan, interior, i, trail):
     """Return whether a path is in one wall between entry i and the next, and as `is_far_inside`."""
     first, second = trail.surface[i], trail.surface[i + 1]
@@ -328,42 +336,42 @@ def _is_inside(plan, interior, i, trail):
     if plan.low[crossed]:
         return False, False
     (ax, ay, _), (bx, by, _) = trail.points[i], trail.points[i + 1]
-    dx, dy, turned = bx - ax, by - ay, plan.pieces_m[first, 1] - plan.pieces_m[first, 0]
-    length, size = max(np.hypot(dx, dy), 1e-12), np.hypot(turned[0], turned[1])
+    dx, dy, length = bx - ax, by - ay, max(np.hypot(bx - ax, by - ay), 1e-12)
+    wx = plan.pieces_m[first, 1, 0] - plan.pieces_m[first, 0, 0]
+    wy = plan.pieces_m[first, 1, 1] - plan.pieces_m[first, 0, 1]
     cosine = min(_cosine(plan, first, dx, dy, length), _cosine(plan, second, dx, dy, length))
     inside = length * cosine <= interior.depth_m and not is_free_between(interior, (ax, ay), (bx, by), 0.0, 1.0)
-    turn = _cosine(plan, second, -turned[1], turned[0], size)
+    turn = _cosine(plan, second, -wy, wx, np.hypot(wx, wy))
     return inside, is_far_inside(interior, turn, length * _cosine(plan, crossed, dx, dy, length))
 
 
-@njit(cache=True)
-def has_long_legs(trail, count, length):
-    previous = 0.0
-    for k in range(count):
-        if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:
-            return False
-        previous = trail.points[k, 2]
-    return (1.0 - previous) * length >= SHORTEST_LEG_M
-
-
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def add_entry(trail, count, piece, kind, x, y, fraction):
     trail.surface[count], trail.kind[count], trail.same_wall[count] = piece, kind, False
     trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = x, y, fraction
     return count + 1
 
 
-@njit(cache=True)
-def empty_paths(count, size):
-    vertices, same_wall = np.zeros((count, size, 3)), np.zeros((count, size), np.bool_)
-    return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
+class WrittenPaths(NamedTuple):
+    """C paths with up to S interactions: `surface`, `kind`, `same_wall` (C, S) and `vertices_m` (C, S, 3)."""
+
+    surface: NDArray[np.int32]
+    kind: NDArray[np.uint8]
+    vertices_m: Floats
+    same_wall: Bools
+
+    @classmethod
+    def empty(cls, count: int, size: int) -> "WrittenPaths":
+        surface, kind = np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8)
+        return cls(surface, kind, np.zeros((count, size, 3)), np.zeros((count, size), np.bool_))
 
 
-@njit(cache=True, forceinline=True)  # copying the arguments of a call would take longer than the function
+@njit(cache=True, borrows=True, forceinline=True)  # copying the arguments would take as long as the function
 def write_path(trail, count, room, owner, target, variant, paths, row):
+    """Write the `count` entries of a trail, with the reflections at floor and ceiling of a variant, as one row."""
     surface, kind, vertices, same_wall = paths
     rise = rise_of(variant, room, target)
-    merge_heights(trail, count, room, target, rise, surface, vertices, row)
+    merge_heights(trail.points, count, room.tx_m, target, rise, surface, vertices, row)
     for d in range(count + rise.bounces):
         entry = surface[row, d] - WALLS
         if entry < 0:
@@ -377,7 +385,7 @@ def write_path(trail, count, room, owner, target, variant, paths, row):
 def candidates_of(
     geometry: SceneGeometry,
     rx: NDArray[np.integer],
-    paths: tuple[NDArray[np.int32], NDArray[np.uint8], Floats, Bools],
+    paths: WrittenPaths,
     *,
     opaque: bool,
     wedge: NDArray[np.int32] | None = None,
@@ -468,7 +476,7 @@ def _lower(kind, face, vertices, same, walls, lids, ends, interior):
     return crossings
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _add_lids(here, there, lids, kind, face, vertices, count):
     """Add the tops that a segment crosses to `count` entries, in order; return their number, -1 if too many."""
     corners, heights, faces = lids
@@ -508,4 +516,5 @@ def _group(face, vertices, same, span, ends, walls_m, interior):
             wall = walls_m[face[begin + j] // 2]
             wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
             cosine[j] = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
-    return group_faces(interior, here, there, found, cosine, same[begin:end])
+    line, order = (here, there, np.hypot(dx, dy)), (dx < 0.0 or (dx == 0.0 and dy < 0.0), False)
+    return group_faces(interior, line, found, cosine, same[begin:end], order)
