@@ -45,7 +45,15 @@ ROOMS = {
     "scene": ("outlines", "scene"),
     "tracing": (
         *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls", "links", "engine", "antennas"),
-        *("plan.room", "plan.clipping", "plan.views", "plan.layers", "plan.beams", "plan.reflections"),
+        *(
+            "plan.room",
+            "plan.obstacles",
+            "plan.clipping",
+            "plan.views",
+            "plan.layers",
+            "plan.beams",
+            "plan.reflections",
+        ),
         *("plan.arrivals", "plan.joining", "plan.edges"),
         *("mesh.sequences", "mesh.reflections", "stock", "finder"),
         *("path_set", "simulation", "gradients"),

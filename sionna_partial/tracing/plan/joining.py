@@ -6,7 +6,7 @@
 A rough bound, by the azimuth in whole degrees, drops most pairs before the diffraction is computed.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -219,7 +219,8 @@ def list_joined(
 
     One number encodes an arrival and a variant.
     """
-    columns, first, used = (np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)), 0, 0
+    columns: tuple[Any, ...] = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)
+    first = used = 0
     while first < len(joining.departures.rx):
         first, used = _list_joined(first, room, materials, joining, columns, used)
         if first < len(joining.departures.rx):

@@ -6,7 +6,7 @@ floor and ceiling. They are selected by their power, as in `power.py`.
 
 from collections.abc import Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,11 +20,11 @@ from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.line import add_slab, has_long_legs, jones_power
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.beams import Beams, BeamTree, Sources, Task, follow, needed_of, trace_beams
+from sionna_partial.tracing.plan.obstacles import Lowered
 from sionna_partial.tracing.plan.room import (
     FACES,
     Building,
     Leg,
-    Lowered,
     Room,
     WrittenPaths,
     add_entry,
@@ -167,7 +167,7 @@ class SpecularCandidates:
         def of_pairs(start: int) -> Listed:
             some = pairs[start : start + pairs_at_once]
             size = len(some) * (2 * depth + 2)
-            columns = np.empty(size, np.int32), np.empty(size, np.int8), np.empty(size)
+            columns: tuple[Any, ...] = np.empty(size, np.int32), np.empty(size, np.int8), np.empty(size)
             inputs = plan.pieces_m, self._building.material, self._building.materials, room, trail_of(plan)
             count = _list_variants(tree, some, depth, *inputs, columns)
             pair, variant, bound = (column[:count].copy() for column in columns)
