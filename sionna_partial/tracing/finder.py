@@ -106,11 +106,11 @@ class MeshScene:
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, settings.max_depth)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
         mesh = SolidMesh(*self.faces, self.cells, materials, solver.material_of_face)
-        opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
+        opaque: list[Kind] = [MeshReflections.between_faces(mesh, tx_m, rx_m, settings, rays, gains)]
         if not settings.through_walls:
             return opaque, []
         count = min(SPLIT_RAYS, settings.samples_per_tx)
-        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, count, gains, coarse=coarse)]
+        return opaque, [MeshReflections.through_walls(mesh, tx_m, rx_m, settings, count, gains, coarse=coarse)]
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:

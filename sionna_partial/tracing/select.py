@@ -228,7 +228,7 @@ class Limits(NamedTuple):
         return self.weakest * np.maximum(found, NO_POWER)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def discount_after(limits, reflections):
     return limits.discount ** max(0, reflections - _USUAL_REFLECTIONS)
 
@@ -253,7 +253,7 @@ def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: f
     return NeedsByDistance(distance_m, relative, np.minimum.accumulate(power))
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def matters(fraction, near, needed):
     """Return whether a ray, at least `near` long, may matter to any receiver with a fraction of its power left."""
     at = np.searchsorted(needed.distance_m, near)
