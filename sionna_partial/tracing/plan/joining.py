@@ -130,7 +130,7 @@ class Shape(NamedTuple):
     boundary: float
     sine: float
     slope: float
-    bounces: int
+    bounces: int | np.int64
 
 
 @njit(cache=True, borrows=True)
