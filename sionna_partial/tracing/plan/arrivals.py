@@ -7,7 +7,7 @@ tx         \
 angle = 0           angle of the wedge; `lit` is True where a path arrives in front of the 0-face.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,7 +121,7 @@ def arrive(
     )
     if building.limits.walls:
         _cross_all(edges, building, trail, every, good)
-    columns = [column[good] for column in every[1:]]
+    columns: list[Any] = [column[good] for column in every[1:]]
     return Arrivals(np.searchsorted(columns[0], np.arange(len(edges.position_m) + 1)), *columns)
 
 

@@ -117,7 +117,7 @@ class Reflected(NamedTuple):
 
     material: NDArray[np.int64]
     cosine: Floats
-    count: np.int64
+    number: np.int64
 
 
 class Shape(NamedTuple):
@@ -130,7 +130,7 @@ class Shape(NamedTuple):
     boundary: float
     sine: float
     slope: float
-    bounces: np.int64
+    bounces: int | np.int64
 
 
 @njit(cache=True, borrows=True)
@@ -140,12 +140,12 @@ def strength_of(materials, before, face, after, shape, terms, flat_material):
     `face` is the material of the wedge and the cosines at its faces, `terms` are from `utd_terms`.
     """
     field, largest = VERTICAL, materials.largest
-    for k in range(before.count):
+    for k in range(before.number):
         field = at_wall(largest, before.material[k], before.cosine[k], shape.sine, shape.slope, field)
     tables = materials.reflection, materials.transition
     cosines = face[1], face[2]
     field = at_edge(tables, face[0], terms, shape.boundary, cosines, shape.sine, shape.slope, field)
-    for k in range(after.count):
+    for k in range(after.number):
         field = at_wall(largest, after.material[k], after.cosine[k], shape.sine, shape.slope, field)
     return at_flats(largest, flat_material, shape.slope, shape.bounces, field)
 

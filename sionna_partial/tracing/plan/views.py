@@ -120,7 +120,7 @@ def _divide(count, plan, scratch, span, wall):
         middle = 0.5 * (t0 + t1)
         begun, number = move_to(middle, scratch, count, begun, number)
         span, wall = grow(span, windows + number + 1), grow(wall, windows + number + 1)
-        best, best_w, some_low = -1, 0.0, False
+        best, best_w, some_low = np.int64(-1), 0.0, False
         for c in active[:number]:
             w = nearness(scratch, c, middle)
             if low[walls[c]]:
