@@ -156,7 +156,7 @@ class UnseenWalls(NamedTuple):
 
     def save(self, path: Path) -> None:
         """Write the configuration and the weights of trained Keras models."""
-        arrays = {}
+        arrays: dict[str, Any] = {}
         for name, model in self._asdict().items():
             arrays[name] = np.array(json.dumps(json.loads(model.to_json())["config"]))
             arrays |= {f"{name}_{number}": values for number, values in enumerate(model.get_weights())}
