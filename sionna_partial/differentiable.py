@@ -19,13 +19,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.errors import MapError
@@ -97,6 +97,8 @@ _LIMITS = {
     "thickness_m": (0.0, 10.0),
     "frequency_hz": FREQUENCIES_HZ,
 }
+
+_Numbers: TypeAlias = NDArray[np.integer[Any]]
 
 
 class SmoothLengths:
@@ -434,7 +436,7 @@ class DifferentiableLinks:
     def _legs(self) -> _Legs:
         return _Legs(self._scene.partial, self._paths)
 
-    def _sum(self, power: Any, rx: NDArray[np.int32]) -> Any:
+    def _sum(self, power: Any, rx: _Numbers) -> Any:
         return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
 
     def _traces(self, power: Any, given: Mapping[str, Any]) -> tuple[list[WallTrace], Any]:
@@ -465,7 +467,7 @@ class DifferentiableLinks:
         classes = self._scene.partial.wall_classes(self._paths.vertices_m)
         return np.stack(unnamed_counts(self._paths.interactions, classes), axis=1).astype(np.float64)
 
-    def _changed_db(self, gain_db: Floats, power: Any, first_power: Any, rx: Indices | None = None) -> Any:
+    def _changed_db(self, gain_db: Floats, power: Any, first_power: Any, rx: _Numbers | None = None) -> Any:
         """Return gains (N,) [dB] that change as the sums of the powers of paths, to `rx`, do; outages stay."""
         rx = self._paths.path_rx if rx is None else rx
         now_db, first_db = (_gain_db(self._sum(each, rx)) for each in (power, first_power))
@@ -494,7 +496,7 @@ class DifferentiableLinks:
         ends_m = [tf.broadcast_to(self.base.tx_m if tx_m is None else tx_m, rx_m.shape), tf.constant(rx_m)]
         moved = self._moved_features(tx_m, self._phi.gain_db)
         lengths_m = (tf.convert_to_tensor(moved[name]) for name in ("unobserved_distance_m", "distance_m"))
-        walls = scene._walls.counts(DirectLines(*ends_m, *lengths_m, traces[0].known), ops)
+        walls = scene._walls.counts(DirectLines._make([*ends_m, *lengths_m, traces[0].known]), ops)
         return [by_mean_losses(trace, walls, scene.simulation.trace_settings.max_walls, ops) for trace in traces]
 
     def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:

@@ -86,8 +86,7 @@ def make_context(phi):
 
 def make_seen_links(count, seed=0):
     phi, state, gain_db = make_links(count, seed)
-    phi = dataclasses.replace(phi, context=make_context(phi))
-    return phi.with_windows(corridors(), corridor_of(phi)), state, gain_db
+    return dataclasses.replace(phi, context=make_context(phi)), state, gain_db
 
 
 def features(
@@ -100,9 +99,8 @@ def features(
     gain_db=-70.0,
     indirect_db=-150.0,
     distance_m=None,
-    windows=True,
 ):
-    """Return features of links on one map, or several with one for each link, with a context and windows.
+    """Return features of links on one map, or several with one for each link, with a context.
 
     All paths but the direct one have the gains `indirect_db`.
     """
@@ -123,8 +121,7 @@ def features(
         **walls_of_links(count),
     )
     distance_m = np.linalg.norm(rx_m - tx_m, axis=1) if distance_m is None else np.full(count, distance_m)
-    phi = LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)
-    return phi.with_windows(maps, map_index) if windows else phi
+    return LinkFeatures(state, unobserved_m, distance_m, np.full(count, gain_db), context)
 
 
 def p_kept(phi):
@@ -152,6 +149,17 @@ def assert_valid(prediction):
             assert (values >= 0.0).all(), name
 
 
+def assert_symmetric(predictor, phi):
+    """Predict links with their ends swapped, some of which have one end seen, to the same."""
+    of = phi.context
+    assert (of.tx_seen != of.rx_seen).any()
+    ends = {"tx_m": of.rx_m, "rx_m": of.tx_m, "tx_seen": of.rx_seen, "rx_seen": of.tx_seen}
+    swapped = dataclasses.replace(phi, context=dataclasses.replace(of, **ends, exposure=of.exposure[:, ::-1]))
+    one, other = (arrays(predictor.predict(each)) for each in (phi, swapped))
+    for name, values in one.items():
+        np.testing.assert_allclose(other[name], values, rtol=1e-5, atol=1e-5, err_msg=name)
+
+
 @functools.cache
 def quick_predictor():
     return Predictor.fit(*make_links(900), homes=["a", "b"], settings=QUICK)
@@ -159,10 +167,10 @@ def quick_predictor():
 
 @contextmanager
 def shallow_map_networks() -> Iterator[None]:
-    """Let map networks have few layers, and see few windows at once: TensorFlow traces each layer of a training."""
+    """Let map networks have few layers, and see few maps at once: TensorFlow traces each layer of a training."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_networks, "_WIDTHS", ((4, 8), (4, 8)))
-        patch.setattr(map_networks, "WINDOWS_AT_ONCE", 4)
+        patch.setattr(map_networks, "_WIDTHS", (4, 8))
+        patch.setattr(map_networks, "MAPS_AT_ONCE", 4)
         yield
 
 

@@ -10,7 +10,7 @@ from traced import made_links
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.prediction.unobserved import map_windows
+from sionna_partial.prediction.space import MapSpace
 
 
 def phi_of(count=3):
@@ -31,7 +31,7 @@ def test_link_features():
     assert phi.distance_m.tolist() == [3.0, 6.0]
     assert phi.unobserved_distance_m == pytest.approx([0.0, 2.5])
     assert phi.gain_db.tolist() == [-72.0, -72.0]
-    np.testing.assert_array_equal(phi.context.windows, map_windows(HALF, np.array([[1.5, 2.5]])))
+    assert phi.context.spaces == (MapSpace.of(HALF),)
     assert phi.context.rx_m.tolist() == rx.tolist()
     assert phi.context.rx_seen.tolist() == [True, False]
 

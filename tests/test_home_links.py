@@ -10,7 +10,15 @@ import pytest
 from link_tables import assert_same
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.datasets.home_links import NEAREST_M, HomeSource, home_links, home_sensor, home_sources, map_area
+from sionna_partial.datasets.home_links import (
+    NEAREST_M,
+    HomeSource,
+    enclosed_map,
+    home_links,
+    home_sensor,
+    home_sources,
+    map_area,
+)
 from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, write_shard
 from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
@@ -110,6 +118,25 @@ class TestPlaces:
         table = home_links(home, "two rooms", replace(SETTINGS, stages=(0, 0.3, 0.6)))
         assert np.unique(table.stage).tolist() == [0.0, 0.3, 0.6]
         assert (table.observed_fraction >= table.stage).all()
+
+
+def test_a_stage_of_1_is_a_map_that_is_closed_where_the_robot_saw_nothing(home: PartialMap) -> None:
+    """What is known stays, walls come between the free cells and the unknown; truth is of the home."""
+    settings = replace(SETTINGS, stages=(0.3, 1), sensor=SensorSettings(field_of_view_deg=90.0))
+    table = home_links(home, "two rooms", settings)
+    seen, closed = table.maps
+    assert closed.is_complete
+    assert not seen.is_complete
+    known = seen.state != CellState.UNKNOWN
+    np.testing.assert_array_equal(closed.state[known & (closed.state != CellState.UNKNOWN)], seen.state[known])
+    (enclosed,) = {each.is_complete for each in [enclosed_map(seen)]}
+    assert enclosed
+    changed = enclosed_map(seen).state != seen.state
+    assert changed.any()
+    assert (seen.state[changed] == CellState.UNKNOWN).all()
+    assert (enclosed_map(seen).state[changed] == CellState.WALL).all()
+    last, first = (table.take(table.stage == stage) for stage in (1, 0.3))
+    np.testing.assert_array_equal(last.gain_db, first.gain_db)
 
 
 class TestTruthAndFeatures:

@@ -72,7 +72,7 @@ ROOMS = {
         *("path_set", "simulation", "gradients"),
     ),
     "prediction": (
-        *("unobserved", "features", "evaluate"),
+        *("evaluate", "unobserved", "space", "features", "rule"),
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),

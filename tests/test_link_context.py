@@ -16,6 +16,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
+from sionna_partial.prediction.space import MapSpace
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import DatasetSettings, TraceSettings
 from sionna_partial.tracing.simulation import trace_links
@@ -117,24 +118,23 @@ class TestLinks:
 
 
 def same(first, second):
-    names = {field.name for field in dataclasses.fields(LinkContext)} - {"windows", "window_index"}
-    windows = (each.windows[each.window_index] for each in (first, second))
+    names = {field.name for field in dataclasses.fields(LinkContext)} - {"spaces", "map_index"}
+    spaces = ([each.spaces[number] for number in each.map_index] for each in (first, second))
     pairs = [(getattr(first, name), getattr(second, name)) for name in names]
-    return np.array_equal(*windows) and all(np.array_equal(one, other) for one, other in pairs)
+    return next(spaces) == next(spaces) and all(np.array_equal(one, other) for one, other in pairs)
 
 
 def context_of(count=3, partial=HALF, tx=TX, rx=NEAR):
     return features(partial, np.tile(rx, (count, 1)), tx_m=tx).context
 
 
-class TestTakeAndConcatenate:
-    def test_windows_are_shared(self):
-        one, two = context_of(2), context_of(3, partial=WHOLE)
-        both = LinkContext.concatenate([one, two, one.take(slice(1)), two.take(np.array([2]))])
-        assert both.windows.tolist() == [*one.windows.tolist(), *two.windows.tolist()]
-        assert both.window_index.tolist() == [0, 0, 1, 1, 1, 0, 1]
-        assert same(both.take(slice(2, 5)), two)
-        assert LinkContext.concatenate([both.take(np.array([3])), both]).windows is both.windows
+def test_fields_of_maps_are_shared_by_links_that_are_taken_and_joined():
+    one, two = context_of(2), context_of(3, partial=WHOLE)
+    both = LinkContext.concatenate([one, two, one.take(slice(1)), two.take(np.array([2]))])
+    assert both.spaces == (*one.spaces, *two.spaces)
+    assert both.map_index.tolist() == [0, 0, 1, 1, 1, 0, 1]
+    assert same(both.take(slice(2, 5)), two)
+    assert not same(both.take(slice(3)), two)
 
 
 class TestSeen:
@@ -161,7 +161,12 @@ class TestSeen:
         assert both.tx_seen.tolist() == [True, True, True]
         assert both.complete.tolist() == [False, True, True]
         assert both.take(np.array([2, 0])).complete.tolist() == [True, False]
-        assert both.window_index.tolist() == [0, 1, 1]
+        assert both.map_index.tolist() == [0, 1, 1]
+        for number, partial in enumerate((HALF, WHOLE, WHOLE)):
+            space, (tx_m, rx_m) = MapSpace.of(partial), (both.tx_m[[number]], both.rx_m[[number]])
+            assert both.spaces[both.map_index[number]] is space
+            assert both.exposure[number].tolist() == [*space.exposure_at(tx_m), *space.exposure_at(rx_m)]
+            assert both.route[number] == pytest.approx(space.routes(tx_m[0], rx_m)[0])
         assert not context_of(1, partial=WHOLE, tx=(-1.0, -1.0, 1.5), rx=(11.0, 6.0, 1.5)).complete.any()
 
 
@@ -173,7 +178,7 @@ def possible(partial, tx, rx, state):
     """Return the states that are possible for a link between points counted in cells, which is traced in a state."""
     tx_m, rx_m = (np.array([0.5 * x, 0.5 * y, 1.5]) for x, y in (tx, rx))
     unobserved_m = unobserved_lengths_m(partial, tx_m, rx_m[None])
-    phi = features(partial, rx_m, tx_m=tx_m, unobserved_m=unobserved_m, state=state, windows=False)
+    phi = features(partial, rx_m, tx_m=tx_m, unobserved_m=unobserved_m, state=state)
     return {LinkState(each) for each in np.flatnonzero(phi.context.possible[0])}
 
 
@@ -223,7 +228,7 @@ class TestWalls:
     def test_three_cells_of_wall_leave_no_los_but_traced_on_exact_walls(self, length, noise):
         """Through a wall from its end, the lines beside the direct one are clear."""
         post = drawn("?........ ......... .#######. ......... ?........")
-        vars(post)["wall_noise"] = noise
+        vars(post)["_noise_field"] = np.full(post.shape, noise)
         for state in LinkState:
             found = possible(post, (8.5 - length, 2.5), (8.5, 2.5), state)
             assert (LOS in found) == (length < 3.0 or (state, noise) == (LOS, 0.0))

@@ -99,7 +99,7 @@ def test_a_predictor_is_read_once(tmp_path, monkeypatch):
         sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predict(TX, RX)
     assert read == [path]
     sp.Predictor.load("map").save(path)
-    assert sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predictor.reads_maps
+    assert sp.LinkModel(half_open(sp.CellState.UNKNOWN), path).predictor.has_gate
 
 
 TWO_ROOMS = """

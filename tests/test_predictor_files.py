@@ -20,10 +20,11 @@ from predictor_links import (
 from sionna_partial.errors import OutputError, PredictorError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.prediction import predictor_files
-from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS, MAP_NETWORKS
+from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS
 from sionna_partial.prediction.paper_networks import GAIN_INPUTS, assemble, import_keras, parts
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.predictor_files import CHECKSUMS, FORMAT, digest, pack, shipped_bytes
+from sionna_partial.prediction.rule import GATE_NETWORK
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 pytestmark = QUIET
@@ -128,7 +129,7 @@ def test_foreign_networks_are_refused(saved):
     values = keras.Input((len(LINK_INPUTS),), name="link")
     foreign = keras.Model(values, keras.layers.Dense(LINK_OUTPUTS + 1, name="outputs")(values), name=LINK_NETWORK)
     paper, alone = parts(quick_predictor().model), parts(context_predictor("map").model)
-    del alone[MAP_NETWORKS[1]]
+    del alone[GATE_NETWORK]
     for networks in (alone, paper | {LINK_NETWORK: foreign}, paper | {"third_network": foreign}):
         _forge(saved, pack(assemble(networks)))
         message = r"mine\.keras' has inputs \['distance_m', .*\] and outputs .*: train it"

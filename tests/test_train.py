@@ -97,7 +97,7 @@ class TestTrain:
             seeing = train(table, settings=settings, progress=lambda *call: calls.append(call))
         assert calls[0] == (0.0, "training on 120 links in 2 homes")
         assert seeing.predictor.settings == settings
-        assert {"near_map_network", "far_map_network", "link_network"} <= set(seeing.predictor.model.output)
+        assert {"map_network", "link_network", "gate_network"} <= set(seeing.predictor.model.output)
         assert seeing.baselines.distance.settings == dataclasses.replace(settings, networks="paper")
         assert [share for share, _ in calls] == sorted(share for share, _ in calls)
         assert any(message.startswith("step 0 of 1, loss ") for _, message in calls)

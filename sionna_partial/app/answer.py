@@ -11,7 +11,6 @@ import xarray as xr
 from sionna_partial.app.radio import RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
-from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION
 from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.prediction.predictor import LinkPrediction
 
@@ -42,9 +41,8 @@ class Answer:
         names = [str(each) for each in coverage["tx"].to_numpy()]
         at = xr.DataArray(best, dims=("y", "x")) if name not in names else names.index(name)
         one = every.isel(tx=at)
-        columns = {each: one[each].to_numpy() for each in (*DISTRIBUTION, *COMPONENTS)}
         threshold_db = np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0)[at]
-        above = LinkPrediction(**columns).probability_above(threshold_db)
+        above = LinkPrediction.of_columns(lambda each: one[each].to_numpy()).probability_above(threshold_db)
         found: dict[str, Any] = {"p_above": (("y", "x"), above)}
         if self.network is not None:
             found |= {"best_server": (("y", "x"), best), "sinr_mean_db": self.network["sinr_mean_db"]}

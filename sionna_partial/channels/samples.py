@@ -267,7 +267,8 @@ class _Buildings(NamedTuple):
             return cls(of_draw, parts, np.zeros((len(parts), 0)), np.zeros((len(traced.path_rx), 0)))
         materials, classes = model.wall_materials, model.partial.wall_classes(traced.vertices_m)
         loss_db = np.column_stack([materials.crossing_db, materials.reflection_db])
-        return cls(of_draw, parts, loss_db, np.stack(unnamed_counts(traced.interactions, classes), axis=1) + 0.0)
+        counts = np.stack(unnamed_counts(traced.interactions, classes), axis=1)
+        return cls(of_draw, parts, loss_db, counts.astype(np.float64))
 
     def kept(self, candidates: Indices, paths: Indices) -> Floats:
         """Return the powers (D, Q) of paths (Q,) relative to the trace for candidates (D,)."""

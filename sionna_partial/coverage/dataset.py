@@ -231,8 +231,7 @@ def transmitters_of(coverage: xr.Dataset) -> dict[str, xr.Dataset]:
 def probability_above(coverage: xr.Dataset, threshold_db: float) -> Floats:
     """Return P(path gain > threshold) (..., ny, nx), NaN without receiver; threshold in [-150, 0] dB."""
     require_number("threshold_db", threshold_db, GAIN_FLOOR_DB, 0.0)
-    columns = {name: coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
-    return LinkPrediction(**columns).probability_above(threshold_db)
+    return LinkPrediction.of_columns(lambda name: coverage[name].to_numpy()).probability_above(threshold_db)
 
 
 def cost_grid(
@@ -465,8 +464,8 @@ class CoverageAccessor:
         )
 
     def _probability_of(self, threshold_db: Floats) -> Floats:
-        columns = {name: self._coverage[name].to_numpy() for name in (*DISTRIBUTION, *COMPONENTS)}
-        return LinkPrediction(**columns).probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
+        links = LinkPrediction.of_columns(lambda name: self._coverage[name].to_numpy())
+        return links.probability_above(np.maximum(threshold_db, GAIN_FLOOR_DB))
 
     def radio_map(self, scene: Any, *, scene_offset_m: Sequence[float] = (0.0, 0.0)) -> Any:
         """Return the mean path gain as a radio map of Sionna RT; cells without receiver or in outage are empty.

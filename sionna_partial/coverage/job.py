@@ -329,7 +329,8 @@ class CoverageJob:
                 "with probability %.2f powers were measured and no path gains: give gains if their offset is known",
                 p_any,
             )
-        assimilations, measured, others = [], transmitter.measured, self.others.get(transmitter.name, ())
+        assimilations: list[Assimilation] = []
+        measured, others = transmitter.measured, self.others.get(transmitter.name, ())
         if measured is None and others:
             measured = Measurements(position_m, np.zeros((0, 3)), np.zeros(0))
         if measured is not None:

@@ -14,7 +14,7 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import number_of, require, require_names, require_type, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage.dataset import ANTENNA, COMPONENTS, DISTRIBUTION, TX_COORDINATES, transmitters_of
+from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, transmitters_of
 from sionna_partial.coverage.link_budget import LinkBudget, transmit_powers_dbm
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
@@ -114,13 +114,12 @@ def network_map(
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
     tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)
-    columns = {name: coverage[name].to_numpy()[:, valid].astype(np.float64) for name in (*DISTRIBUTION, *COMPONENTS)}
+    every = LinkPrediction.of_columns(lambda name: coverage[name].to_numpy()[:, valid].astype(np.float64))
     latents = JointLatents(_map_of(coverage))
     parts = []
     for start in range(0, len(rx_m), _RECEIVERS_AT_ONCE):
         here = slice(start, start + _RECEIVERS_AT_ONCE)
-        links = LinkPrediction(**{name: values[:, here] for name, values in columns.items()})
-        gain_db = latents.draw(links, tx_m, rx_m[here], n, [seed])[1]
+        gain_db = latents.draw(every.take((slice(None), here)), tx_m, rx_m[here], n, [seed])[1]
         received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + powers_dbm[:, None]
         parts.append(_statistics(received_dbm, budget))
     found = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in VARIABLES}

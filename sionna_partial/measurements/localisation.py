@@ -182,7 +182,7 @@ def locate_transmitter(
     log_p = np.full((2, block.max() + 1), -np.inf)
     log_p[:, first] = compare(np.flatnonzero(possible)[of_first], 0.0)
     log_p = np.where(possible, log_p[:, block], -np.inf)
-    likely = likely_region(np.bincount(block, weights=_normalised(log_p).sum(axis=0)))
+    likely = likely_region(np.asarray(np.bincount(block, _normalised(log_p).sum(axis=0)), dtype=np.float64))
     if likely.sum() <= REFINED:
         finer = np.flatnonzero(possible & likely[block])
         log_p[:, finer] = compare(finer, 0.5)

@@ -415,10 +415,12 @@ class Search:
         _, found, _ = self.model.predict_each(ends_m, report)
 
         def placed(links: LinkPrediction) -> LinkPrediction:
-            columns = {name: np.full(far.shape, value) for name, value in OUTAGE.items()}
-            for name, column in columns.items():
-                column[far] = getattr(links, name)
-            return LinkPrediction(**columns)
+            def column(name: str) -> Floats:
+                values = np.full(far.shape, OUTAGE[name])
+                values[far] = getattr(links, name)
+                return values
+
+            return LinkPrediction.of_columns(column)
 
         return found.mapped(placed), far
 

@@ -114,7 +114,7 @@ def _flag(name: str, column: int | None = None) -> Make:
 
 
 def _log_length(length_m: Callable[[Values], Any]) -> Make:
-    return lambda of, ops: ops.log(1.0 + length_m(of) / _SCALE_M)
+    return lambda of, ops: ops.log(1.0 + ops.maximum(length_m(of), 0.0) / _SCALE_M)
 
 
 def _gain(gain_db: Callable[[Values], Any]) -> Make:
@@ -138,7 +138,7 @@ LINK_INPUTS: dict[str, Make] = {
     "both_exposed": lambda of, ops: of["exposure"][:, 0] * of["exposure"][:, 1],
     "noise": lambda of, ops: of["wall_noise"],
     "route": lambda of, ops: of["route"] / 10.0,
-    "detour": _log_length(lambda of: np.maximum(of["route"] * WALK_M - of["distance_m"], 0.0)),
+    "detour": _log_length(lambda of: of["route"] * WALK_M - of["distance_m"]),
     **{f"{state.name.lower()}_possible": _flag("possible", state) for state in LinkState},
     "walled": lambda of, ops: ops.minimum(of["walled_m"], 1.0),
     "log_distance": lambda of, ops: ops.log(of["near_m"]),

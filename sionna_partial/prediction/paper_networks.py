@@ -22,7 +22,7 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.errors import BackendError, PredictorError
 from sionna_partial.llvm import load_llvm
-from sionna_partial.prediction.evaluate import Network, array_ops
+from sionna_partial.prediction.evaluate import array_ops
 from sionna_partial.prediction.features import LinkFeatures, shifted_gain_db
 from sionna_partial.process import signals_held
 from sionna_partial.settings import PredictorSettings
@@ -267,7 +267,7 @@ def _blocks(phi: LinkFeatures) -> Iterator[LinkFeatures]:
         yield phi.take(slice(start, start + _LINKS_AT_ONCE))
 
 
-def network_ranges(networks: Mapping[str, Network]) -> dict[str, dict[str, list[float]]]:
+def network_ranges(networks: Mapping[str, Any]) -> dict[str, dict[str, list[float]]]:
     ranges = {}
     for name in OUTPUT_WIDTHS:
         network = networks[name]

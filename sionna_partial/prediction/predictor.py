@@ -119,6 +119,11 @@ class LinkPrediction(Shown):
         mixed = cls.of_parts(*over_materials([part.by_state for part in parts], weights, residual_db))
         return replace(mixed, by_material=(tuple(parts), weights))
 
+    @classmethod
+    def of_columns(cls, column: Callable[[str], Any]) -> LinkPrediction:
+        """Return the distribution whose arrays a function gives by name."""
+        return LinkPrediction(**{name: column(name) for name in cls.COLUMNS})
+
     def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
         """Apply `change` to this distribution and to its parts by material."""
         return self._combined([self], lambda links: change(links[0]))
@@ -215,8 +220,8 @@ class LinkPrediction(Shown):
 
         return self.mapped(amplified)
 
-    def take(self, index: NDArray[np.generic] | slice) -> LinkPrediction:
-        """Select links by an index array, a mask (N,) or a slice."""
+    def take(self, index: NDArray[np.generic] | slice | tuple[slice, slice]) -> LinkPrediction:
+        """Select links by an index array, a mask (N,), or slices."""
         return self._by_column(lambda column: column[index])
 
     @classmethod
@@ -224,7 +229,7 @@ class LinkPrediction(Shown):
         """Join links."""
 
         def join(parts: Sequence[LinkPrediction]) -> LinkPrediction:
-            return cls(*(np.concatenate([getattr(part, name) for part in parts]) for name in cls.COLUMNS))
+            return cls.of_columns(lambda name: np.concatenate([getattr(part, name) for part in parts]))
 
         return cls._combined(parts, join)
 
@@ -240,14 +245,14 @@ class LinkPrediction(Shown):
         return self._by_column(lambda column: column.reshape(shape))
 
     def _by_column(self, change: Callable[[Floats], Floats]) -> LinkPrediction:
-        return self.mapped(lambda links: LinkPrediction(*(change(getattr(links, name)) for name in self.COLUMNS)))
+        return self.mapped(lambda links: self.of_columns(lambda name: change(getattr(links, name))))
 
     def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
         """Return `other` where a mask (N,) is True, this distribution elsewhere."""
 
         def choose(links: Sequence[LinkPrediction]) -> LinkPrediction:
-            columns = ((getattr(each, name) for each in links) for name in self.COLUMNS)
-            return LinkPrediction(*(np.where(taken, there, here) for here, there in columns))
+            here, there = links
+            return self.of_columns(lambda name: np.where(taken, getattr(there, name), getattr(here, name)))
 
         return self._combined([self, other], choose)
 
@@ -462,7 +467,7 @@ class Predictor(Shown):
         Raises
         ------
         PredictorError
-            For features with a context but without windows, if map networks read them.
+            If `features` are no LinkFeatures.
         """
         _require_features(features)
         networks = self.network.layers

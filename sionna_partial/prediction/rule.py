@@ -72,7 +72,8 @@ def predicted(
 def with_errors(trace: Parts, outputs: Any, doubts: Any, ops: Any = array_ops) -> Parts:
     """Return the trace with the errors of the gate, which vanish with the doubt."""
     shifts_db = [doubts * _SHIFT_DB * outputs[:, column] for column in (1, 3)]
-    root = ops.sqrt(ops.maximum(doubts, 1e-12))
+    doubtful = doubts > 0.0
+    root = ops.where(doubtful, ops.sqrt(ops.where(doubtful, doubts, 1.0)), 0.0)
     stds_db = [
         root * std_db * ops.exp(_SPREAD_RANGE * ops.tanh(outputs[:, column] / _SPREAD_RANGE))
         for column, std_db in zip((2, 4), _STDS_DB, strict=True)

@@ -87,12 +87,15 @@ class MapSpace:
     @classmethod
     def of(cls, partial: PartialMap) -> "MapSpace":
         """Return the fields of a map; the latest are kept."""
-        key = id(partial)
-        if key not in _kept:
-            for old in [key for key, (owner, _) in _kept.items() if owner() is None]:
-                del _kept[old]
-            _kept[key] = weakref.ref(partial), cls(partial)
-        return _kept[key][1]
+        kept = _kept.get(id(partial))
+        if kept is None or kept[0]() is not partial:  # numbers of maps that are gone are used again
+            for old in [key for key, (owner, _) in [*_kept.items()] if owner() is None]:
+                _kept.pop(old, None)
+            kept = _kept[id(partial)] = weakref.ref(partial), cls(partial)
+        return kept[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_walk"}
 
     @cached_property
     def _walk(self) -> Any:
@@ -179,7 +182,8 @@ def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
     """Return 1 if the space beyond the grid can be entered, else 0."""
     rim = np.ones(state.shape, dtype=bool)
     rim[1:-1, 1:-1] = False
-    return float((rim & (entered | (state == CellState.FREE))).any() or (state == CellState.UNKNOWN).all())
+    free = state == CellState.FREE
+    return float((rim & (entered | free)).any() or not free.any())
 
 
 def _overlaps(edges: Floats, count: int) -> Any:
@@ -198,7 +202,7 @@ def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, .
     """Return known walls at `_PARTS` x `_PARTS` points of each cell."""
     step = cells / _PARTS
     if step > 1.0:  # thin walls between the points
-        wall = ndimage.maximum_filter(wall, size=math.ceil(step))
+        wall = ndimage.maximum_filter(wall, size=2 * math.ceil(0.5 * (step - 1.0)) + 1)
     sampled = np.zeros(tuple(_PARTS * count for count in shape), dtype=bool)
     at = [first[axis] + (np.arange(_PARTS * shape[axis]) + 0.5) * step for axis in (0, 1)]
     for aside in itertools.product((-_ASIDE_CELLS, _ASIDE_CELLS), repeat=2):

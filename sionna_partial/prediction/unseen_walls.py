@@ -115,7 +115,7 @@ class WallDensity(NamedTuple):
     def counts(self, lines: DirectLines, ops: Any = array_ops) -> Any:
         """Return the expected number of unseen walls on each line (N,); `ops` is `array_ops`, or keras.ops."""
         starts = range(0, max(1, len(lines.known)), _LINES_AT_ONCE)
-        parts = (DirectLines(*(column[first : first + _LINES_AT_ONCE] for column in lines)) for first in starts)
+        parts = (DirectLines._make(column[first : first + _LINES_AT_ONCE] for column in lines) for first in starts)
         return ops.concatenate([self._counts(part, ops) for part in parts])
 
     def _counts(self, lines: DirectLines, ops: Any) -> Any:
@@ -292,7 +292,7 @@ def by_mean_losses(
     """
     starts = range(0, max(1, len(trace.known)), _LINES_AT_ONCE)
     blocks = [slice(first, first + _LINES_AT_ONCE) for first in starts]
-    found = [_by_mean_losses(WallTrace(*(each[at] for each in trace)), walls[at], max_walls, ops) for at in blocks]
+    found = [_by_mean_losses(WallTrace._make(each[at] for each in trace), walls[at], max_walls, ops) for at in blocks]
     probabilities, means_db, stds_db = (ops.concatenate(parts, axis=1) for parts in zip(*found, strict=True))
     return probabilities, means_db, stds_db
 
