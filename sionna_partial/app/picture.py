@@ -15,7 +15,7 @@ from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import Outline, extent_m, outside
+from sionna_partial.plots.coverage_plot import Outline, extent_m, outside, to_the_edge
 from sionna_partial.plots.coverage_viewer import STATES, add_layer
 from sionna_partial.plots.style import FAILS, material_colour
 
@@ -249,9 +249,10 @@ class Picture:
         """Draw the line at the threshold, and hatch the side that fails."""
         lines: list[Any] = []
         areas: list[Any] = []
-        values = np.ma.masked_invalid(shown)
+        x_m, y_m, values = to_the_edge(one, shown)
+        values = np.ma.masked_invalid(values)
         if outline is not None and values.count():
-            field: Any = contour_generator(one["x"], one["y"], values, fill_type="OuterOffset")
+            field: Any = contour_generator(x_m, y_m, values, fill_type="OuterOffset")
             lines = field.lines(outline.level)
             below = min(float(values.min()), outline.level) - 1.0
             for points, offsets in zip(*field.filled(below, outline.level), strict=True):

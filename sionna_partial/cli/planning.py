@@ -99,7 +99,7 @@ def place(
         with atomic_files(out) as folder:
             result.save(folder / "placement.json")
             figure.savefig(folder / "placement.png")
-    added = result.added if isinstance(result, sp.NetworkPlacement) else []
+    added: Any = result.added if isinstance(result, sp.NetworkPlacement) else []
     for (x, y, z), more in itertools.zip_longest(positions_m, added):
         typer.echo(f"transmitter at ({x:.2f}, {y:.2f}, {z:.2f}) m" + (f" adds {more:.1%}" if more is not None else ""))
     if goal is not None and result.score < goal:

@@ -60,7 +60,7 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
-_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 130, (1.1, 0.45), (0.5, 1.0)
+_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 124, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -384,6 +384,12 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
     area.set_hatch_linewidth(0.5)
 
 
+def to_the_edge(coverage: xr.Dataset, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return x and y with the edges of the map, and values (ny + 2, nx + 2) that continue to them, for contours."""
+    x0, x1, y0, y1 = extent_m(coverage)
+    return np.r_[x0, coverage["x"], x1], np.r_[y0, coverage["y"], y1], np.pad(values, 1, mode="edge")
+
+
 @dataclass(frozen=True)
 class Outline:
     """Line at a level of values (ny, nx), hatching where they are below it, and the legends of both."""
@@ -395,10 +401,10 @@ class Outline:
 
     def draw(self, axis: Axes, coverage: xr.Dataset) -> list[Line2D | Patch]:
         """Draw both, and return the handles of the legend."""
-        x, y = coverage["x"].to_numpy(), coverage["y"].to_numpy()
-        values = np.where(outside(coverage), np.nan, _fill(self.values, np.isfinite(self.values), self.values > np.inf))
+        filled = _fill(self.values, np.isfinite(self.values), np.zeros(self.values.shape, dtype=bool))
+        x, y, values = to_the_edge(coverage, np.where(outside(coverage), np.nan, filled))
         handles: list[Line2D | Patch] = []
-        if min(values.shape) < 2 or not np.isfinite(values).any():
+        if not np.isfinite(values).any():
             return handles
         lowest, highest = np.nanmin(values), np.nanmax(values)
         if lowest < self.level:
