@@ -93,9 +93,8 @@ class Drawing:
     @property
     def python(self) -> list[str]:
         """Lines that read the map."""
-        name = PurePath(self.name).name
         given = f", layer_materials={dict(self.materials)!r}" if self.materials else ""
-        return [f"partial = sp.load_map({name!r}{given})"]
+        return [f"partial = sp.load_map({self.name!r}{given})"]
 
     def read(self) -> PartialMap:
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder, logged_warnings():

@@ -133,7 +133,11 @@ class Session(WindowJobs):
     def _enter(self, name: str, home: PartialMap, seed: int, tx_m: Sequence[float]) -> None:
         self.title, self.home, self.steps, self._seed, self.source, self.strokes = name, home, 0, seed, None, ()
         x_m, y_m, z_m = tx_m
-        self.transmitters, self.chosen, self.measured = {"tx1": Transmitter(x_m, y_m, z_m)}, "tx1", None
+        self.transmitters, self.chosen, self.measured = (
+            {"tx1": Transmitter(x_m, y_m, z_m, self.settings.eirp_dbm)},
+            "tx1",
+            None,
+        )
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
