@@ -2,14 +2,17 @@ SHELL := /bin/bash
 .SHELLFLAGS := -euo pipefail -c
 .DEFAULT_GOAL := help
 
+# uv leaves it to Python to compile what is imported, which takes a fraction of the time for all files.
+unexport PYTHONDONTWRITEBYTECODE
+
 BIN := .venv/bin
 READY := .venv/.ready
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
 CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
 	network outlines partial_map predictor ros_map scene settings slab trace unobserved)
-LEARNED_FROM := build/predictor/{camera,mixed,floors,large}
-FRACTIONS := --stage 0 --stage 0.25 --stage 0.5 --stage 0.75
+LEARNED_FROM := build/predictor/{camera,mixed,large}
+FRACTIONS := --mixed-sensors --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
@@ -72,15 +75,13 @@ scenes: $(READY) ## Make the demo scenes again (scenes/)
 
 predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
 	@rm -rf build/predictor
-	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 300 --first-seed 100000
-	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 200 --first-seed 110000 --mixed-sensors $(FRACTIONS)
-	@$(BIN)/sionna-partial dataset build/predictor/floors --homes 100 --first-seed 220000 --mixed-sensors $(FRACTIONS) \
-		--kind floor --short-links 0.5
-	@$(BIN)/sionna-partial dataset build/predictor/large --homes 40 --first-seed 200000 --mixed-sensors $(FRACTIONS) \
-		--kind floor --kind floor --kind hall --kind warehouse --short-links 0.5
+	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 135 --first-seed 330000 --links 160
+	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 94 --first-seed 320000 $(FRACTIONS)
+	@$(BIN)/sionna-partial dataset build/predictor/large --homes 54 --first-seed 350000 $(FRACTIONS) \
+		--kind hall --kind warehouse --kind floor --short-links 0.5
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --passes 8 --test-fraction 0.1 --out build/predictor/$$networks; \
+			--networks $$networks --passes 22 --test-fraction 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
@@ -101,16 +102,15 @@ clean: ## Remove what was made, the environment too
 	@rm -rf .venv build dist demo-output .pytest_cache .hypothesis .mypy_cache .ruff_cache
 	@find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
-$(READY): requirements.lock pyproject.toml
+$(READY): requirements.lock pyproject.toml install_locked.py
 	@python=; for name in python3.11 python3.12 python3.13 python3; do \
 		if "$$name" -c 'import sys, ensurepip, venv; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 13))' 2>/dev/null; \
 		then python=$$name; break; fi; done; \
 	if [ -z "$$python" ]; then \
 		echo "error: no Python 3.11, 3.12 or 3.13 with venv was found: install python3.11 (Debian: python3.11-venv too)." >&2; \
 		exit 2; fi; \
-	echo "setting up .venv with $$("$$python" --version) (a few minutes, 3 GB)"; \
+	echo "setting up .venv with $$("$$python" --version) (a minute, 3 GB)"; \
 	"$$python" -m venv --clear .venv
-	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --only-binary :all: --require-hashes \
-		-r requirements.lock
+	@$(BIN)/python install_locked.py
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
 	@touch $@

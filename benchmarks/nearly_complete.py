@@ -1,11 +1,10 @@
 """Nearly complete maps: buildings driven to the end by a lidar, where small pockets alone stay unknown.
 
 Of links whose ends are both seen and that have no line of sight on the map: the errors of the trace between the mapped
-walls, of its mean over geometries, of the networks alone and of the default predictor, which takes the mean with its
-measured errors there. Homes have a lidar of 12 m, and a drift of 0.2 % where the range noise is 2 cm. Halls and
-warehouses of at most `MOST_CELLS` have one of 20 m and, as SLAM closes loops, a drift of 0.02 %. Truth is the trace of
-the complete building. FOLDER holds complete maps, one folder with a map.yaml for each, in place of procedural homes.
-Run it with
+walls, of the networks alone and of the default predictor. Homes have a lidar of 12 m, and a drift of 0.2 % where the
+range noise is 2 cm. Halls and warehouses of at most `MOST_CELLS` have one of 20 m and, as SLAM closes loops, a drift of
+0.02 %. Truth is the trace of the complete building. FOLDER holds complete maps, one folder with a map.yaml for each, in
+place of procedural homes. Run it with
 
     python benchmarks/nearly_complete.py --homes 8 --halls 8 --warehouses 8
     python benchmarks/nearly_complete.py --maps ../shared/gibson --homes 4 --halls 0 --warehouses 0
@@ -54,7 +53,7 @@ def main() -> None:
     parser.add_argument("--halls", type=int, default=4)
     parser.add_argument("--warehouses", type=int, default=4)
     arguments = parser.parse_args()
-    models = ("mapped walls", "mean", "networks", "predictor")
+    models = ("mapped walls", "networks", "predictor")
     print(
         "| building | noise [cm] | nearly complete | links | "
         + " | ".join(f"{name}: RMSE, mean std, rms std [dB], in 90 %" for name in models)
@@ -99,16 +98,11 @@ def links_of(home: sp.PartialMap, partial: sp.PartialMap) -> Links:
         points_m = cell_centres_m(home, both[rng.choice(len(both), RECEIVERS)])
         tx_m, *rx_m = np.column_stack([points_m, height_m])
         rx_m = np.array(rx_m)[np.linalg.norm(rx_m - tx_m, axis=1) > 0.2]
-        single = sp.SceneSettings(geometries=1)
-        truth, traced, mapped = (
-            sp.trace_links(scene, tx_m, rx_m, scene_settings=settings)
-            for scene, settings in ((home, None), (partial, None), (partial, single))
-        )
+        truth, traced = (sp.trace_links(scene, tx_m, rx_m) for scene in (home, partial))
         phi = sp.link_features(partial, traced)
         alone = replace(phi, context=replace(phi.context, both_seen=np.zeros(len(phi), dtype=bool)))
         models = {
-            "mapped walls": LinkPrediction.of_trace(sp.link_features(partial, mapped, windows=False)),
-            "mean": LinkPrediction.of_trace(phi),
+            "mapped walls": LinkPrediction.of_trace(phi),
             "networks": predictor.predict(alone),
             "predictor": predictor.predict(phi),
         }

@@ -44,7 +44,7 @@ import sionna_partial as sp
 from sionna_partial import link_model
 from sionna_partial.checks import no_progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.coverage.job import CoverageJob, Transmitter, grid_receivers
+from sionna_partial.coverage.job import CoverageJob, GridArea, Transmitter, grid_receivers
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import MOST_POSITIONS, likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
@@ -136,8 +136,9 @@ def main() -> None:
 def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
     """Return error [m] and whether the 90 % region holds the truth (D, 2), of each transmitter and draw."""
     link_model.KEPT_BLOCKS = POINTS
-    job, found = CoverageJob(model, DEFAULT_HEIGHT_M, 1.0, "indoor", block=MOST_POSITIONS), []
-    nowhere = grid_receivers(model, np.empty((0, 3)), DEFAULT_HEIGHT_M, 1.0)
+    area = GridArea(DEFAULT_HEIGHT_M, 1.0)
+    job, found = CoverageJob(model, area, "indoor", block=MOST_POSITIONS), []
+    nowhere = grid_receivers(model, np.empty((0, 3)), area)
     for number, rows in enumerate(links.values()):
         rows, tx_m = rows[np.random.default_rng(0).permutation(len(rows))[:POINTS]], rows[0, :3]
         for draw in range(draws):

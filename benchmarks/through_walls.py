@@ -228,7 +228,8 @@ def unknown_material(maps: dict[str, sp.PartialMap], arguments: argparse.Namespa
                 named = {"material": material} if material in COMMON else {}
                 model = sp.LinkModel(partial, None, sp.TraceSettings(frequency_hz), sp.SceneSettings(**named))
                 if material == "usual limits":
-                    model.simulation._coarse_finder = model.simulation._mean_finder
+                    usual = replace(model.simulation._finder, material_unknown=False)
+                    vars(model.simulation)["_finder"] = usual
                 model.predict(tx_m, rx_m)  # compiles kernels
                 start = time.process_time()
                 found[material] = model.predict(tx_m, rx_m), time.process_time() - start

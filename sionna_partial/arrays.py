@@ -85,7 +85,7 @@ def grid_edges(cost: Floats) -> tuple[Indices, Floats]:
     return np.concatenate(ends, axis=1), np.concatenate(costs)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def span_in_strip(corners, low, high):  # type: ignore[no-untyped-def]
     """Return the smallest and largest x of a convex polygon (n, 2) within low <= y <= high; inf and -inf if outside."""
     left, right = np.inf, -np.inf

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -19,7 +20,7 @@ from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import later, part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths
+from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths, in_observed_space
 from sionna_partial.prediction.map_networks import feature_values
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import (
@@ -211,8 +212,14 @@ class LinkModel:
         """
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
-        paths = [self.simulation.blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
+        paths = [self._blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
         return self._predict_paths(ends_m, paths)
+
+    def _blocks(
+        self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
+    ) -> Iterator[SolvedPaths]:
+        observed = None if self.partial.is_complete else functools.partial(in_observed_space, self.partial)
+        return self.simulation.blocks(tx_m, rx_m, report, antenna, observed)
 
     def _predict_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
@@ -285,7 +292,7 @@ class LinkModel:
         else:
             sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
             found = self._every_path.blocks(tx_m, rx_m, report, Antenna()) if at_rx else None
-            paths = sums.added(found or self.simulation.blocks(tx_m, rx_m, report, antenna))
+            paths = sums.added(found or self._blocks(tx_m, rx_m, report, antenna))
             phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
             phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))

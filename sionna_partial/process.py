@@ -162,13 +162,15 @@ def in_order(function: Callable[[_Item], _Result], items: Iterable[_Item]) -> It
                 future.cancel()
 
 
-def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+def njit(*, borrows: bool = False, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return a decorator for functions that numba compiles, with a cache, if necessary in a temporary folder.
 
     Division by zero gives infinity or NaN as in NumPy: Python's checks take time in every loop. Wrappers for C would
-    only take time to compile.
+    only take time to compile. A function that `borrows` neither makes arrays nor returns any: numba then counts no
+    references, which for tuples of arrays takes most of the time to compile.
     """
-    return lambda function: _Kernel(function, {"error_model": "numpy", "no_cfunc_wrapper": True} | options)
+    options = {"error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": not borrows} | options
+    return lambda function: _Kernel(function, options)
 
 
 class _Kernel:

@@ -44,7 +44,7 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 FREQUENCIES_HZ = (1e6, 1e12)
 
 POWER_TOLERANCE_DB = 0.1
-"""Default of `TraceSettings.power_tolerance_db` for powers [dB]."""
+"""Default of `TraceSettings.power_tolerance_db` [dB]."""
 
 OPAQUE_FROM_HZ = 24e9
 """Frequency from which walls are opaque by default [Hz]."""
@@ -193,11 +193,6 @@ class SceneSettings(Checked):
     outline : {"lines", "cells"}
         Walls as straight lines fitted to the wall cells, or as the staircase through their centres, without
         `bridge_gap_m`.
-    geometries : int or None
-        Number of geometries, 1 to 16, over which gains [dB] of links without line of sight are averaged: the mapped
-        outlines, and outlines with vertices moved at random by 2 cm. None is 3 on nearly complete maps with strong
-        range noise (`PartialMap.wall_noise` above 0.5) and opaque walls, else 1. Gradients, channels, meshes, links
-        with a folder and traces with a `TraceSettings.power_tolerance_db` always use the mapped outlines.
 
     Raises
     ------
@@ -216,7 +211,6 @@ class SceneSettings(Checked):
     floor_extent: Literal["observed", "none"] = "observed"
     ceiling: bool = True
     outline: Literal["lines", "cells"] = "lines"
-    geometries: Annotated[int, Within(1, 16)] | None = None
 
     @property
     def traced_material(self) -> Material:
@@ -243,8 +237,8 @@ class TraceSettings(Checked):
         True if walls of a floor plan also diffract at ends where observation stopped.
     power_tolerance_db : float or None
         Largest change of the power of a link's indirect paths by leaving out weak paths [dB], 0 to 1; 0 keeps every
-        path. None is 0.1 for powers and predictions, and 0 for channels, for which links are traced again. Predictions
-        leave out more paths, and add their expected power.
+        path. None is 0.1. Predictions leave out more paths, and add their expected power; the tolerance is then of
+        the power through observed space, too.
     refraction : bool or None
         True if paths go through walls. None is True below 24 GHz only, as the paper assumes opaque walls.
     max_walls : int
@@ -287,7 +281,7 @@ class TraceSettings(Checked):
 
     @property
     def tolerance_db(self) -> float:
-        """`power_tolerance_db`, or its default for powers [dB]."""
+        """`power_tolerance_db`, or its default [dB]."""
         return POWER_TOLERANCE_DB if self.power_tolerance_db is None else self.power_tolerance_db
 
     @property

@@ -20,6 +20,7 @@ from http.client import HTTPConnection
 from pathlib import Path
 from typing import Any
 
+import ezdxf
 import numpy as np
 import pytest
 from bokeh.document import Document
@@ -30,14 +31,15 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 import sionna_partial as sp
+from sionna_partial.app import answer as answer_module
 from sionna_partial.app import session as app_session
-from sionna_partial.app.answer import Answer
+from sionna_partial.app.answer import LEVELS, Answer, View
 from sionna_partial.app.drawing import Stroke
 from sionna_partial.app.files import FILES, stored_map
 from sionna_partial.app.jobs import Status
 from sionna_partial.app.page import Page
 from sionna_partial.app.picture import Picture
-from sionna_partial.app.radio import Transmitter
+from sionna_partial.app.radio import OTHER_CHANNELS, Transmitter
 from sionna_partial.app.server import AppServer
 from sionna_partial.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
@@ -216,16 +218,20 @@ class TestTransmitters:
 def test_it_fills_the_fields_of_all_transmitters_present_and_new(window: Window) -> None:
     session = window.session
     session.put([("", 1.0, 1.0)])
-    assert session.preset == ""
+    assert session.settings.preset == "Wi-Fi 5 GHz"
+    session.use_preset("5G, 28 GHz")
+    assert session.settings.text(PARTIAL) == "5G, 28 GHz, opaque walls"
     session.use_preset("Wi-Fi 5 GHz")
+    assert session.settings.text(PARTIAL) == "Wi-Fi 5 GHz, walls of unknown material"
     session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
     assert window.settle() == "Ready."
     assert [each.eirp_dbm for each in session.transmitters.values()] == [23.0, 23.0]
     assert (session.settings.frequency_hz, session.settings.threshold_dbm) == (5.21e9, -67.0)
-    assert session.preset == "Wi-Fi 5 GHz"
-    assert [*window.answer.thresholds("tx1", -67.0).values()] == [-67.0, -90.0, 21.0]
-    session.change("tx2", eirp_dbm=10.0)
-    assert session.preset == ""
+    assert session.settings.preset == "Wi-Fi 5 GHz"
+    scales = [window.answer.scale(name, "tx1", -67.0) for name in LEVELS]
+    assert [scale.ticks[3] for scale in scales if scale] == [-67.0, -90.0, 21.0]
+    session.set(bandwidth_hz=40e6)
+    assert (session.settings.preset, session.settings.channels) == ("", OTHER_CHANNELS)
 
 
 def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
@@ -233,6 +239,8 @@ def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
     window.session.change("tx2", new_name="hall", eirp_dbm=40.0)
     window.settle()
     answer = window.answer
+    each = [answer.layers_of(name, -60.0)["p_above"].to_numpy() for name in ("tx1", "hall")]
+    np.testing.assert_array_equal(answer.layers_of("", -60.0)["p_above"], np.fmax(*each))
     best = answer.layers_of("", -60.0)
     one, two = (answer.layers_of(name, -60.0) for name in ("tx1", "hall"))
     powers = [each["power_mean_dbm"].to_numpy() for each in (one, two)]
@@ -241,7 +249,7 @@ def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
     np.testing.assert_allclose(two["p_above"], above, atol=1e-6)
     assert np.isfinite(best["sinr_mean_db"].to_numpy()[best["valid"].to_numpy()]).all()
     picture = Picture()
-    picture.show_answer(answer, "", -67.0, truth=False)
+    picture.show_answer(answer, View(), -67.0)
     power, server = (picture.parts[name][1] for name in ("power_mean_dbm", "best_server"))
     assert power.ticker.ticks == [-97.0, -87.0, -77.0, -67.0, -57.0, -47.0, -37.0, -27.0]
     assert (power.color_mapper.low, power.color_mapper.high, len(power.color_mapper.palette)) == (-97.0, -27.0, 14)
@@ -255,6 +263,121 @@ def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
     assert math.dist((x_m, y_m), (3.0, 1.0)) < 0.5
 
 
+def test_kinds_of_access_points_keep_limits_and_weak_clients_decide(window: Window) -> None:
+    session = window.session
+    session.put([("", 1.0, 1.0)])
+    session.change("tx1", model="ceiling access point")
+    assert session.transmitters["tx1"].eirp_dbm == 23.0  # the limit of Europe
+    session.set(region="FCC")
+    assert session.transmitters["tx1"].eirp_dbm == 30.5
+    session.set(both_ways=True, client_dbm=10.0)
+    assert window.settle() == "Ready."
+    assert window.answer.eirp_dbm.tolist() == [15.5]  # the client, and the antenna that hears it
+    assert "client_dbm=[15.5]" in session.python()
+    session.change("tx1", eirp_dbm=12.0)
+    assert (session.transmitters["tx1"].model, session.transmitters["tx1"].eirp_dbm) == ("", 12.0)
+    with pytest.raises(SettingsError, match="model = 'toaster'"):
+        session.change("tx1", model="toaster")
+
+
+def test_several_are_placed_for_a_goal_and_get_channels(window: Window) -> None:
+    session = window.session
+    session.use_preset("5G, 28 GHz")
+    session.put([("", 1.0, 1.0)])
+    session.set(threshold_dbm=-36.0)
+    with pytest.raises(SettingsError, match="two or more transmitters"):
+        session.plan_channels()
+    session.place_several(1.0, 2)
+    assert window.settle() == "Ready."
+    assert [*session.transmitters] == ["tx1", "tx2"]
+    assert re.match(r"Expected covered floor \d+%; each adds: tx1 \d+%, tx2 \d+%\.", session.warnings[0])
+    session.plan_channels()
+    assert window.settle() == "Ready."
+    assert {each.channel for each in session.transmitters.values()} == {"1", "2"}
+    assert window.answer.network["channel"].values.tolist() == ["1", "2"]
+    assert "channels={'tx1': '1', 'tx2': '2'}" in session.python()
+
+
+def test_layers_of_a_drawing_have_materials(window: Window, tmp_path: Path) -> None:
+    session, drawing = window.session, ezdxf.new(units=6)
+    for layer, ends in (("A-WALL", [(0, 0), (4, 0), (4, 3), (0, 3), (0, 0)]), ("I-WALL", [(2, 0), (2, 2)])):
+        drawing.modelspace().add_lwpolyline(ends, dxfattribs={"layer": layer})
+    drawing.saveas(tmp_path / "flat.dxf")
+    content = (tmp_path / "flat.dxf").read_bytes()
+    session.upload_map([("flat.dxf", content)])
+    window.settle()
+    assert {each.name for each in session.partial.import_source.used} == {"A-WALL", "I-WALL"}
+    session.put([("", 1.0, 1.0)])
+    session.change_source(materials={"I-WALL": "brick"})
+    assert window.settle() == "Ready."
+    assert session.partial == sp.load_map(tmp_path / "flat.dxf", layer_materials={"I-WALL": "brick"})
+    assert [*session.transmitters] == ["tx1"]
+    assert "sp.load_map('flat.dxf', layer_materials={'I-WALL': 'brick'})" in session.python()
+    session.look(layer="power_mean_dbm")
+    content = session.file("project")
+    session.open_map(PARTIAL, "room.yaml")
+    session.upload_map([("mine.zip", content)])
+    window.settle()
+    assert session.source.materials == {"I-WALL": "brick"}
+    assert session.view == View("power_mean_dbm")
+    session.change_source(materials={})
+    window.settle()
+    assert session.partial.wall_material is None
+
+
+def test_a_plan_keeps_shade_strokes_and_view_in_a_project(window: Window) -> None:
+    session, other = window.session, Window()
+    session.upload_map([("flat.png", picture())])
+    window.settle()
+    session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+    window.settle()
+    session.change_source(threshold=190)
+    window.settle()
+    session.draw(Stroke("free", ((3.05, 0.5), (3.05, 1.0)), 0.3))
+    session.look(outline="power_mean_dbm")
+    content, after = session.file("project"), other.session
+    after.upload_map([("mine.zip", content)])
+    other.settle()
+    assert after.plan is not None
+    assert (after.plan.threshold, after.plan.pixel_m, after.strokes) == (190, 0.01, session.strokes)
+    assert (after.partial, after.view) == (session.partial, View(outline="power_mean_dbm"))
+    assert after.file("project") == content
+    after.undo()
+    assert after.partial.state_at(np.array([[3.05, 0.7]])).tolist() == [1]
+    after.close()
+
+
+def test_the_png_is_the_picture_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+    session = window.session
+    session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    session.draw(Stroke("brush", ((2.05, 0.5), (2.05, 1.5)), 0.4, "concrete"))
+    session.change("tx2", eirp_dbm=-30.0)
+    session.set(threshold_dbm=-45.0)
+    window.settle()
+    drawn: list[Any] = []
+    monkeypatch.setattr(answer_module, "figure_png", lambda figure: drawn.append(figure) or b"")
+    for view in (View(), View("power_mean_dbm", "tx2", outline="power_mean_dbm"), View("best_server", outline="")):
+        session.view = view
+        session.file("png")
+    any_of, second, servers = drawn
+    assert [figure.axes[0].get_title() for figure in drawn] == [
+        "P(power > -45 dBm), any transmitter",
+        "Mean received power, tx2",
+        "Strongest transmitter",
+    ]
+    assert all(
+        "room.yaml\nWi-Fi 5 GHz, walls of concrete and unknown material" in each.get_suptitle() for each in drawn
+    )
+    labels = [{text.get_text() for text in figure.legends[0].get_texts()} for figure in drawn]
+    assert {"concrete", "wall", "transmitter", "mean below -45 dBm"} <= labels[1]
+    assert not {text for text in labels[2] if "dBm" in text}
+    (bar,) = second.axes[1:]
+    assert bar.get_ylabel() == "dBm; colours break at -45"
+    assert [text.get_text() for text in servers.axes[1].get_yticklabels()] == ["tx1", "tx2"]
+    covered = np.fmax(*(window.answer.layers_of(name, -45.0)["p_above"].to_numpy() for name in ("tx1", "tx2")))
+    assert np.nanmax(np.abs(np.unique(any_of.axes[0].images[0].get_array()) - np.unique(covered[covered >= 0]))) == 0
+
+
 def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
     window.put((1.0, 1.0))
     page = Page(Document(), "/files/key")
@@ -265,7 +388,7 @@ def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
     session.status = Status("Ready.")
     page.show()
     assert "Ready. Probability of wall materials: brick .69." in page.message.text
-    assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "")
+    assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "Wi-Fi 5 GHz")
     assert page.links.text.count("<a ") == len(FILES)
     session.put([("", 1.0, 1.0)])
     page.show()
@@ -280,6 +403,7 @@ def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
 def test_prediction_meets_the_truth(window: Window) -> None:
     with pytest.raises(SettingsError, match="examples alone"):
         window.session.explore_more()
+    window.session.use_preset("5G, 28 GHz")
     window.session.open_example("apartment")
     window.settle()
     session = window.session
@@ -443,7 +567,7 @@ class TestDrawing:
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0]])).tolist() == [1, 0]
         session.put([("", 1.0, 1.0)])
         session.draw(Stroke("free", ((0.5, 0.05), (0.7, 0.05)), 0.3))
-        session.change_plan(threshold=190)
+        session.change_source(threshold=190)
         assert window.settle() == "Ready."
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0], [0.6, 0.05]])).tolist() == [1, 1, 0]
         assert [*session.transmitters] == ["tx1"]
@@ -674,6 +798,11 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         other = open_tab(url, 390, 844)
         other.wait(f"{_MODEL}('message').text.includes('Click on the map')")
         assert other.run("document.documentElement.scrollWidth <= 390")
+        other.send("Emulation.setDeviceMetricsOverride", width=1280, height=720, deviceScaleFactor=1, mobile=False)
+        label = "walk(document.body).find(n => n.tagName == 'LABEL' && n.textContent.trim() == 'Band')"
+        bottom = other.run(f"(() => {{ {_WALK}; return {label}.getBoundingClientRect().bottom }})()")
+        assert 0.0 < bottom < box(other, "#plot")[1] < 720.0  # the band stands above the map
+        assert "Wi-Fi 5 GHz" in other.run(f"{_MODEL}('picture').title.text")
         for part, label in (("bk-spin-btn-up", "more"), ("noUi-handle", "Threshold [dBm]"), ("bk-events", "Map; ")):
             found = f"walk(document.body).find(n => n.classList.contains({part!r}))"
             focus = "n.dispatchEvent(new FocusEvent('focusin', {bubbles: true, composed: true}))"  # none comes behind

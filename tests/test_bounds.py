@@ -12,6 +12,7 @@ from sionna_partial.tracing.engine import SceneSolver
 from sionna_partial.tracing.plan.edges import DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.reflections import SpecularCandidates
 from sionna_partial.tracing.power import (
+    VERTICAL,
     at_edge,
     at_wall,
     materials_of,
@@ -52,15 +53,15 @@ class TestDiffraction:
         for arrival, departure in rng.uniform(0.0, exterior, (300, 2)):
             utd_terms(wedge, wedge_angle(arrival, exterior), wedge_angle(departure, exterior), terms)
             for boundary in (1.0, 10.0, 100.0):
-                level = 1.0, 0.0, (1.0, 0.0, 1.0)
+                level = 1.0, 0.0, VERTICAL
                 exact = at_edge((table.reflection, table.transition), 0, terms, boundary, (-1.0, -1.0), *level)
-                assert exact[0] <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
+                assert exact.vertical <= 1.03 * most_at_edge(terms, boundary, 1.0, 1.0)
 
     def test_a_wall_that_is_grazed_has_a_finite_bound(self) -> None:
         """Rounding must not take the root of a negative number: the bound of a whole link would be NaN."""
         table, terms = materials_of([DRYWALL], 28e9), np.ones((4, 3))
         for sine in np.linspace(0.01, 0.99, 500):
-            level = float(sine), float(np.sqrt(1.0 - sine**2)), (1.0, 0.0, 1.0)
+            level = float(sine), float(np.sqrt(1.0 - sine**2)), VERTICAL
             assert np.isfinite(at_edge((table.reflection, table.transition), 0, terms, 10.0, (0.0, -1.0), *level)).all()
             assert np.isfinite(at_wall(table.largest, 0, 0.0, *level)).all()
 

@@ -202,16 +202,19 @@ def several() -> sp.TracedLinks:
     return sp.trace_links(_room(), [(1.0, 1.0, 1.5), (4.5, 1.2, 1.4)], rx, trace_settings=settings, invalid="nan")
 
 
-def test_channels_have_every_path_unless_a_tolerance_was_set() -> None:
-    """Channels are sums of fields: weak paths count, which the default tolerance leaves out of links."""
+def test_channels_have_the_paths_of_their_links() -> None:
+    """Channels are sums of fields: weak paths count, which links have by request."""
     settings = [sp.TraceSettings(max_depth=3, power_tolerance_db=tolerance_db) for tolerance_db in (None, 0.0, 0.1)]
-    links, every, set_by_user = (sp.trace_links(_room(), TX, RX[:2], trace_settings=each) for each in settings)
-    assert len(links.a) == len(set_by_user.a) < len(every.a)
+    links, every, written = (sp.trace_links(_room(), TX, RX[:2], trace_settings=each) for each in settings)
+    assert every.with_every_path(_room()) is every
+    completed = links.with_every_path(_room())
+    assert len(links.a) == len(written.a) < len(every.a)
     for name, arguments in (("cfr", ([-1e8, 1e8],)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
-        found, expected, weaker = (getattr(each, name)(*arguments) for each in (links, every, set_by_user))
-        xr.testing.assert_identical(found, expected)
-        assert not found.equals(weaker)
-        assert (found.power_tolerance_db, weaker.power_tolerance_db) == (0.0, 0.1)
+        found = [getattr(each, name)(*arguments) for each in (links, written, completed, every)]
+        xr.testing.assert_identical(found[0], found[1])
+        xr.testing.assert_identical(found[2], found[3])
+        assert not found[0].equals(found[2])
+        assert [each.power_tolerance_db for each in found] == [0.1, 0.1, 0.0, 0.0]
 
 
 class TestResponses:

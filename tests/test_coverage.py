@@ -14,7 +14,7 @@ from scipy.stats import norm
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.coverage.dataset import ATTRIBUTES, WALL_PARTS, require_coverage
 from sionna_partial.coverage.job import predict_map, transmitter_positions
-from sionna_partial.coverage.link_budget import schemes
+from sionna_partial.coverage.link_budget import access_point_eirp_dbm, eirp_limit_dbm, schemes
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.export import load_coverage
 from sionna_partial.link_model import LinkModel
@@ -291,6 +291,39 @@ class TestAccessor:
             coverage.radio.probability_above(-151.0)
         each = several.transpose("y", "x", "tx").radio.power(eirp_dbm=[20.0, 10.0])["power_mean_dbm"]
         np.testing.assert_allclose(each, several["gain_mean_db"] + np.array([20.0, 10.0])[:, None, None], atol=1e-4)
+
+    def test_receivers_outside_a_complete_map_can_be_omitted(self, complete):
+        drawing = map_of(COMPLETE)
+        inside = predict_map(drawing, TX, spacing_m=float(complete.spacing_m), receivers="inside")
+        seen = (complete["cell_state"] != CellState.UNKNOWN).to_numpy()
+        assert not seen.all()
+        for name in ("gain_mean_db", "valid"):
+            values = (found[name].to_numpy()[seen].astype(float) for found in (inside, complete))
+            np.testing.assert_allclose(*values, atol=1e-3)
+        assert not inside["valid"].to_numpy()[~seen].any()
+        assert inside.attrs["receivers"] == "indoor"
+
+    def test_a_weak_client_decides(self, complete, several):
+        weak, strong = (complete.radio.power(eirp_dbm=23.0, client_dbm=client)["power_mean_dbm"] for client in (15, 30))
+        np.testing.assert_allclose(weak, complete["gain_mean_db"] + 15.0, atol=1e-4)
+        xr.testing.assert_equal(strong, complete.radio.power(eirp_dbm=23.0)["power_mean_dbm"])
+        both, down = (several.radio.area(-67.0, client_dbm=client).fraction for client in ([5.0, 40.0], None))
+        assert (both.isel(tx=0) < down.isel(tx=0)).any()
+        xr.testing.assert_equal(both.isel(tx=1), down.isel(tx=1))
+        with pytest.raises(SettingsError, match="client_dbm"):
+            complete.radio.snr(client_dbm=np.nan)
+
+    def test_access_points_keep_the_limit_of_their_band(self):
+        assert eirp_limit_dbm(5.21e9, 80e6) == 23.0
+        assert eirp_limit_dbm(5.21e9, 10e6) == pytest.approx(20.0)
+        assert eirp_limit_dbm(6.185e9, 160e6, "FCC") == pytest.approx(27.04, abs=0.01)
+        assert eirp_limit_dbm(28e9, 100e6) == math.inf
+        assert access_point_eirp_dbm("home router", 5.6e9, 80e6) == 26.0
+        assert access_point_eirp_dbm("ceiling access point", 2.442e9, 20e6) == 20.0
+        with pytest.raises(SettingsError, match=r"frequency_hz = 28000000000.0 .* choose a band of Wi-Fi"):
+            access_point_eirp_dbm("home router", 28e9, 80e6)
+        with pytest.raises(SettingsError, match="region = 'MIC'"):
+            eirp_limit_dbm(5.21e9, 80e6, "MIC")
 
     def test_area_above_a_power_is_counted(self, complete, several):
         area = complete.radio.area(-67.0, eirp_dbm=13.0, probability=0.9)

@@ -138,12 +138,13 @@ class TestSeveralTransmitters:
     def test_the_command_network_writes_the_page(self, tmp_path):
         save_map(map_of(PICTURE), tmp_path / "map.yaml")
         options = [word for x, y in SEVERAL.values() for word in ("--tx", x, y)]
-        options += ["--tx-power", 23, "--tx-power", 20]
+        options += ["--tx-power", 23, "--tx-power", 20, "--channel", 1, "--channel", 6]
         words = ["network", tmp_path / "map.yaml", *options, "--spacing", 0.5, "--out", tmp_path / "out"]
         result = CliRunner().invoke(cli.app, [*map(str, words)])
         assert result.exit_code == 0, result.output
         files = ["coverage.nc", "coverage.html", "network.nc", "network.png"]
-        assert result.stdout.splitlines() == [f"wrote {tmp_path / 'out' / name}" for name in files]
+        written = [f"wrote {tmp_path / 'out' / name}" for name in files]
+        assert result.stdout.splitlines() == ["tx1: channel 1, tx2: channel 6", *written]
         assert sorted(file.name for file in (tmp_path / "out").iterdir()) == sorted(files)
         assert xr.load_dataset(tmp_path / "out" / "network.nc").attrs["tx_power_dbm"].tolist() == [23.0, 20.0]
 

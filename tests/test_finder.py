@@ -77,43 +77,9 @@ def test_settings_say_how_many_walls_mirror_beside_a_diffraction() -> None:
     assert {word for word in words[2] if "D" in word} == {"D", "DR", "RD", "RDR", "DRR", "RRD"}
 
 
-def test_gains_are_averaged_over_geometries(tmp_path: Path) -> None:
-    """A link in sight is as mapped, another has the mean gain of the mapped walls and of drawn ones."""
-    plan = _plan()
-    one, three, again = (sp.Simulation(plan, None, sp.SceneSettings(geometries=count)) for count in (1, 3, 3))
-    mapped, mean = one.links(TX, RX), three.links(TX, RX)
-    hidden = mapped.link_state == sp.LinkState.NLOS
-    assert 0 < hidden.sum() < len(RX)
-    np.testing.assert_array_equal(mean.link_state, mapped.link_state)
-    np.testing.assert_array_equal(mean.gain_db[~hidden], mapped.gain_db[~hidden])
-    np.testing.assert_array_equal(mean.gain_db, again.links(TX, RX).gain_db)
-    assert (mean.gain_db != mapped.gain_db)[hidden].all()
-    drawn = [three._finder_of(draw) for draw in (1, 2)]
-    power = np.zeros((2, len(RX)))
-    for number, finder in enumerate(drawn):
-        for _, paths in finder.paths(TX, RX, 1, lambda *_: None):
-            np.add.at(power[number], paths.path_rx, paths.power)
-    drawn_db = 10.0 * np.log10(np.maximum(power, 1e-15))
-    expected_db = (mapped.gain_db + drawn_db.sum(axis=0)) / 3.0
-    np.testing.assert_allclose(expected_db[hidden], mean.gain_db[hidden], atol=0.6)
-    for links in (three.paths(TX, RX).links(), three.links(TX, RX, folder=tmp_path / "links")):
-        np.testing.assert_allclose(links.gain_db, mapped.gain_db, atol=0.1)
-
-
-@pytest.mark.parametrize(
-    ("noise", "pocket", "settings", "count"),
-    [
-        (1.0, True, sp.TraceSettings(), simulation.GEOMETRIES),
-        (0.5, True, sp.TraceSettings(), 1),
-        (1.0, False, sp.TraceSettings(), 1),
-        (1.0, True, sp.TraceSettings(refraction=True), 1),
-    ],
-)
-def test_geometries_are_drawn_where_a_nearly_complete_map_is_noisy(
-    noise: float, pocket: bool, settings: sp.TraceSettings, count: int
-) -> None:
-    state = _plan().state.copy()
-    state[8:11, 8:11] = sp.CellState.UNKNOWN if pocket else sp.CellState.FREE
-    partial = sp.PartialMap(state, 0.1)
-    vars(partial)["wall_noise"] = noise
-    assert sp.Simulation(partial, settings).resolved.scene_settings.geometries == count
+def test_links_in_a_folder_are_those_in_memory_and_the_default_tolerance_is_as_written(tmp_path: Path) -> None:
+    default, written = (sp.Simulation(_plan(), sp.TraceSettings(power_tolerance_db=each)) for each in (None, 0.1))
+    expected = default.links(TX, RX)
+    for links in (written.links(TX, RX), default.links(TX, RX, folder=tmp_path / "links")):
+        for name in ("gain_db", "link_state", "path_rx", "transfer", "delay_s", "interactions"):
+            np.testing.assert_array_equal(getattr(links, name), getattr(expected, name))

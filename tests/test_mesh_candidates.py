@@ -67,7 +67,7 @@ def candidates_of(
     loaded: tuple[Any, list[Any]], meshes: Sequence[trimesh.Trimesh], tx: Any, rx: Any, depth: int = 3, **options: int
 ) -> Candidates:
     shot = shoot_rays(loaded[0].mi_scene, loaded[1], tx, 50_000, depth)
-    kind = MeshReflections(opaque(*meshes), tx, rx, TraceSettings(max_depth=depth), shot)
+    kind = MeshReflections.between_faces(opaque(*meshes), tx, rx, TraceSettings(max_depth=depth), shot)
     parts, shares = zip(*blocks_of(kind.listed(np.zeros(len(rx)), **options)), strict=True)
     assert list(shares) == sorted(shares)
     assert shares[-1] == 1.0

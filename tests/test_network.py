@@ -63,11 +63,49 @@ def test_probabilities_agree_with_the_maps(coverage: xr.Dataset) -> None:
     outage, valid = coverage["p_outage"], coverage["valid"].all("tx")
     low, high = outage.prod("tx"), outage.min("tx")
     all_out = network["p_all_outage"]
-    assert bool(((all_out <= high + 0.02) | ~valid).all())
+    assert bool(((all_out <= high + 1e-6) | ~valid).all())
     assert bool(((all_out >= np.minimum(low, high) - 0.1) | ~valid).all())
     total = network["p_best"].sum("tx") + all_out
     np.testing.assert_allclose(total.to_numpy()[valid], 1.0, atol=1e-5)
     assert network.identical(sp.network_map(coverage, n=200))
+
+
+def test_channels_divide_the_interference() -> None:
+    room = sp.PartialMap(np.pad(np.zeros((30, 70), np.uint8), 1, constant_values=1), 0.1)
+    tx = {"a": (1.0, 1.0, 1.5), "b": (1.6, 1.0, 1.5), "c": (6.0, 2.5, 1.5)}
+    coverage = sp.predict_map(room, tx, spacing_m=0.5)
+    shared, apart = (sp.network_map(coverage, channels=plan, n=20) for plan in (None, {"a": 1, "b": 6, "c": 11}))
+    noise_dbm = -174.0 + 80.0 + 7.0
+    valid = coverage["valid"].all("tx").to_numpy()
+    snr_db = (coverage["gain_mean_db"].max("tx") + 20.0 - noise_dbm).to_numpy()
+    np.testing.assert_allclose(apart["sinr_mean_db"].to_numpy()[valid], snr_db[valid], atol=1e-3)
+    assert (apart["sinr_mean_db"] > shared["sinr_mean_db"]).to_numpy()[valid].all()
+    proposed = sp.network_map(coverage, channels=[36, 52], n=20)
+    rates = [float(found["rate_bit_s"].mean()) for found in (shared, proposed, apart)]
+    assert rates == sorted(rates)
+    near, other, far = proposed["channel"].values.tolist()
+    assert near != other  # the two nearest
+    assert {near, other, far} == {"36", "52"}
+    for channels, match in (
+        ({"a": 1}, "give a channel to each of a, b, c"),
+        ([], r"give a list, such as \[1, 6, 11\]"),
+    ):
+        with pytest.raises(SettingsError, match=match):
+            sp.network_map(coverage, channels=channels)
+
+
+def test_any_transmitter_covers_at_least_as_much_as_each(half_seen: sp.PartialMap, model: sp.LinkModel) -> None:
+    tx = {"on a receiver": (1.0, 1.0, 1.5), "in the unseen": (4.6, 2.6, 1.5)}
+    coverage = model.coverage(tx, spacing_m=0.4)
+    assert (coverage["valid"].any("tx") & ~coverage["valid"].all("tx")).sum() == 2
+    for threshold_dbm in (-90.0, -60.0, -40.0):
+        each, together = (coverage.radio.area(threshold_dbm, any_transmitter=every) for every in (False, True))
+        for name in ("fraction", "fraction_mean"):
+            assert (each[name] <= together[name] + 1e-9).all()
+        assert each["area_m2"].equals(together["area_m2"])
+    network = sp.network_map(coverage)
+    assert network["best_server"].sel(x=1.0, y=1.0, method="nearest").item() == 0
+    assert (network["p_all_outage"] <= coverage["p_outage"].min("tx") + 1e-6).all()
 
 
 def test_links_through_the_same_unknown_cells_are_alike() -> None:
@@ -90,6 +128,14 @@ def test_several_are_placed_greedily_and_then_swapped(half_seen: sp.PartialMap) 
     placed = sp.place_transmitters(direct, 2, threshold_db=-75.0)
     assert (half_seen.state_at(placed.positions_m) == sp.CellState.FREE).all()
     assert placed.scores[1] >= placed.scores[0]
+    np.testing.assert_allclose(placed.added.sum(), placed.score)
+    few = sp.place_transmitters(direct, 6, goal=float(placed.scores[0]) + 0.01, threshold_db=-75.0)
+    assert few.score >= placed.scores[0] + 0.01
+    assert 2 <= len(few.positions_m) < 6
+    assert (few.added > 0.0).all()
+    assert len(sp.place_transmitters(direct, 2, goal=1.0, threshold_db=-60.0).positions_m) == 2
+    with pytest.raises(SettingsError, match=r"goal = 95 is not allowed"):
+        sp.place_transmitters(direct, goal=95, threshold_db=-75.0)
     own = sp.place_transmitters(direct, 1, rx=[(1.0, 1.0, 1.5)], threshold_db=-75.0)
     assert own.score > 0.9
     assert own.rx_m.shape == (1, 3)
@@ -106,7 +152,7 @@ def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Da
             sp.network_map(coverage, **options)
     for other, match in (
         (coverage.isel(tx=[]), "give each a name"),
-        (coverage.assign(valid=coverage.valid & False), "no position at which receivers"),
+        (coverage.assign(valid=coverage.valid & False), "no position at which a receiver"),
         (coverage.isel(tx=0), "no dimension tx"),
         (coverage.assign_coords(tx=["a\nb", "b"]), "of printable characters"),
     ):

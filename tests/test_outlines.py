@@ -124,7 +124,7 @@ def assert_sound(outlines: Outlines) -> None:
         pytest.param("........ .######. .######. ........", path((1.5, 2.0), (6.5, 2.0)), id="two cells thick"),
         pytest.param("........ .######. .######. .######. ........", ring(1.5, 1.5, 6.5, 3.5), id="thick wall"),
         pytest.param(
-            "??????????? ?##?#?#?#?? ??#######?? ...........", path((2.0, 1.5), (9.0, 1.5)), id="seen at one face"
+            "??????????? ??##?#####? ??#######?? ...........", path((2.0, 1.5), (9.0, 1.5)), id="seen at one face"
         ),
         pytest.param("???????? ?######? ?######? ?######? ????????", ring(1.5, 1.5, 6.5, 3.5), id="seen from nowhere"),
         pytest.param("......... ....#.... .#######. .........", path((1.5, 1.5), (7.5, 1.5)), id="spur of one cell"),
@@ -254,7 +254,7 @@ def test_staircase_of_a_tilted_wall_is_one_line(angle_deg: float, thickness: flo
 
 @pytest.mark.parametrize(
     ("thickness", "fraction", "around", "most"),
-    [(1, 0.0, 0.3, 20), (4, 0.05, 0.05, 24), (4, 0.15, 0.15, 110)],
+    [(1, 0.0, 0.3, 26), (4, 0.05, 0.05, 24), (4, 0.15, 0.15, 110)],
 )
 def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: float, most: int) -> None:
     partial = noisy_plan(thickness, fraction, around)
@@ -265,7 +265,7 @@ def test_noisy_walls_have_few_segments(thickness: int, fraction: float, around: 
     assert farthest_from_walls(partial, outlines) < 2.0
 
 
-@pytest.mark.parametrize(("before", "behind", "noise"), [(0.0, 0.0, 0.0), (0.0, 0.03, 0.3), (0.7, 0.8, 0.5)])
+@pytest.mark.parametrize(("before", "behind", "noise"), [(0.0, 0.0, 0.0), (0.0, 0.03, 0.1), (0.7, 0.8, 0.5)])
 def test_outlines_are_in_the_middle_of_noisy_walls(before: float, behind: float, noise: float) -> None:
     """Range noise fills cells before and behind a wall; single cells behind straight walls are its first sign."""
     rng = np.random.default_rng(1)
@@ -274,13 +274,26 @@ def test_outlines_are_in_the_middle_of_noisy_walls(before: float, behind: float,
         inside = state[margin:-margin, margin:-margin]
         inside[rng.random(inside.shape) < fraction] = CellState.WALL
         inside[1:-1, 1:-1] = CellState.FREE
-    state[160, 210] = CellState.UNKNOWN  # complete maps are exact
     partial = PartialMap(state.astype(np.uint8), 0.05)
-    assert partial.wall_noise >= noise
-    assert (partial.wall_noise == 0.0) == (noise == 0.0)
+    near = partial.noise_near(np.array([[2.0, 2.0], [10.0, 15.0]]))
+    assert (near >= noise).all()
+    assert near.any() == (noise > 0.0)
     walls = shapely.LinearRing([[10.5, 10.5], [409.5, 10.5], [409.5, 309.5], [10.5, 309.5]])
     lines = shapely.multilinestrings(shapely.linestrings(in_cells(partial, wall_outlines(partial))))
     assert shapely.distance(lines, shapely.points(shapely.segmentize(walls, 1.0).coords)).mean() < 0.25
+
+
+def test_outlines_depend_on_the_cells_around_them() -> None:
+    """Rough, noisy walls from 11.5 m on move the ends of walls that begin within 5 m by less than a millimetre."""
+    rng = np.random.default_rng(4)
+    calm = noisy_plan(2, 0.02, 0.02, scale=2, seed=1).state[:230, :230]
+    rough = np.where(rng.random(calm.shape) < 0.2, CellState.WALL, calm).astype(np.uint8)
+    beside, alone = (PartialMap(np.hstack([calm, *more]), 0.05) for more in ([np.roll(rough, 5, 0)], []))
+    here, there = (wall_outlines(partial) for partial in (alone, beside))
+    lines = shapely.multilinestrings(shapely.linestrings(there.vertices_m[there.segments]))
+    near = here.vertices_m[here.vertices_m[:, 0] < 5.0]
+    assert len(near) == 4
+    assert shapely.distance(lines, shapely.points(near)).max() < 1e-3
 
 
 @pytest.mark.parametrize("angle_deg", [0, 7, 20, 45])
@@ -314,7 +327,7 @@ def test_noise_near_is_local_continuous_and_turns_and_moves_with_the_map() -> No
     noise = partial.noise_near(points_m)
     assert noise[:300].min() > 0.6
     assert (noise[-300:] == 0.0).all()
-    assert np.abs(np.diff(noise)).max() < 0.02
+    assert np.abs(np.diff(noise)).max() < 0.03
     for transpose, rows, columns in SYMMETRIES:
         turned = PartialMap(transformed(state, transpose, rows, columns), 0.05, (-3.21, 1e3))
         there_m = transformed_points(points_m / 0.05, state.shape, transpose, rows, columns) * 0.05 + turned.origin_m

@@ -99,3 +99,16 @@ def test_place(map_path: Path, tmp_path: Path) -> None:
 def test_worst_tenth(map_path: Path, tmp_path: Path) -> None:
     result = run("place", map_path, "--out", tmp_path / "place", "--objective", "percentile")
     assert "\nthe worst tenth of the receivers is predicted at " in result.stdout
+
+
+def test_how_many_and_where(map_path: Path, tmp_path: Path) -> None:
+    options = ("--count", "3", "--goal", "1", "--threshold", "-60", "--out", tmp_path / "place")
+    lines = run("place", map_path, *options).stdout.splitlines()
+    record = json.loads((tmp_path / "place" / "placement.json").read_text())
+    added = [float(line.rpartition(" adds ")[2].rstrip("%")) for line in lines[:3]]
+    assert added == pytest.approx([100.0 * record["scores"][0], *100.0 * np.diff(record["scores"])], abs=0.06)
+    assert lines[3].startswith("the goal of 100.0% is not reached: give a larger --count")
+    result = run(
+        "place", map_path, "--goal", "1", "--objective", "percentile", "--out", tmp_path / "other", exit_code=2
+    )
+    assert "leave out --count and --goal" in result.stderr

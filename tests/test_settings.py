@@ -33,7 +33,7 @@ NO_NUMBERS = (math.nan, math.inf, -math.inf, "1", None, True, [1.0])
 RANGES = """
 Material relative_permittivity number [1, 1e+06], conductivity_s_m number [0, 1e+09], thickness_m number (0, 10],
     conductivity_exponent number [0, 2]
-SceneSettings bridge_gap_m number [0, 1], geometries whole [1, 16]
+SceneSettings bridge_gap_m number [0, 1]
 TraceSettings frequency_hz number [1e+06, 1e+12], max_depth whole [0, 10], diffraction_walls whole [0, 2],
     power_tolerance_db number [0, 1], max_walls whole [1, 16], wall_depth_m number [0, 10],
     samples_per_tx whole [1, 100000000], seed whole [0, 2147483647]

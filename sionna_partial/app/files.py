@@ -60,7 +60,7 @@ FILES = {
 }
 """Downloads: kind and file name."""
 
-_MAP, _TEXT, _VERSION, _MOST_TEXT = "map.npz", "project.json", 1, 20_000_000
+_MAP, _TEXT, _SOURCE, _VERSION, _MOST_TEXT = "map.npz", "project.json", "source", 1, 20_000_000
 _ARRAYS = ("tx", "rx", "gain_db", "std_db")
 
 
@@ -118,9 +118,9 @@ def coverage_file(
     *,
     scene: PartialMap | None = None,
 ) -> bytes:
-    """Return the content of one of `FILES`. `heading` is for the report, `scene` for the ROS map, which is a zip."""
+    """Return the content of one of `FILES`; a ROS map is a zip. `heading` is for the report, `scene` for both."""
     if kind == "pdf":
-        return report_pdf(coverage, eirp_dbm, threshold_dbm, heading)
+        return report_pdf(coverage, eirp_dbm, threshold_dbm, heading, scene)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         path = Path(folder) / f"coverage.{kind}"
         save_coverage(coverage, path, scene=scene, threshold_db=np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0))
@@ -130,13 +130,16 @@ def coverage_file(
 
 @dataclass(frozen=True)
 class Project:
-    """State of a window."""
+    """State of a window: `source` is the file of its map, with settings, on which `strokes` were drawn."""
 
     partial: PartialMap
     title: str
     transmitters: Mapping[str, Transmitter] = field(default_factory=dict)
     settings: RadioSettings | None = None
     measured: Measurements | None = None
+    view: Mapping[str, Any] = field(default_factory=dict)
+    source: tuple[str, bytes, Mapping[str, Any]] | None = None
+    strokes: Sequence[Mapping[str, Any]] = ()
 
 
 def project_file(project: Project) -> bytes:
@@ -148,10 +151,18 @@ def project_file(project: Project) -> bytes:
         "transmitters": {name: asdict(each) for name, each in project.transmitters.items()},
         "settings": None if project.settings is None else asdict(project.settings),
         "measured": None if measured is None else _measured_record(measured),
+        "view": {**project.view},
+        "source": None,
+        "strokes": [*project.strokes],
     }
+    files: dict[str, bytes] = {}
+    if project.source is not None:
+        name, content, values = project.source
+        record["source"], files = [PurePath(name).name, {**values}], {_SOURCE: content}
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         save_map(project.partial, Path(folder) / _MAP)
-        return zipped({_MAP: (Path(folder) / _MAP).read_bytes(), _TEXT: json.dumps(record, indent=1).encode()})
+        files |= {_MAP: (Path(folder) / _MAP).read_bytes(), _TEXT: json.dumps(record, indent=1).encode()}
+        return zipped(files)
 
 
 def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
@@ -174,10 +185,10 @@ def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
             (Path(folder) / _MAP).write_bytes(contents[_MAP])
             partial = load_map(Path(folder) / _MAP)
-        return _project(partial, record)
+        return _project(partial, record, contents.get(_SOURCE))
 
 
-def _project(partial: PartialMap, record: dict[str, Any]) -> Project:
+def _project(partial: PartialMap, record: dict[str, Any], content: bytes | None) -> Project:
     title, settings, measured, transmitters = str(record["title"])[:100], record["settings"], record["measured"], {}
     require(
         len(record["transmitters"]) <= MOST_TRANSMITTERS, "transmitters", len(record["transmitters"]), "give fewer."
@@ -189,7 +200,16 @@ def _project(partial: PartialMap, record: dict[str, Any]) -> Project:
     if links is not None:
         outside = partial.state_at(links.rx) != CellState.WALL  # links in walls are kept, and not used
         partial.require_positions("rx of the measurements", links.rx[outside], least=0)
-    return Project(partial, title, transmitters, None if settings is None else RadioSettings(**settings), links)
+    return Project(
+        partial,
+        title,
+        transmitters,
+        None if settings is None else RadioSettings(**settings),
+        links,
+        record.get("view", {}),
+        (str(record["source"][0]), content, record["source"][1]) if content and record.get("source") else None,
+        record.get("strokes", ()),
+    )
 
 
 def _measured_record(measured: Measurements) -> dict[str, Any]:
@@ -205,17 +225,24 @@ def script(project: Project, python_map: Sequence[str]) -> str:
     trace = [f"frequency_hz={settings.frequency_hz!r}"]
     trace += [] if settings.through_walls is None else [f"refraction={settings.through_walls}"]
     given = [f"rx_height_m={settings.rx_height_m!r}", f"spacing_m={settings.spacing_m!r}"]
-    given += [f"trace_settings=sp.TraceSettings({', '.join(trace)})"]
+    given += ["receivers='inside'", f"trace_settings=sp.TraceSettings({', '.join(trace)})"]
     given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
     given += ['measurements="measured.csv"'] if project.measured is not None else []
+    power = [f"eirp_dbm={powers!r}"]
+    if settings.both_ways:
+        power.append(f"client_dbm={[settings.uplink_dbm(each) for each in transmitters]!r}")
     if any(each != Antenna() for each in antennas):
         given.append(f"tx_antenna=[{', '.join(f'sp.{each!r}' for each in antennas)}]")
     tx_m = {name: each.position_m for name, each in project.transmitters.items()}
     lines = [
         *("import sionna_partial as sp", "", *python_map, f"tx = {tx_m!r}"),
         *("coverage = sp.predict_map(", "    partial,", "    tx,", *(f"    {each}," for each in given), ")"),
-        f"power = coverage.radio.power(eirp_dbm={powers!r})",
-        f"area = coverage.radio.area({settings.threshold_dbm!r}, eirp_dbm={powers!r})",
+        f"power = coverage.radio.power({', '.join(power)})",
+        f"area = coverage.radio.area({settings.threshold_dbm!r}, {', '.join(power)})",
         'coverage.radio.save("coverage.nc")',
     ]
+    plan = {name: each.channel for name, each in project.transmitters.items()}
+    if any(plan.values()):
+        bandwidth = f"bandwidth_hz={settings.bandwidth_hz!r}"
+        lines.append(f"network = sp.network_map(coverage, tx_power_dbm={powers!r}, {bandwidth}, channels={plan!r})")
     return "\n".join(lines) + "\n"

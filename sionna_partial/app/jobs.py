@@ -5,8 +5,16 @@ import threading
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import partial
+from typing import TypeAlias
+
+from sionna_partial.checks import Progress, reason_of
+from sionna_partial.errors import SionnaPartialError
+
+_log = logging.getLogger(__name__)
 
 
 class CancelledError(Exception):
@@ -72,6 +80,112 @@ class Job:
             TURNS.pass_on()
         if self.is_cancelled.is_set():
             raise CancelledError
+
+
+Work: TypeAlias = Callable[[Progress], Iterator[Callable[[], None]]]
+"""A computation, which yields functions to be called in the thread of the window."""
+
+
+class WindowJobs:
+    """Jobs of one window, one after the other, in a thread of their own.
+
+    A new job cancels the one before it and drops its results. `call` runs a function in the thread of the window;
+    `show` is called in that thread after changes.
+    """
+
+    def __init__(self, call: Callable[[Callable[[], None]], object], show: Callable[[], None]) -> None:
+        self._call, self._show = call, show
+        self._waiting: deque[Callable[[], None]] = deque()
+        self._job: Job | None = None
+        self._worker = ThreadPoolExecutor(1, "coverage of a window")
+        self._job_warnings: list[str] = []
+        self.status = Status()
+
+    def do(self, function: Callable[[], None]) -> None:
+        """Run a function in the thread of the window, after those that wait; called in any thread."""
+        self._waiting.append(function)
+        self._call(self._do_all)
+
+    def _do_all(self) -> None:
+        while self._waiting:
+            try:
+                self._waiting.popleft()()
+            except Exception as error:  # shown by the page, which stays alive
+                self.cancel()
+                self.refuse(_reason(error))
+
+    def begin(self, work: Work) -> None:
+        """Start a job, and cancel the one before."""
+        if self._job is not None:
+            self._job.is_cancelled.set()
+        job = self._job = Job(self._tell)
+        self.status = Status("Waiting", 0.0)
+        self._show()
+        with suppress(RuntimeError):  # a window that was closed computes nothing
+            self._worker.submit(self._run, job, work)
+
+    def cancel(self) -> None:
+        if self._job is not None:
+            self._job.is_cancelled.set()
+            self._job = None
+            self._conclude(Status("Cancelled."))
+
+    def refuse(self, error: object) -> None:
+        self.status = Status(str(error), is_error=True)
+        self._show()
+
+    def close(self) -> None:
+        """Cancel the job, and accept no other one."""
+        self._call, self._show = lambda function: None, lambda: None
+        self.cancel()
+        self._worker.shutdown(wait=False, cancel_futures=True)
+
+    def _run(self, job: Job, work: Work) -> None:
+        """Compute a job in turns with other windows."""
+        try:
+            with TURNS, collected_warnings(job.warnings):
+                job.report(0.0, "starting")
+                for change in work(job.report):
+                    self.do(partial(self._take, job, change))
+                    job.pass_on()
+                end = Status("Ready.")
+        except CancelledError:
+            return
+        except Exception as error:  # shown by the page, which stays alive
+            end = Status(_reason(error), is_error=True)
+        self.do(partial(self._end, job, end))
+
+    def _tell(self, job: Job, status: Status) -> None:
+        def tell() -> None:
+            if job is self._job:
+                self.status = status
+                self._show()
+
+        self.do(tell)
+
+    def _take(self, job: Job, change: Callable[[], None]) -> None:
+        if job is self._job:
+            change()
+            self._job_warnings += job.warnings
+            self._show()
+
+    def _end(self, job: Job, end: Status) -> None:
+        if job is self._job:
+            self._job = None
+            self._job_warnings += job.warnings
+            self._conclude(end)
+
+    def _conclude(self, status: Status) -> None:
+        """Show the end of a job."""
+        self.status = status
+        self._show()
+
+
+def _reason(error: Exception) -> str:
+    """Return the reason of an error, whose trace is logged if it is not ours."""
+    if not isinstance(error, SionnaPartialError | OSError | MemoryError):
+        _log.error("a job of the app failed", exc_info=error)
+    return reason_of(error)
 
 
 class _Collector(logging.Handler):

@@ -10,21 +10,25 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Stroke
+from sionna_partial.app.answer import LAYERS, LIKELY, NETWORK_LAYERS, OUTLINES, Answer
+from sionna_partial.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
 from sionna_partial.app.files import FILES
-from sionna_partial.app.picture import LAYERS, LIKELY, OUTLINES, Picture, material_colour
-from sionna_partial.app.radio import MATERIALS, MOST_TRANSMITTERS, PRESETS
+from sionna_partial.app.picture import Picture
+from sionna_partial.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, PRESETS
 from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes
+from sionna_partial.plots.style import material_colour
 from sionna_partial.resources import demo_homes
 from sionna_partial.settings import WALL_MATERIALS, material_name
 
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
 _AIM = 0.06
 _WALLS = {"": "below 24 GHz", "opaque": "never", "through": "always"}
+_DIRECTIONS = {"": "at the client", "1": "weaker of both ways"}
+_REGIONS = {"ETSI": "Europe (ETSI)", "FCC": "USA (FCC)"}
+_UNITS = {"frequency_hz": 1e9, "bandwidth_hz": 1e6}
 _COMPUTED_FOR = {"": "the partial map", "1": "the whole home (truth)"}
 _STRONGEST = "the strongest"
 _FILE_NAMES = {
@@ -81,25 +85,30 @@ class Page:
         from bokeh.models.widgets.markups import Div
         from bokeh.models.widgets.sliders import Slider
 
+        session, transmitter = self.session, lambda name: self.session.look(transmitter=name)
         self.layer = self._on(
-            Select(title="Layer", name="layer", value="p_above", options=self._options(1)), lambda _: self.show()
+            Select(title="Layer", name="layer", value="p_above", options=self._options(1)),
+            lambda name: session.look(layer=name),
         )
-        self.which = self._on(Select(title="Shown for", value=""), lambda _: self.show())
+        self.which = self._on(Select(title="Shown for", value=""), transmitter)
         self.truth = self._on(
-            Select(
-                title="Computed for",
-                value="",
-                options=list[Any](_COMPUTED_FOR.items()),
-            ),
-            lambda _: self.show(),
+            Select(title="Computed for", value="", options=list[Any](_COMPUTED_FOR.items())),
+            lambda value: session.look(truth=bool(value)),
         )
         self.threshold = self._on(
-            Slider(title="Threshold [dBm]", start=-130, end=-30, step=1, value=-80),
-            lambda value: self.session.set(threshold_dbm=float(value)),
+            Slider(title="Threshold [dBm]", name="threshold", start=-130, end=-30, step=1, value=-67),
+            lambda value: session.set(threshold_dbm=float(value)),
         )
         self.outline = self._on(
             Select(title="Line at the threshold", name="outline", value="p_above", options=list[Any](OUTLINES.items())),
-            lambda _: self.show(),
+            lambda name: session.look(outline=name),
+        )
+        presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
+        self.preset = self._on(Select(title="Band", name="preset", options=presets), self._use_preset)
+        materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
+        self.material = self._on(
+            Select(title="Material of walls", name="material", options=materials),
+            lambda name: session.set(material=name),
         )
         self.message = Div(
             name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
@@ -126,8 +135,13 @@ class Page:
         )
         self.dark = self._on(
             Slider(title="Walls up to shade", name="dark", start=0, end=254, step=1, value=127),
-            lambda value: self.session.change_plan(threshold=int(value)),
+            lambda value: self.session.change_source(threshold=int(value)),
             "value_throttled",
+        )
+        self.layer_of_walls = self._on(Select(title="Layer of the drawing", name="wall_layer"), lambda _: self.show())
+        materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
+        self.layer_material = self._on(
+            Select(title="Its material", name="wall_layer_material", options=materials), self._set_layer_material
         )
         self.undo = self._button("Undo", lambda: self.session.undo())
         self.picture.follow(self.stroke, self.brush, self.dark)
@@ -150,6 +164,14 @@ class Page:
                 ("eirp_dbm", "Power [dBm]", 1, -100, 100),
             )
         }
+        models: list[Any] = [(name, name or "own power") for name in MODELS]
+        self.model = self._on(Select(title="Kind", name="model", options=models), lambda name: self._change(model=name))
+        self.channel = self._on(
+            Select(title="Channel", name="channel", value=""), lambda name: self._change(channel=name)
+        )
+        self.goal = Spinner(title="Covered floor [%]", name="goal", low=1, high=100, step=1, value=95)
+        self.most = Spinner(title="At most", name="most", low=1, high=MOST_TRANSMITTERS, step=1, value=4)
+        self.plan_channels = self._button("Plan channels", lambda: self.session.plan_channels())
         self.pattern = self._on(
             Select(title="Antenna", name="pattern", options=list[Any](_ANTENNAS.items())),
             lambda value: self._change_antenna("pattern", value),
@@ -174,13 +196,14 @@ class Page:
             Select(title="Paths through walls", options=list[Any](_WALLS.items()), value=""),
             lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),
         )
-        materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
-        self.material = self._on(
-            Select(title="Material of walls", name="material", options=materials),
-            lambda name: self.session.set(material=name),
+        self.both_ways = self._on(
+            Select(title="Received power", name="both_ways", options=list[Any](_DIRECTIONS.items()), value=""),
+            lambda value: self.session.set(both_ways=bool(value)),
         )
-        presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
-        self.preset = self._on(Select(title="Band", name="preset", options=presets), self._use_preset)
+        self.region = self._on(
+            Select(title="Power limits of", name="region", options=list[Any](_REGIONS.items())),
+            lambda name: self.session.set(region=name),
+        )
         self.radio = {
             name: self._on(
                 Spinner(title=title, name=name, step=step, low=low, high=high, format="0.[000]"),
@@ -192,6 +215,7 @@ class Page:
                 ("bandwidth_hz", "Bandwidth [MHz]", 1e6, 10, 0.01, 10_000),
                 ("rx_height_m", "Receiver height [m]", 1.0, 0.1, 0, 100),
                 ("spacing_m", "Between receivers [m]", 1.0, 0.05, 0.05, 10),
+                ("client_dbm", "Client's power [dBm]", 1.0, 1, -100, 100),
             )
         }
         self.measured_text = Div(name="measured_text", sizing_mode="stretch_width")
@@ -217,11 +241,13 @@ class Page:
         self.forget = self._button("Forget the measurements", lambda: session.forget_measurements())
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
         x, y, z, eirp = self.fields.values()
-        frequency, bandwidth, height, spacing = self.radio.values()
+        frequency, bandwidth, height, spacing, client = self.radio.values()
         return {
             "status": _wide(row(self.message, self.cancel), self.warnings),
+            "band": _pair(self.preset, self.material),
             "layers": _pair(self.layer, self.which),
-            "choices": _pair(self.threshold, self.outline, self.truth),
+            "lines": _pair(self.outline, self.truth),
+            "choices": _pair(self.threshold),
             "picture": self.picture.plot,  # nothing above it changes its height with an answer: a drag would miss
             "summary": self.summary,
             "links": self.links,
@@ -230,6 +256,7 @@ class Page:
                 upload_map,
                 self.map_text,
                 _pair(self.length, self.dark),
+                _pair(self.layer_of_walls, self.layer_material),
                 self.stroke,
                 self.hint,
                 _pair(self.paint, self.brush),
@@ -239,15 +266,22 @@ class Page:
                 _pair(self.chosen, self.name),
                 _pair(x, y),
                 _pair(z, eirp),
+                _pair(self.model, self.channel),
                 _pair(self.pattern, *self.aims.values()),
                 _pair(
                     self._button("Add", lambda: session.add()),
                     self._button("Remove", lambda: session.remove(session.chosen)),
                 ),
                 self._button("Place it for me", lambda: session.place(), button_type="primary"),
+                _pair(self.goal, self.most),
+                self._button("Place several for me", self._place_several),
+                self.plan_channels,
             ),
             "radio": _wide(
-                self.preset, _pair(frequency, bandwidth), _pair(self.walls, self.material), _pair(height, spacing)
+                _pair(frequency, bandwidth),
+                _pair(self.walls, self.region),
+                _pair(self.both_ways, client),
+                _pair(height, spacing),
             ),
             "robot": _wide(
                 self.more,
@@ -311,6 +345,14 @@ class Page:
         stroke = Stroke(self.stroke.value, tuple(points_m), float(self.brush.value or 0.0), material)
         self._guarded(self.session.draw, stroke)
 
+    def _set_layer_material(self, name: str) -> None:
+        assert isinstance(self.session.source, Drawing)
+        materials = {**self.session.source.materials, self.layer_of_walls.value: name}
+        self.session.change_source(materials={layer: each for layer, each in materials.items() if each})
+
+    def _place_several(self) -> None:
+        self.session.place_several(float(self.goal.value or 0.0) / 100.0, int(self.most.value or 1))
+
     def _open_example(self, name: str) -> None:
         if name:
             self.session.open_example(name)
@@ -343,6 +385,7 @@ class Page:
             key = self.session.partial, self.session.title, self.session.steps, self.session.plan
             self._once("map", key, self._show_map)
             self._show_strokes()
+            self._show_layers()
             self._show_transmitters()
             self._show_measured()
             self._show_answer()
@@ -402,6 +445,17 @@ class Page:
             model.visible = self.stroke.value in users
         self._once("unit", (is_measured,), lambda: self.picture.show_unit("m" if is_measured else "pixels"))
 
+    def _show_layers(self) -> None:
+        """Show the layers of a drawing that are walls."""
+        source, partial = self.session.source, self.session.partial
+        is_drawing = isinstance(source, Drawing) and partial is not None
+        self.layer_of_walls.visible = self.layer_material.visible = is_drawing
+        if isinstance(source, Drawing) and partial is not None and partial.import_source is not None:
+            self.layer_of_walls.options = [each.name for each in partial.import_source.used]
+            if self.layer_of_walls.value not in self.layer_of_walls.options:
+                self.layer_of_walls.value = next(iter(self.layer_of_walls.options), "")
+            self.layer_material.value = source.materials.get(self.layer_of_walls.value, "")
+
     def _show_transmitters(self) -> None:
         session = self.session
         names = [*session.transmitters]
@@ -428,17 +482,24 @@ class Page:
         aims = self._aimed()
         self._once("aims", (repr(aims),), functools.partial(setattr, self.picture.aims, "data", aims))
         self.name.disabled = chosen is None
-        options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
-        if self.which.options != options:  # of several transmitters, first the sum at a receiver
-            self.which.options, self.which.value = options, options[0][0]
-        self.layer.options = self._options(len(names))
-        if self.layer.value not in [value for value, _ in self.layer.options]:
-            self.layer.value = "p_above"
+        self.model.value, self.model.disabled = chosen.model if chosen else "", chosen is None
         settings = session.settings
-        for name, unit in (("frequency_hz", 1e9), ("bandwidth_hz", 1e6), ("rx_height_m", 1.0), ("spacing_m", 1.0)):
+        channels = dict.fromkeys(["", *settings.channels, *(tx.channel for tx in each)])
+        self.channel.options = [(channel, channel or "shared by all") for channel in channels]
+        self.channel.value, self.channel.disabled = chosen.channel if chosen else "", chosen is None
+        self.plan_channels.visible = len(names) > 1
+        options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
+        self.which.options, self.layer.options = options, self._options(len(names))
+        view = session.shown_view
+        self.which.value = view.transmitter if len(names) != 1 else names[0]
+        self.layer.value, self.outline.value, self.truth.value = view.layer, view.outline, "1" * view.truth
+        self.both_ways.value, self.region.value = "1" * settings.both_ways, settings.region
+        self.radio["client_dbm"].visible = settings.both_ways
+        for name in self.radio:
+            unit = _UNITS.get(name, 1.0)
             self.radio[name].value = getattr(settings, name) / unit
         self.walls.value = {None: "", False: "opaque", True: "through"}[settings.through_walls]
-        self.material.value, self.preset.value = settings.material, session.preset
+        self.material.value, self.preset.value = settings.material, settings.preset
         if self.threshold.value != settings.threshold_dbm:
             self.threshold.value = settings.threshold_dbm
         self.python.value = session.python()
@@ -468,35 +529,27 @@ class Page:
         return {"xs": [xs for xs, _ in lines], "ys": [ys for _, ys in lines]}
 
     def _options(self, transmitters: int) -> list[Any]:
-        return [
-            (name, layer.title)
-            for name, layer in LAYERS.items()
-            if transmitters > 1 or name not in ("sinr_mean_db", "best_server")
-        ]
+        return [(name, layer.title) for name, layer in LAYERS.items() if transmitters > 1 or name not in NETWORK_LAYERS]
 
     def _show_answer(self) -> None:
-        answer, name, threshold_dbm = self.session.answer, self.which.value, self.session.settings.threshold_dbm
-        key = answer, name, threshold_dbm, self.truth.value, self.outline.value
-        self._once("answer", key, self._show_values)
+        session, answer, partial = self.session, self.session.answer, self.session.partial
+        view, threshold_dbm = session.shown_view, session.settings.threshold_dbm
+        self._once("answer", (answer, view, threshold_dbm), self._show_values)
         for layer, parts in self.picture.parts.items():
             for part in parts:
-                part.visible = layer == self.layer.value
+                part.visible = layer == view.layer
         kinds = [*FILES] if answer is not None and answer.is_final else ["project"]
         links = (
             f'<a href="{self._files_url}/{kind}" download="{FILES[kind]}">{_FILE_NAMES[kind]}</a>' for kind in kinds
         )
-        self.links.text = " ".join(links) if self.session.partial is not None else ""
-        title = LAYERS[self.layer.value].title.replace("threshold", f"{threshold_dbm:g} dBm")
-        if answer is not None and not answer.is_final:
-            title += " (coarse)"
-        elif answer is not None and self.truth.value:
-            title += ", the whole home" if answer.truth is not None else ", the partial map"
-        self.picture.plot.title.text = "Map" if answer is None else title
+        self.links.text = " ".join(links) if partial is not None else ""
+        title = "Map" if answer is None else answer.title(view, threshold_dbm)
+        settings = session.settings if answer is None else answer.settings
+        self.picture.plot.title.text = title if partial is None else f"{title}\n{settings.text(partial)}"
 
     def _show_values(self) -> None:
         answer, threshold_dbm = self.session.answer, self.session.settings.threshold_dbm
-        of = {"truth": bool(self.truth.value), "outline": self.outline.value}
-        self.picture.show_answer(answer, self.which.value, threshold_dbm, **of)
+        self.picture.show_answer(answer, self.session.shown_view, threshold_dbm)
         self.summary.text = "" if answer is None else _summary(answer, threshold_dbm)
 
 
@@ -555,4 +608,4 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."
-    return text + (" Hatched: not observed." if not answer.coverage.attrs["map_complete"] else "")
+    return text

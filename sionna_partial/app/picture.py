@@ -1,5 +1,6 @@
 """Plot of the page: map, layers, transmitters, measured points and next views."""
 
+import itertools
 import math
 from typing import Any
 
@@ -8,23 +9,15 @@ from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.app.answer import LEVELS, Answer
+from sionna_partial.app.answer import LAYERS, LEVELS, Answer, View
 from sionna_partial.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
 from sionna_partial.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import extent_m, outside
-from sionna_partial.plots.coverage_viewer import STATES, add_layer, level_codes, radio_layers, server_codes
-from sionna_partial.settings import WALL_MATERIALS, Material, material_name
-
-LIKELY = 0.9
-"""Probability at which an area counts as covered."""
-
-OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
-"""Layers with a line at the threshold."""
-
-LAYERS = radio_layers(MOST_TRANSMITTERS)
+from sionna_partial.plots.coverage_plot import Outline, extent_m, outside, to_the_edge
+from sionna_partial.plots.coverage_viewer import STATES, add_layer
+from sionna_partial.plots.style import FAILS, material_colour
 
 _UNSELECT = "points.selection_manager.clear()"
 """Otherwise the next drag would move a clicked transmitter as well."""
@@ -42,21 +35,17 @@ if (is_done) stroke.data = drawn
 """
 """Draws a stroke in the browser, and sends it at its end."""
 
-_COLOURS = ["#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc"]
-_OTHER, _PEN = "#004488", "#0066ff"
-"""Colours of `WALL_MATERIALS`, of other walls, and of strokes."""
+_PEN = "#0066ff"
+"""Colour of strokes."""
 
-_BELOW_PIXELS = 130
+_BELOW_PIXELS = 100
 """Height of axis and colour bar of every layer."""
 
 _HANDLE_PIXELS = 44
 """Diameter in which a finger grabs a transmitter."""
 
 _HOVERED = ("p_los", "p_nlos", "p_outage")
-_MOST_PIXELS, _FEWEST_PIXELS, _HATCHED = 1000, 600, 3
-_STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
-"""Steps of scales [dB], and their number below and above the threshold."""
-
+_MOST_PIXELS, _FEWEST_PIXELS, _HATCHED, _HALO = 1000, 600, 3, 4
 _TOOLTIPS = (
     ("x, y", "$x{0.00} m, $y{0.00} m"),
     ("most probable state", "@link_state{custom}"),
@@ -66,8 +55,9 @@ _TOOLTIPS = (
     ("SNR", "@snr_mean_db{0.0} dB"),
     ("P(above threshold)", "@p_above{0.00}"),
 )
-_GROUND, _WALLS = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9"), ("#00000000", "#000000", "#00000000", "#ffffff60")
-"""Colours of free cells, walls, unknown cells and hatches, below and above the coverage."""
+_GROUND = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9", "#ffffff")
+_WALLS = ("#00000000", "#000000", "#00000000", "#ffffff60", "#ffffffcc")
+"""Colours of free cells, walls, unknown cells, hatches and cells beside walls, below and above the coverage."""
 
 _LABEL: dict[str, Any] = {
     "text_baseline": "middle",
@@ -88,6 +78,7 @@ class Picture:
         self.values = ColumnDataSource({name: [] for name in of_values}, name="values")
         self.shades = ColumnDataSource({name: [] for name in ("cells", "x", "y", "dw", "dh")})
         self.outline = ColumnDataSource({"xs": [], "ys": []})
+        self.fails = ColumnDataSource({"xs": [], "ys": []}, name="fails")
         self.stroke, self._live = (
             ColumnDataSource({"x": [], "y": [], "r": []}, name=name) for name in ("drawn", "live")
         )
@@ -110,7 +101,7 @@ class Picture:
             background_fill_color="#d9dce0",
         )
         self.plot = plot
-        plot.toolbar.logo, plot.grid.visible = None, False
+        plot.toolbar.logo, plot.grid.visible, plot.title.text_font_size = None, False, "12px"
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         self._mappers = LinearColorMapper(palette=[*_GROUND], low=-0.5), LinearColorMapper(palette=[*_WALLS], low=-0.5)
         greys = [f"#{shade:02x}{shade:02x}{shade:02x}" for shade in range(256)]
@@ -123,14 +114,36 @@ class Picture:
             name: add_layer(plot, geometry, name, layer, words.get(name, ()), "below") for name, layer in LAYERS.items()
         }
         for name, (_, bar) in self.parts.items():
+            bar.height, bar.padding, bar.title_standoff = 10, 3, 2
             bar.title = bar.title or LAYERS[name].title  # bars of one height
             if name in LEVELS:
                 bar.ticker = FixedTicker()
-        for colour, width in (("white", 4), ("black", 2)):
+        hatch: dict[str, Any] = {"hatch_pattern": "left_diagonal_line", "hatch_color": FAILS, "hatch_weight": 1.5}
+        look: dict[str, Any] = {"fill_color": FAILS, "fill_alpha": 0.01, "line_color": None, **hatch}
+        fails = plot.multi_polygons("xs", "ys", source=self.fails, hatch_scale=14, **look)  # no fill hides hatches
+        lines = [
             plot.multi_line("xs", "ys", source=self.outline, line_color=colour, line_width=width)
+            for colour, width in (("white", 4), ("black", 2))
+        ]
         plot.image(image="cells", source=self.ground, color_mapper=self._mappers[1], **where)
+        self._add_legend([fails], [lines[1]])
         self.plan = plot.image(image="cells", source=self.shades, color_mapper=self.wall_shades, **where)
         self._add_marks()
+
+    def _add_legend(self, fails: list[Any], lines: list[Any]) -> None:
+        """Add a legend of one line above the map, so that its height stays."""
+        from bokeh.models.annotations.legends import Legend, LegendItem
+
+        plot = self.plot
+        nowhere: dict[str, Any] = {"x": [math.nan], "y": [math.nan], "size": 12, "line_color": "black"}
+        unseen = plot.scatter(marker="square", fill_color="#b9bec4", hatch_pattern="/", hatch_color="white", **nowhere)
+        self.keys = {
+            "fails": LegendItem(label={"value": ""}, renderers=fails),
+            "line": LegendItem(label={"value": ""}, renderers=lines),
+            "unseen": LegendItem(label={"value": "not observed"}, renderers=[unseen]),
+        }
+        look: dict[str, Any] = {"orientation": "horizontal", "border_line_color": None, "padding": 0, "margin": 2}
+        plot.add_layout(Legend(items=[*self.keys.values()], label_text_font_size="12px", **look), "above")
 
     def _add_marks(self) -> None:
         """Draw the top layers, with the tools that read and move them."""
@@ -191,6 +204,7 @@ class Picture:
         colours = []
         if partial is not None:
             (x0, y0, x1, y1), cells = partial.bounds_m, hatched_pixels(partial)
+            self.keys["unseen"].visible = bool((cells == _HATCHED).any())
             colours = [material_colour(each) for each in partial.wall_materials]
         for mapper, palette in zip(self._mappers, (_GROUND, _WALLS), strict=True):
             mapper.update(palette=[*palette, *colours], high=len(palette) + len(colours) - 0.5)
@@ -203,15 +217,14 @@ class Picture:
             self.wall_shades.low = plan.threshold + 1
         self.plan.visible = plan is not None and not has_map
 
-    def show_answer(
-        self, answer: Answer | None, name: str, threshold_dbm: float, *, truth: bool, outline: str = ""
-    ) -> None:
-        """Draw the layers of a transmitter, or of the strongest for ""; `outline` is one of `OUTLINES`."""
+    def show_answer(self, answer: Answer | None, view: View, threshold_dbm: float) -> None:
+        """Draw the layers of a view."""
         if answer is None:
             self.values.data = {column: [] for column in self.values.data}
-            self.outline.data = {"xs": [], "ys": []}
+            self.outline.data, self.fails.data = {"xs": [], "ys": []}, {"xs": [], "ys": []}
+            self.keys["fails"].visible = self.keys["line"].visible = False
             return
-        one = answer.layers_of(name, threshold_dbm, truth=truth)
+        one = answer.layers_of(view.transmitter, threshold_dbm, truth=view.truth)
         x0, x1, y0, y1 = extent_m(one)
         valid = (one["valid"].to_numpy() == 1) & ~outside(one)
         row, column = np.indices(valid.shape)
@@ -223,25 +236,33 @@ class Picture:
             values = one[layer].to_numpy() if layer in one else np.full(valid.shape, np.nan)
             columns[layer] = [np.where(valid, values[row, column], np.nan).astype(np.float32)]
         self.values.data = columns
-        lines: list[Any] = []
-        if outline:
-            height = {"power_mean_dbm": threshold_dbm, "p_above": LIKELY}[outline]
-            field: Any = contour_generator(one["x"], one["y"], np.ma.masked_invalid(columns[outline][0]))
-            lines = field.lines(height)
-        self.outline.data = {"xs": [line[:, 0] for line in lines], "ys": [line[:, 1] for line in lines]}
-        self._show_scales(answer.thresholds(name, threshold_dbm), [str(each) for each in answer.coverage["tx"].values])
+        outline = answer.outline(view, one, threshold_dbm)
+        self._show_outline(outline, one, columns[view.outline][0] if outline else np.full(valid.shape, np.nan))
+        for name, (_, bar) in self.parts.items():
+            scale = answer.scale(name, view.transmitter, threshold_dbm)
+            if scale is not None:
+                bar.ticker.ticks, bar.title = [*scale.ticks], scale.title
+                bar.major_label_overrides = dict(zip(scale.ticks, scale.names, strict=True))
+                bar.color_mapper.update(palette=[*scale.palette], low=scale.low, high=scale.high)
 
-    def _show_scales(self, thresholds: dict[str, float], names: list[str]) -> None:
-        """Set scales in steps of 5 dB whose colours break at the threshold, and the names of servers."""
-        for name, threshold in thresholds.items():
-            _, bar = self.parts[name]
-            low, high = threshold - _BELOW * _STEP_DB, threshold + _ABOVE * _STEP_DB
-            bar.ticker.ticks = np.arange(low, high + 1.0, 2.0 * _STEP_DB).tolist()
-            bar.color_mapper.update(palette=level_codes(_BELOW, _ABOVE), low=low, high=high)
-            bar.title = f"{LAYERS[name].label.partition(';')[0]}; colours break at {threshold:g}"
-        _, bar = self.parts["best_server"]
-        bar.ticker.ticks, bar.major_label_overrides = [*range(len(names))], dict(enumerate(names))
-        bar.color_mapper.update(palette=server_codes(MOST_TRANSMITTERS)[: len(names)], high=len(names) - 0.5)
+    def _show_outline(self, outline: Outline | None, one: Any, shown: Any) -> None:
+        """Draw the line at the threshold, and hatch the side that fails."""
+        lines: list[Any] = []
+        areas: list[Any] = []
+        x_m, y_m, values = to_the_edge(one, shown)
+        values = np.ma.masked_invalid(values)
+        if outline is not None and values.count():
+            field: Any = contour_generator(x_m, y_m, values, fill_type="OuterOffset")
+            lines = field.lines(outline.level)
+            below = min(float(values.min()), outline.level) - 1.0
+            for points, offsets in zip(*field.filled(below, outline.level), strict=True):
+                areas.append([points[start:end] for start, end in itertools.pairwise(offsets)])
+        self.outline.data = {"xs": [line[:, 0] for line in lines], "ys": [line[:, 1] for line in lines]}
+        rings: list[Any] = [[[[ring[:, axis].tolist() for ring in area]] for area in areas] for axis in (0, 1)]
+        self.fails.data = dict(zip(("xs", "ys"), rings, strict=True))
+        self.keys["fails"].visible, self.keys["line"].visible = bool(areas), bool(lines)
+        if outline is not None:
+            self.keys["fails"].label, self.keys["line"].label = {"value": outline.fails}, {"value": outline.line}
 
     def show_views(self, views: NextViews | None) -> None:
         """Draw next views of a robot, and the ways to them."""
@@ -256,7 +277,10 @@ class Picture:
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
-    """Return the cells of a map in 600 to 1000 rows or columns: states, 3 for a hatch, 3 + k for material k."""
+    """Return the cells of a map in 600 to 1000 rows or columns.
+
+    States, 3 for a hatch, 4 for a cell beside a wall, 4 + k for a wall of material k.
+    """
     merge = math.ceil(max(partial.shape) / _MOST_PIXELS)
     ny, nx = (math.ceil(n / merge) for n in partial.shape)
     padded = np.full((ny * merge, nx * merge), CellState.UNKNOWN, dtype=np.uint8)
@@ -268,16 +292,14 @@ def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
         padded[:] = 0
         padded[: partial.shape[0], : partial.shape[1]] = partial.wall_material
         number = padded.reshape(ny, merge, nx, merge).max(axis=(1, 3))
-        cells = np.where(number > 0, np.minimum(number, 255 - _HATCHED) + _HATCHED, cells)
+        cells = np.where(number > 0, np.minimum(number, 255 - _HALO) + _HALO, cells)
     finer = max(1, round(_FEWEST_PIXELS / max(cells.shape)))
     cells = cells.repeat(finer, axis=0).repeat(finer, axis=1)
     row, column = np.indices(cells.shape)
     stripe = (row + column) % (max(cells.shape) // 50 + 1) < max(cells.shape) // 400 + 1
-    return np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells).astype(np.uint8)
-
-
-def material_colour(material: Material) -> str:
-    return dict(zip(WALL_MATERIALS, _COLOURS, strict=True)).get(material_name(material), _OTHER)
+    is_wall = (cells == CellState.WALL) | (cells > _HALO)
+    cells = np.where((cells == CellState.UNKNOWN) & stripe & (not partial.is_complete), _HATCHED, cells)
+    return np.where(ndimage.binary_dilation(is_wall) & ~is_wall, _HALO, cells).astype(np.uint8)
 
 
 def _state_words() -> Any:

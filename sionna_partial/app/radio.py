@@ -8,12 +8,13 @@ from typing import Annotated, NamedTuple
 import numpy as np
 
 from sionna_partial.checks import Checked, Within, require, require_choice
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M
+from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.coverage.link_budget import ACCESS_POINTS, EIRP_LIMITS, access_point_eirp_dbm, access_point_gain_dbi
 from sionna_partial.maps.partial_map import PartialMap, nearest_free_m
-from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings
+from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings, material_name
 from sionna_partial.tracing.antennas import Antenna
 
-MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS = 10, 1000, 30_000
+MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS, _LONGEST_CHANNEL = 10, 1000, 30_000, 8
 
 FINEST_M = 0.15
 """Default spacing of receivers [m]."""
@@ -22,11 +23,18 @@ MATERIALS = ("", *WALL_MATERIALS)
 """Choices of wall materials; "" is unknown."""
 
 
+MODELS = ("", *ACCESS_POINTS)
+"""Kinds of transmitters; the power of "" is its own."""
+
+
 class Preset(NamedTuple):
     frequency_hz: float
     bandwidth_hz: float
     eirp_dbm: float
     threshold_dbm: float
+
+
+DEFAULT_PRESET = "Wi-Fi 5 GHz"
 
 
 PRESETS = {
@@ -41,16 +49,34 @@ PRESETS = {
 """Channels 7, 42 and 47 with the powers that Europe allows indoors (ETSI EN 300 328, EN 301 893, EN 303 687) and the
 -67 dBm that vendors of Wi-Fi ask for; typical indoor cells; channel 2 with the sensitivity of MCS 1 (IEEE 802.11ad)."""
 
+CHANNELS = {
+    "Wi-Fi 2.4 GHz": ("1", "6", "11"),
+    "Wi-Fi 5 GHz": ("42", "58", "106", "122"),
+    "Wi-Fi 6 GHz": ("15", "47", "79"),
+    "60 GHz (WiGig)": ("1", "2", "3", "4"),
+}
+"""Channels of a preset's bandwidth that do not overlap; Wi-Fi as in Europe, by the numbers of their centres."""
+
+OTHER_CHANNELS = ("1", "2", "3", "4")
+"""Channels of other bands."""
+
 
 @dataclass(frozen=True)
 class Transmitter(Checked):
-    """Position [m], power [dBm] and antenna of a transmitter; the antenna's gain is added."""
+    """Position [m], power [dBm], antenna, kind and channel of a transmitter; the antenna's gain is added."""
 
     x_m: Annotated[float, Within(-1e6, 1e6)]
     y_m: Annotated[float, Within(-1e6, 1e6)]
     z_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
-    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
+    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = PRESETS[DEFAULT_PRESET].eirp_dbm
     antenna: Antenna = field(default_factory=Antenna)
+    model: str = ""
+    channel: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        require_choice("model", self.model, MODELS)
+        require(len(self.channel) <= _LONGEST_CHANNEL, "channel", self.channel, "give a number.")
 
     @property
     def position_m(self) -> tuple[float, float, float]:
@@ -65,20 +91,27 @@ def require_name(name: str) -> None:
 
 @dataclass(frozen=True)
 class RadioSettings(Checked):
-    """Settings of the prediction, and the power of new transmitters [dBm]; the material "" is unknown."""
+    """Settings of the prediction, and the power of new transmitters [dBm]; the material "" is unknown.
 
-    frequency_hz: Annotated[float, Within(*FREQUENCIES_HZ)] = CARRIER_FREQUENCY_HZ
+    With `both_ways` the weaker direction counts: clients transmit with `client_dbm`.
+    """
+
+    frequency_hz: Annotated[float, Within(*FREQUENCIES_HZ)] = PRESETS[DEFAULT_PRESET].frequency_hz
     through_walls: bool | None = None
     rx_height_m: Annotated[float, Within(0.0, 1000.0)] = DEFAULT_HEIGHT_M
     spacing_m: Annotated[float, Within(0.02, 10.0)] = FINEST_M
-    bandwidth_hz: Annotated[float, Within(1e3, 1e11)] = 100e6
-    threshold_dbm: Annotated[float, Within(-200.0, 100.0)] = -80.0
-    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = 20.0
+    bandwidth_hz: Annotated[float, Within(1e3, 1e11)] = PRESETS[DEFAULT_PRESET].bandwidth_hz
+    threshold_dbm: Annotated[float, Within(-200.0, 100.0)] = PRESETS[DEFAULT_PRESET].threshold_dbm
+    eirp_dbm: Annotated[float, Within(-200.0, 200.0)] = PRESETS[DEFAULT_PRESET].eirp_dbm
     material: str = ""
+    both_ways: bool = False
+    client_dbm: Annotated[float, Within(-200.0, 200.0)] = 15.0
+    region: str = "ETSI"
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require_choice("material", self.material, MATERIALS)
+        require_choice("region", self.region, EIRP_LIMITS)
 
     @property
     def trace_settings(self) -> TraceSettings:
@@ -90,9 +123,37 @@ class RadioSettings(Checked):
 
     @property
     def preset(self) -> str:
-        """Name of the preset with these values, "" for none."""
-        own = Preset(*(getattr(self, name) for name in Preset._fields))
-        return next((name for name, preset in PRESETS.items() if preset == own), "")
+        """Name of the preset with this frequency and bandwidth, "" for none."""
+        own = self.frequency_hz, self.bandwidth_hz
+        return next((name for name, preset in PRESETS.items() if preset[:2] == own), "")
+
+    @property
+    def channels(self) -> tuple[str, ...]:
+        """Channels of the band that do not overlap."""
+        return CHANNELS.get(self.preset, OTHER_CHANNELS)
+
+    def text(self, partial: PartialMap) -> str:
+        """Return band, walls and direction, as above every picture."""
+        band = self.preset or f"{self.frequency_hz / 1e9:g} GHz, {self.bandwidth_hz / 1e6:g} MHz"
+        walls = "opaque walls"
+        if self.trace_settings.through_walls:
+            of_map = sorted(material_name(each) if each else "unknown material" for each in partial.wall_fractions)
+            walls = f"walls of {self.material or ' and '.join(of_map)}"
+        return ", ".join([band, walls, *[f"both ways, client {self.client_dbm:g} dBm"] * self.both_ways])
+
+    def powered(self, transmitter: Transmitter) -> Transmitter:
+        """Return a transmitter with the power of its kind in this band."""
+        if not transmitter.model:
+            return transmitter
+        eirp_dbm = access_point_eirp_dbm(transmitter.model, self.frequency_hz, self.bandwidth_hz, self.region)
+        return replace(transmitter, eirp_dbm=eirp_dbm)
+
+    def uplink_dbm(self, transmitter: Transmitter) -> float:
+        """Return the power of a client plus the gain of the transmitter's kind [dBm], infinite if it does not count."""
+        if not self.both_ways:
+            return math.inf
+        gain_dbi = access_point_gain_dbi(transmitter.model, self.frequency_hz) if transmitter.model else 0.0
+        return self.client_dbm + gain_dbi
 
 
 def usual_height_m(partial: PartialMap) -> float:

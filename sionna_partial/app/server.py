@@ -8,6 +8,7 @@ import socket
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from sionna_partial.app.drawing import Source
 from sionna_partial.app.files import FILES, MOST_BYTES, UPLOADED_SUFFIXES
 from sionna_partial.app.page import TEMPLATE, Page
 from sionna_partial.app.session import Session
@@ -47,6 +48,8 @@ class AppServer:
         0 is any free one.
     warnings : sequence of str
         Warnings of the map's reader.
+    source : Drawing or Plan, optional
+        File that can be read again with other settings; a picture without scale needs no map.
 
     Attributes
     ----------
@@ -66,6 +69,7 @@ class AppServer:
         address: str = LOOPBACK,
         port: int = 0,
         warnings: Sequence[str] = (),
+        source: Source | None = None,
     ) -> None:
         from bokeh.application import Application
         from bokeh.application.handlers.function import FunctionHandler
@@ -74,8 +78,9 @@ class AppServer:
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a window was closed during its job
         self._sessions, self._token = dict[str, Session](), secrets.token_urlsafe(24)
         self._open_first = functools.partial(Session.open_example, name=_FIRST_EXAMPLE)
-        if partial is not None:
-            self._open_first = functools.partial(Session.open_map, partial=partial, title=title, warnings=warnings)
+        given: dict[str, Any] = {"partial": partial, "title": title, "warnings": warnings, "source": source}
+        if partial is not None or source is not None:
+            self._open_first = functools.partial(Session.open_map, **given)
         path = f"/{self._token}"
         hosts = {address, socket.gethostname()} | ({"localhost"} if address == LOOPBACK else set())
         try:

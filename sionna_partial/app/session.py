@@ -2,22 +2,18 @@
 
 import functools
 import itertools
-import logging
 import math
 import tempfile
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
-from sionna_partial.app.answer import Answer
-from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Stroke, drawn, uploaded_plan
+from sionna_partial.app.answer import NETWORK_LAYERS, Answer, View, answer_png
+from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Source, Stroke, drawn, read_again, uploaded_source
 from sionna_partial.app.files import (
     FILES,
     Project,
@@ -28,7 +24,7 @@ from sionna_partial.app.files import (
     uploaded_map,
     uploaded_project,
 )
-from sionna_partial.app.jobs import TURNS, CancelledError, Job, Status, collected_warnings
+from sionna_partial.app.jobs import Status, WindowJobs, collected_warnings
 from sionna_partial.app.radio import (
     MOST_TRANSMITTERS,
     PRESETS,
@@ -40,13 +36,14 @@ from sionna_partial.app.radio import (
     usual_height_m,
 )
 from sionna_partial.arrays import Bools, Floats
-from sionna_partial.checks import Progress, reason_of, require, require_choice
+from sionna_partial.checks import Progress, require, require_choice
 from sionna_partial.constants import COARSER, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
-from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
+from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.exploration.next_views import NextViews, next_views
+from sionna_partial.files import decoding
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, nearest_free_m
@@ -59,6 +56,7 @@ from sionna_partial.measurements.measurements import (
     nearest_transmitters,
 )
 from sionna_partial.placement.placement import place_transmitter
+from sionna_partial.placement.several import NetworkPlacement, place_transmitters
 from sionna_partial.resources import demo_homes, scenes_folder
 
 ROUNDING_M = 0.006
@@ -70,25 +68,16 @@ FIRST_STEPS, MORE_STEPS = 100, 50
 _MEASURE = 'Drag along a length that you know, such as a wall; then type it in "Known length [m]" and press Enter.'
 _SAVED_MAP = 'partial = sp.load_map("map.npz")  # in the file of "Save the project", with everything drawn on it'
 
-_log = logging.getLogger(__name__)
 
-
-class Session:
-    """State of one window. Its methods are called in one thread; long computations run in another.
-
-    A new job cancels the one before it and drops its results. `call` runs a function in the thread of the session;
-    `show` is called in that thread after changes.
-    """
+class Session(WindowJobs):
+    """State of one window. Its methods are called in one thread; long computations run in another."""
 
     def __init__(self, call: Callable[[Callable[[], None]], object], show: Callable[[], None]) -> None:
-        self._call, self._show = call, show
-        self._waiting: deque[Callable[[], None]] = deque()
-        self._job: Job | None = None
-        self._worker = ThreadPoolExecutor(1, "coverage of a window")
+        super().__init__(call, show)
         self._models: dict[str, tuple[LinkModel, list[str]]] = {}
-        self._warnings: dict[str, list[str]] = {"map": [], "act": [], "job": []}
+        self._warnings: dict[str, list[str]] = {"map": [], "act": []}
         self.partial: PartialMap | None = None
-        self.plan: Plan | None = None
+        self.source: Source | None = None
         self.strokes: tuple[Stroke, ...] = ()
         self._bare: PartialMap | None = None
         self.home: PartialMap | None = None
@@ -96,57 +85,40 @@ class Session:
         self._python_map: list[str] = []
         self.transmitters: dict[str, Transmitter] = {}
         self.chosen = ""
-        self.settings = RadioSettings()
+        self.settings, self.view = RadioSettings(), View()
         self.measured: Measurements | None = None
         self.answer: Answer | None = None
         self._is_outdated = False
         self.views: NextViews | None = None
-        self.status = Status()
         self.is_receiving = False
 
-    def do(self, function: Callable[[], None]) -> None:
-        """Run a function in the thread of the session, after those that wait; called in any thread."""
-        self._waiting.append(function)
-        self._call(self._do_all)
-
-    def _do_all(self) -> None:
-        while self._waiting:
-            try:
-                self._waiting.popleft()()
-            except Exception as error:  # shown by the page, which stays alive
-                self.cancel()
-                self.refuse(self._reason(error))
-
-    def close(self) -> None:
-        """Cancel the job, and accept no other one."""
-        self._call, self._show = lambda function: None, lambda: None
-        self.cancel()
-        self._worker.shutdown(wait=False, cancel_futures=True)
+    @property
+    def plan(self) -> Plan | None:
+        """The picture of which the map was made."""
+        return self.source if isinstance(self.source, Plan) else None
 
     @property
     def warnings(self) -> list[str]:
         """Warnings of the map, the last action, the predictor, and the jobs since the last answer."""
         on_networks = self.partial is not None and not self.partial.is_complete
         of_models = [warning for _, found in [*self._models.values()] for warning in found if on_networks]
-        found = [*self._warnings["map"], *self._warnings["act"], *of_models, *self._warnings["job"]]
+        found = [*self._warnings["map"], *self._warnings["act"], *of_models, *self._job_warnings]
         return list(dict.fromkeys(found))
-
-    def cancel(self) -> None:
-        if self._job is not None:
-            self._job.is_cancelled.set()
-            self._job = None
-            self._conclude(Status("Cancelled."))
-
-    def refuse(self, error: object) -> None:
-        self.status = Status(str(error), is_error=True)
-        self._show()
 
     # Maps
 
-    def open_map(self, partial: PartialMap, title: str, warnings: Sequence[str] = ()) -> None:
-        """Take a map without transmitters, and the warnings of its reader."""
-        self._take_map(partial, title, [f"partial = sp.load_map({title!r})"], warnings)
-        self.predict()
+    def open_map(
+        self, partial: PartialMap | None, title: str, warnings: Sequence[str] = (), source: Source | None = None
+    ) -> None:
+        """Take a map without transmitters, the warnings of its reader, and its file; or a picture without scale."""
+        if partial is not None:
+            python = (source and source.python) or [f"partial = sp.load_map({title!r})"]
+            self._take_map(partial, title, python, warnings, source)
+            self.predict()
+        elif isinstance(source, Plan):
+            self._forget_map()
+            self.partial, self.source, self.title = None, source, source.name
+            self._ask(_MEASURE)
 
     def open_example(self, name: str) -> None:
         """Open a demo home as a robot has seen it, with its transmitter."""
@@ -160,9 +132,13 @@ class Session:
         self.begin(work)
 
     def _enter(self, name: str, home: PartialMap, seed: int, tx_m: Sequence[float]) -> None:
-        self.title, self.home, self.steps, self._seed, self.plan, self.strokes = name, home, 0, seed, None, ()
+        self.title, self.home, self.steps, self._seed, self.source, self.strokes = name, home, 0, seed, None, ()
         x_m, y_m, z_m = tx_m
-        self.transmitters, self.chosen, self.measured = {"tx1": Transmitter(x_m, y_m, z_m)}, "tx1", None
+        self.transmitters, self.chosen, self.measured = (
+            {"tx1": Transmitter(x_m, y_m, z_m, self.settings.eirp_dbm)},
+            "tx1",
+            None,
+        )
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
@@ -192,28 +168,31 @@ class Session:
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, f"reading {title}")
             with collected_warnings() as warnings:
-                project, plan = uploaded_project(files), uploaded_plan(files)
-                partial = None if project or plan else uploaded_map(files)
-            if plan is not None:
-                yield functools.partial(self._open_plan, plan)
-            elif partial is not None:
-                yield functools.partial(self.open_map, partial, title, warnings)
-            elif project is not None:
-                found = {name: placed(project.partial, each) for name, each in project.transmitters.items()}
-                yield functools.partial(self._open_project, replace(project, transmitters=found), warnings)
+                project, source = uploaded_project(files), uploaded_source(files)
+                partial = None
+                if project is None and (source is None or source.is_scaled):
+                    partial = source.read() if source else uploaded_map(files)
+            if project is not None:
+                yield self._opening(project, warnings)
+            else:
+                yield functools.partial(self.open_map, partial, title, warnings, source)
 
         self.begin(work)
 
-    def _open_project(self, project: Project, warnings: Sequence[str]) -> None:
-        self._take_map(project.partial, project.title, [_SAVED_MAP], warnings)
-        self.settings = project.settings or self.settings
-        self.measured = project.measured if project.transmitters else None
-        self._take_transmitters({**project.transmitters})
+    def _opening(self, project: Project, warnings: Sequence[str]) -> Callable[[], None]:
+        """Return the function that opens a project, with its file and strokes if they still give its map."""
+        found = {name: placed(project.partial, each) for name, each in project.transmitters.items()}
+        bare, source, strokes = read_again(project)
+        with decoding(Path("project.zip"), "was not saved by the app", MapError, "save it again."):
+            view = View(**project.view)
 
-    def _open_plan(self, plan: Plan) -> None:
-        self._forget_map()
-        self.partial, self.plan, self.title = None, plan, plan.name
-        self._ask(_MEASURE)
+        def take() -> None:
+            self._take_map(bare, project.title, [_SAVED_MAP], warnings, source, strokes)
+            self.settings, self.view = project.settings or self.settings, view
+            self.measured = project.measured if project.transmitters else None
+            self._take_transmitters(found)
+
+        return take
 
     def measure(self, line_m: Sequence[tuple[float, float]], length_m: float) -> None:
         """Set the scale of a plan by the length [m] of a line that was drawn on it."""
@@ -221,31 +200,30 @@ class Session:
         assert self.plan is not None
         drawn_m = math.dist(line_m[0], line_m[-1])
         require(drawn_m > 0.0, "known length", length_m, "drag along it on the picture first.")
-        self.change_plan(pixel_m=(self.plan.pixel_m or 1.0) * length_m / drawn_m)
+        self.change_source(pixel_m=(self.plan.pixel_m or 1.0) * length_m / drawn_m)
 
-    def change_plan(self, **values: Any) -> None:
-        """Read a plan with another threshold, or another scale, which removes everything on the map."""
-        plan = replace(self.plan, **values) if self.plan else None
-        if plan is None or plan.pixel_m is None:
-            self.plan = plan
+    def change_source(self, **values: Any) -> None:
+        """Read the file with other settings; another scale removes everything on the map."""
+        source = replace(self.source, **values) if self.source else None
+        if source is None or (isinstance(source, Plan) and source.pixel_m is None):
+            self.source = source
             self._show()
             return
+        python = source.python or [_SAVED_MAP]
 
         def take(partial: PartialMap, warnings: Sequence[str]) -> None:
-            is_same = self.plan is not None and self.plan.pixel_m == plan.pixel_m
-            self.plan = plan
-            if is_same:
-                self._change_map(partial, [_SAVED_MAP])
+            if self.plan is None or self.plan.settings["pixel_m"] == source.settings["pixel_m"]:
+                self.source = source
+                self._change_map(partial, python)
                 self._warnings["map"] = [*warnings]
             else:
-                self._take_map(partial, plan.name, [_SAVED_MAP], warnings)
-                self.plan = plan
+                self._take_map(partial, source.name, python, warnings, source)
                 self.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
-            report(0.1, f"reading {plan.name}")
+            report(0.1, f"reading {source.name}")
             with collected_warnings() as warnings:
-                partial = plan.read()
+                partial = source.read()
             yield functools.partial(take, partial, warnings)
 
         self.begin(work)
@@ -265,18 +243,26 @@ class Session:
         self._take_transmitters(self.transmitters)
 
     def _forget_map(self) -> None:
-        self._warnings = {"map": [], "act": [], "job": []}
+        self._warnings, self._job_warnings = {"map": [], "act": []}, []
         self.transmitters, self.chosen, self.measured, self.views, self.answer = {}, "", None, None, None
-        self.plan, self.strokes, self.home = None, (), None
+        self.source, self.strokes, self.home = None, (), None
 
-    def _take_map(self, partial: PartialMap, title: str, python: list[str], warnings: Sequence[str] = ()) -> None:
+    def _take_map(
+        self,
+        partial: PartialMap,
+        title: str,
+        python: list[str],
+        warnings: Sequence[str] = (),
+        source: Source | None = None,
+        strokes: tuple[Stroke, ...] = (),
+    ) -> None:
         self._forget_map()
-        self.title, self._warnings["map"] = title, [*warnings]
+        self.title, self._warnings["map"], self.source, self.strokes = title, [*warnings], source, strokes
         self._fit(partial, python)
 
     def _change_map(self, partial: PartialMap, python: list[str]) -> None:
         """Take another map of the same building, and predict."""
-        self._warnings, self.answer = {"map": [], "act": [], "job": []}, None
+        self._warnings, self._job_warnings, self.answer = {"map": [], "act": []}, [], None
         self._fit(partial, python)
         self._take_transmitters(self.transmitters)
 
@@ -320,7 +306,8 @@ class Session:
         new_name = name if new_name is None else new_name.strip()
         require_name(new_name)
         require(new_name == name or new_name not in self.transmitters, "name", new_name, "another one has it.")
-        changed = replace(self.transmitters[name], **values)
+        values |= {"model": ""} if "eirp_dbm" in values else {}
+        changed = self.settings.powered(replace(self.transmitters[name], **values))
         self.chosen = new_name if self.chosen == name else self.chosen
         pairs = [(new_name, changed) if key == name else (key, old) for key, old in self.transmitters.items()]
         self._take_transmitters(dict(pairs))
@@ -331,21 +318,33 @@ class Session:
     def use_preset(self, name: str) -> None:
         require_choice("preset", name, PRESETS)
         values = PRESETS[name]._asdict()
-        self.transmitters = {each: replace(old, eirp_dbm=values["eirp_dbm"]) for each, old in self.transmitters.items()}
+        settings = replace(self.settings, **values)
+        given = {"eirp_dbm": values["eirp_dbm"], "channel": ""}
+        changed = {each: settings.powered(replace(old, **given)) for each, old in self.transmitters.items()}
+        self.transmitters = changed
         self.set(**values)
 
-    @property
-    def preset(self) -> str:
-        """Name of the preset in use, "" for none."""
-        same = all(each.eirp_dbm == self.settings.eirp_dbm for each in self.transmitters.values())
-        return self.settings.preset if same else ""
-
     def set(self, **values: Any) -> None:
-        self.settings = replace(self.settings, **values)
+        settings = replace(self.settings, **values)
+        self.transmitters = {name: settings.powered(each) for name, each in self.transmitters.items()}
+        self.settings = settings
         if values.keys() <= {"threshold_dbm"}:
             self._show()
         else:
             self.predict()
+
+    @property
+    def shown_view(self) -> View:
+        """The view, with what there is."""
+        several = len(self.transmitters) > 1
+        layer = self.view.layer if several or self.view.layer not in NETWORK_LAYERS else View.layer
+        name = self.view.transmitter if several and self.view.transmitter in self.transmitters else ""
+        return replace(self.view, layer=layer, transmitter=name, truth=self.view.truth and self.home is not None)
+
+    def look(self, **values: Any) -> None:
+        """Change the picture."""
+        self.view = replace(self.view, **values)
+        self._show()
 
     def _take_transmitters(self, transmitters: dict[str, Transmitter]) -> None:
         """Predict for transmitters; one that cannot be where it is moves to the nearest free cell."""
@@ -387,7 +386,7 @@ class Session:
 
     def _map(self) -> PartialMap:
         if self.partial is None:
-            raise MapError(_MEASURE if self.plan else "there is no map yet: open one, or an example.")
+            raise MapError(_MEASURE if self.source else "there is no map yet: open one, or an example.")
         return self.partial
 
     def _tx_m(self) -> dict[str, tuple[float, float, float]]:
@@ -410,25 +409,30 @@ class Session:
             self._ask('Click on the map to put a transmitter, or press "Add".')
             return
         tx_m, eirp_dbm = self._tx_m(), np.array([each.eirp_dbm for each in self.transmitters.values()])
-        of_all: dict[str, Any] = {
+        counted_dbm = np.minimum(eirp_dbm, [settings.uplink_dbm(each) for each in self.transmitters.values()])
+        channels = {name: each.channel for name, each in self.transmitters.items()}
+        of_links: dict[str, Any] = {
             "tx_antenna": [each.antenna for each in self.transmitters.values()],
             "rx_height_m": settings.rx_height_m,
+            "receivers": "inside",
         }
 
         def coverage(of: str, where: PartialMap, spacing_m: float, report: Progress, **given: Any) -> xr.Dataset:
             model = self._model(of, where, settings)
-            return model.coverage(tx_m, spacing_m=spacing_m, progress=report, **of_all, **given)
+            return model.coverage(tx_m, spacing_m=spacing_m, progress=report, **of_links, **given)
 
         def steps(report: Progress) -> Iterator[Callable[[], None]]:
             coarse_m = COARSER * settings.spacing_m
             found = coverage("map", partial, coarse_m, part_of(report, 0.0, 0.2), measurements=measured)
-            answer = Answer(found, eirp_dbm, settings, is_final=False)
+            answer = Answer(found, counted_dbm, settings, is_final=False)
             yield functools.partial(self._take_answer, answer)
             found = coverage("map", partial, settings.spacing_m, part_of(report, 0.2, 0.7), measurements=measured)
             answer = replace(answer, coverage=found, is_final=True)
             if len(tx_m) > 1:
                 report(0.7, "SINR of the network")
-                network = network_map(found, tx_power_dbm=eirp_dbm, bandwidth_hz=settings.bandwidth_hz)
+                network = network_map(
+                    found, tx_power_dbm=eirp_dbm, bandwidth_hz=settings.bandwidth_hz, channels=channels
+                )
                 answer = replace(answer, network=network)
             yield functools.partial(self._take_answer, answer)
             if home is not None:
@@ -447,7 +451,7 @@ class Session:
     def place(self) -> None:
         partial, settings, name = self._map(), self.settings, self.chosen
         old = self.transmitters.get(name, self._new_transmitter())
-        threshold_db = float(np.clip(settings.threshold_dbm - old.eirp_dbm, GAIN_FLOOR_DB + 1.0, 0.0))
+        threshold_db = self._threshold_db(old)
 
         def take(position_m: Floats) -> None:
             x_m, y_m, z_m = (round(float(each), 3) for each in position_m)
@@ -466,10 +470,69 @@ class Session:
 
         self.begin(work)
 
+    def _threshold_db(self, *transmitters: Transmitter) -> float:
+        """Return the path gain at the threshold of the weakest transmitter [dB]."""
+        weakest_dbm = min(min(each.eirp_dbm, self.settings.uplink_dbm(each)) for each in transmitters)
+        return float(np.clip(self.settings.threshold_dbm - weakest_dbm, GAIN_FLOOR_DB + 1.0, 0.0))
+
+    def place_several(self, goal: float, most: int) -> None:
+        """Replace the transmitters by the fewest of up to `most` that cover the fraction `goal` of the floor."""
+        partial, settings = self._map(), self.settings
+        like = self.transmitters.get(self.chosen, self._new_transmitter())
+        threshold_db = self._threshold_db(like)
+
+        def take(found: NetworkPlacement) -> None:
+            names = [f"tx{number}" for number in range(1, len(found.added) + 1)]
+            places_m = [{"x_m": x_m, "y_m": y_m} for x_m, y_m, _ in found.positions_m.round(2).tolist()]
+            self._take_transmitters(
+                {name: replace(like, **at_m, channel="") for name, at_m in zip(names, places_m, strict=True)}
+            )
+            texts = [f"{name} {more:.0%}" for name, more in zip(names, found.added, strict=True)]
+            reached = "" if found.score >= goal else f" The goal of {goal:.0%} needs more than {most}, or more power."
+            self._warnings["act"].append(
+                f"Expected covered floor {found.score:.0%}; each adds: {', '.join(texts)}.{reached}"
+            )
+
+        def work(report: Progress) -> Iterator[Callable[[], None]]:
+            found = place_transmitters(
+                self._model("map", partial, settings),
+                most,
+                goal=goal,
+                threshold_db=threshold_db,
+                tx_height_m=like.z_m,
+                rx_height_m=settings.rx_height_m,
+                progress=report,
+            )
+            yield functools.partial(take, found)
+
+        self.begin(work)
+
+    def plan_channels(self) -> None:
+        """Give each transmitter a channel of the band, so that the mean rate is large."""
+        answer, channels, names = self.answer, self.settings.channels, [*self.transmitters]
+        if answer is None or self._is_outdated or not answer.is_final or answer.network is None:
+            raise SettingsError("channels are planned for two or more transmitters with a fine picture: wait for it.")
+        network, settings = answer.network, answer.settings
+
+        def take(found: xr.Dataset) -> None:
+            plan = dict(zip(names, found["channel"].to_numpy(), strict=True))
+            self.transmitters = {name: replace(old, channel=plan[name]) for name, old in self.transmitters.items()}
+            before, after = (float(np.nanmean(each["rate_bit_s"])) / 1e6 for each in (network, found))
+            self._take_answer(replace(answer, network=found))
+            self._warnings["act"] = [f"Mean rate with the plan of channels {after:.0f} Mbit/s, before {before:.0f}."]
+
+        def work(report: Progress) -> Iterator[Callable[[], None]]:
+            report(0.2, "planning channels")
+            powers_dbm = network.attrs["tx_power_dbm"]
+            bandwidth_hz = settings.bandwidth_hz
+            found = network_map(answer.coverage, tx_power_dbm=powers_dbm, bandwidth_hz=bandwidth_hz, channels=channels)
+            yield functools.partial(take, found)
+
+        self.begin(work)
+
     def find_views(self) -> None:
         partial, settings, tx_m = self._map(), self.settings, [*self._tx_m().values()]
-        weakest_dbm = min(each.eirp_dbm for each in self.transmitters.values())
-        threshold_db = float(np.clip(settings.threshold_dbm - weakest_dbm, GAIN_FLOOR_DB, 0.0))
+        threshold_db = self._threshold_db(*self.transmitters.values())
 
         def take(views: NextViews) -> None:
             self.views = views
@@ -522,67 +585,14 @@ class Session:
             _ = model.predictor_of_map
         return model
 
-    def begin(self, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Start a job, which yields functions to be called in the session's thread, and cancel the one before."""
-        if self._job is not None:
-            self._job.is_cancelled.set()
-        job = self._job = Job(self._tell)
-        self.status = Status("Waiting", 0.0)
-        self._show()
-        with suppress(RuntimeError):  # a window that was closed computes nothing
-            self._worker.submit(self._run, job, work)
-
-    def _run(self, job: Job, work: Callable[[Progress], Iterator[Callable[[], None]]]) -> None:
-        """Compute a job in turns with other windows."""
-        try:
-            with TURNS, collected_warnings(job.warnings):
-                job.report(0.0, "starting")
-                for change in work(job.report):
-                    self.do(functools.partial(self._take, job, change))
-                    job.pass_on()
-                end = functools.partial(self._conclude, Status("Ready."))
-        except CancelledError:
-            return
-        except Exception as error:  # shown by the page, which stays alive
-            end = functools.partial(self._conclude, Status(self._reason(error), is_error=True))
-        self.do(functools.partial(self._end, job, end))
-
-    @staticmethod
-    def _reason(error: Exception) -> str:
-        """Return the reason of an error, whose trace is logged if it is not ours."""
-        if not isinstance(error, SionnaPartialError | OSError | MemoryError):
-            _log.error("a job of the app failed", exc_info=error)
-        return reason_of(error)
-
-    def _tell(self, job: Job, status: Status) -> None:
-        def tell() -> None:
-            if job is self._job:
-                self.status = status
-                self._show()
-
-        self.do(tell)
-
-    def _take(self, job: Job, change: Callable[[], None]) -> None:
-        if job is self._job:
-            change()
-            self._warnings["job"] += job.warnings
-            self._show()
-
-    def _end(self, job: Job, end: Callable[[], None]) -> None:
-        if job is self._job:
-            self._job = None
-            self._warnings["job"] += job.warnings
-            end()
-
     def _conclude(self, status: Status) -> None:
         """Show the end of a job, and remove an outdated answer."""
-        self.status = status
         if self._is_outdated:
             self.answer, self._is_outdated = None, False
-        self._show()
+        super()._conclude(status)
 
     def _take_answer(self, answer: Answer) -> None:
-        self.answer, self._is_outdated, self._warnings["job"] = answer, False, []
+        self.answer, self._is_outdated, self._job_warnings = answer, False, []
 
     # Files
 
@@ -596,8 +606,13 @@ class Session:
             raise SettingsError(
                 "there is no coverage yet: put a transmitter on the map, and wait for the fine picture."
             )
-        threshold_dbm = answer.settings.threshold_dbm
-        heading = self.title, f"{answer.made:%Y-%m-%d}"
+        threshold_dbm = self.settings.threshold_dbm
+        text = answer.settings.text(self._map())
+        if kind == "png":
+            return answer_png(
+                answer, self.shown_view, threshold_dbm, self._map(), f"{PurePath(self.title).name}\n{text}"
+            )
+        heading = self.title, f"{answer.made:%Y-%m-%d}", text
         return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=self._map())
 
     def python(self) -> str:
@@ -606,4 +621,7 @@ class Session:
         return script(self._project(), [_SAVED_MAP] if self.strokes else self._python_map)
 
     def _project(self) -> Project:
-        return Project(self._map(), self.title, self.transmitters, self.settings, self.measured)
+        source = self.source and (self.source.name, self.source.content, self.source.settings)
+        strokes = [asdict(each) for each in self.strokes] if source else []
+        of_window = self._map(), self.title, self.transmitters, self.settings, self.measured
+        return Project(*of_window, asdict(self.view), source or None, strokes)

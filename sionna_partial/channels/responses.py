@@ -4,7 +4,7 @@ import itertools
 import logging
 import math
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,6 @@ from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.tracing.antennas import Antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, REFLECTION
 from sionna_partial.tracing.links import path_gain_db
-from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:
     from sionna_partial.tracing.links import TracedLinks
@@ -71,7 +70,8 @@ class ArrayPaths:
     ) -> "ArrayPaths":
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
             require_bool(name, value)
-        paths = with_every_path(paths)
+        if paths.trace_settings.power_tolerance_db:
+            _log_tolerance(paths.trace_settings.power_tolerance_db)
         require(
             paths.transfer.shape[1:] == (2, 2),
             "transfer",
@@ -194,25 +194,10 @@ class ArrayPaths:
         return longer_m
 
 
-def with_every_path(links: "TracedLinks") -> "TracedLinks":
-    """Return the links with all paths that the default tolerance omits, traced once."""
-    settings = links.trace_settings
-    if links._partial is None:
-        if settings.power_tolerance_db:
-            _log_tolerance(settings.power_tolerance_db)
-        return links
-    if "every_path" not in vars(links):
-        _log.info("tracing every path of %d links, which lack those within the default tolerance", links.gain_db.size)
-        every = Simulation(links._partial, replace(settings, power_tolerance_db=0.0), links.scene_settings)
-        vars(links)["every_path"] = every.links(links.tx, links.rx, invalid="nan", progress=False)
-    complete: TracedLinks = vars(links)["every_path"]
-    return complete
-
-
 @cache
 def _log_tolerance(tolerance_db: float) -> None:
-    message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: trace with 0 for all"
-    _log.info(message, tolerance_db)
+    message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: links.with_every_path(scene)"
+    _log.info("%s has all", message % tolerance_db)
 
 
 def phasors(angle: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:

@@ -1,5 +1,6 @@
 """Subcommands calibrate, place, next, live and app."""
 
+import itertools
 import json
 from pathlib import Path
 from typing import Annotated, Any
@@ -71,6 +72,10 @@ def place(
     *,
     out: Annotated[Path, typer.Option(help="Folder for the numbers and a picture.", show_default=False)],
     count: Annotated[int, typer.Option(help="Number of transmitters; several are placed for the coverage.")] = 1,
+    goal: Annotated[
+        float | None,
+        typer.Option(help="Wanted fraction of covered receivers, by the fewest of up to --count transmitters."),
+    ] = None,
     objective: Annotated[Objective, typer.Option(help=_OBJECTIVE_HELP)] = "coverage",
     threshold: Annotated[float, typer.Option(help="Path gain above which a receiver is covered [dB].")] = -100.0,
     height: Annotated[float, typer.Option(help="Height of the transmitter [m].")] = DEFAULT_HEIGHT_M,
@@ -84,23 +89,27 @@ def place(
 
     The folder --out gets the positions and the search as JSON, and a picture.
     """
-    if count > 1 and objective != "coverage":
-        raise typer.BadParameter(f"--objective {objective} is for one transmitter: leave it out with --count {count}.")
+    if (count > 1 or goal is not None) and objective != "coverage":
+        raise typer.BadParameter(f"--objective {objective} is for one transmitter: leave out --count and --goal.")
     options: dict[str, Any] = {"threshold_db": threshold, "tx_height_m": height, "rx_height_m": rx_height, "seed": seed}
     options |= {"predictor": predictor or None, **settings}
     result: sp.TransmitterPlacement | sp.NetworkPlacement
     with opt.reporting_to(out, "loading the predictor") as report:
-        if count == 1:
+        if count == 1 and goal is None:
             result = sp.place_transmitter(partial, objective=objective, **options, progress=report)
             positions_m, figure = [result.position_m], sp.plot_placement(result)
         else:
-            result = sp.place_transmitters(partial, count, **options, progress=report)
+            result = sp.place_transmitters(partial, count, goal=goal, **options, progress=report)
             positions_m, figure = [*result.positions_m], sp.plot_network_placement(result)
         with atomic_files(out) as folder:
             result.save(folder / "placement.json")
             figure.savefig(folder / "placement.png")
-    for x, y, z in positions_m:
-        typer.echo(f"transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m")
+    added: Any = result.added if isinstance(result, sp.NetworkPlacement) else []
+    for (x, y, z), more in itertools.zip_longest(positions_m, added):
+        text = f"transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m"
+        typer.echo(text + (f" adds {more:.1%}" if more is not None else ""))
+    if goal is not None and result.score < goal:
+        typer.echo(f"the goal of {goal:.1%} is not reached: give a larger --count, or more power (a lower --threshold)")
     if objective == "coverage":
         typer.echo(f"{result.score:.1%} of the receivers are predicted above {threshold:g} dB")
     else:
@@ -343,12 +352,19 @@ def open_app(
     browser: Annotated[bool, typer.Option(help="Whether the page is opened in a browser.")] = True,
 ) -> None:
     """Serve a page on which transmitters are dragged over a map, and the coverage follows, until Ctrl-C."""
+    from sionna_partial.app.drawing import uploaded_source
     from sionna_partial.app.jobs import collected_warnings, logged_warnings
     from sionna_partial.app.server import AppServer
 
+    partial, source = None, None
     with collected_warnings() as warnings, logged_warnings():
-        partial = None if map_path is None else sp.load_map(map_path)
-    server = AppServer(partial, str(map_path or ""), address, port, warnings)
+        if map_path is not None and map_path.is_file():
+            source = uploaded_source([(str(map_path), map_path.read_bytes())])
+        if source is not None and source.is_scaled:
+            partial = source.read()
+        elif map_path is not None and source is None:
+            partial = sp.load_map(map_path)
+    server = AppServer(partial, str(map_path or ""), address, port, warnings, source)
     typer.echo(f"open {server.url}")
     if browser:
         import webbrowser

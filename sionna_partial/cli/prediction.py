@@ -75,7 +75,7 @@ def predict(
     pixel: opt.Pixel = None,
     receivers: Annotated[
         str,
-        typer.Option(metavar="indoor|anywhere", help="Where receivers are; those outside are in outage."),
+        typer.Option(metavar="indoor|anywhere|inside", help="Receivers; outdoors in outage, or omitted (inside)."),
     ] = "indoor",
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
@@ -276,6 +276,13 @@ def network(
     bandwidth: Annotated[float, typer.Option(help="Bandwidth [Hz].")] = 100e6,
     load: Annotated[float, typer.Option(help="Fraction of time in which an interferer transmits.")] = 1.0,
     sinr_threshold: Annotated[float, typer.Option(help="SINR that a receiver needs [dB].")] = 0.0,
+    channel: Annotated[
+        list[str],
+        typer.Option(
+            help="A channel that there is, to propose a plan; or tx1=CHANNEL for each. Default: all share one.",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.25,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     settings: opt.Settings,
@@ -306,14 +313,23 @@ def network(
             progress=part_of(report, 0.0, 0.8),
         )
         report(0.8, "drawing links together")
-        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, **asdict(budget))
+        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, channels=_parse_channels(channel), **asdict(budget))
         with atomic_files(out) as folder:
             report(0.9, "writing")
             for name in ("coverage.nc", "coverage.html"):
                 sp.save_coverage(coverage, folder / name)
             sp.save_network(found, folder / "network.nc")
             sp.plot_network(found).savefig(folder / "network.png")
+    if channel:
+        typer.echo(", ".join(f"{name}: channel {found.channel.sel(tx=name).item()}" for name in found["tx"].to_numpy()))
     opt.print_files(out, ["coverage.nc", "coverage.html", "network.nc", "network.png"])
+
+
+def _parse_channels(texts: list[str]) -> dict[str, str] | list[str] | None:
+    pairs = [text.partition("=") for text in texts]
+    if any(found for _, found, _ in pairs):
+        return {name: channel for name, _, channel in pairs}
+    return texts or None
 
 
 @opt.with_options

@@ -306,7 +306,9 @@ class CoverageAccessor:
         values = self._coverage["p_los"].copy(data=above.astype(np.float32))
         return values.rename(f"probability_above_{threshold_db:g}_db").assign_attrs(attributes)
 
-    def power(self, *, eirp_dbm: ArrayLike = 20.0, rx_gain_db: float = 0.0) -> xr.Dataset:
+    def power(
+        self, *, eirp_dbm: ArrayLike = 20.0, rx_gain_db: float = 0.0, client_dbm: ArrayLike | None = None
+    ) -> xr.Dataset:
         """Return the received power: EIRP + path gain + gain of the receiver's antenna.
 
         Parameters
@@ -315,6 +317,9 @@ class CoverageAccessor:
             Equivalent isotropically radiated power [dBm], of all or each of the T transmitters.
         rx_gain_db : float
             Gain of the receiver's antenna [dB].
+        client_dbm : float or (T,) array-like, optional
+            Transmit power of the receiver, a client that answers, plus the gain of the transmitter's antenna that the
+            coverage does not have [dBm]. With it the weaker direction counts: path gains are the same in both.
 
         Returns
         -------
@@ -326,13 +331,14 @@ class CoverageAccessor:
         SettingsError
             For a power or gain that is not a finite number.
         """
-        return self._level("power", "dBm", self._offset_db(eirp_dbm, rx_gain_db))
+        return self._level("power", "dBm", self._offset_db(eirp_dbm, rx_gain_db, client_dbm))
 
     def snr(
         self,
         *,
         eirp_dbm: ArrayLike = 20.0,
         rx_gain_db: float = 0.0,
+        client_dbm: ArrayLike | None = None,
         noise_figure_db: float = 7.0,
         bandwidth_hz: float = 100e6,
     ) -> xr.Dataset:
@@ -344,7 +350,7 @@ class CoverageAccessor:
             `snr_mean_db` (outage: path gain -150 dB) and `snr_std_db`. `network_map` includes interference.
         """
         budget = LinkBudget(noise_figure_db, bandwidth_hz)
-        return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db) - budget.noise_dbm)
+        return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db, client_dbm) - budget.noise_dbm)
 
     def rate(
         self,
@@ -390,6 +396,7 @@ class CoverageAccessor:
         probability: float = 0.9,
         eirp_dbm: ArrayLike = 20.0,
         rx_gain_db: float = 0.0,
+        client_dbm: ArrayLike | None = None,
         any_transmitter: bool = False,
     ) -> xr.Dataset:
         """Return the covered fraction of the floor, as in "95 % above -67 dBm with probability 0.9".
@@ -409,28 +416,37 @@ class CoverageAccessor:
             On `floor`: "observed" (free cells), "all" (weighted by `p_indoor`; 1 in free cells) and the rooms of the
             map, with their number if a room has such a name ("all_1"). `fraction` has at least that probability,
             `fraction_mean` is the mean probability, `area_m2` the size. Fractions are NaN on an empty floor. Several
-            transmitters are on `tx`.
+            transmitters are on `tx`, with one floor for all: any of them covers at least as much as each.
         """
         require_number("threshold_dbm", threshold_dbm, -400.0, 400.0)
         require_number("probability", probability, 0.0, 1.0)
-        above = self._probability_of(threshold_dbm - self._offset_db(eirp_dbm, rx_gain_db))
-        valid, indoor = self._coverage["valid"].to_numpy() == 1, self._coverage["p_indoor"].to_numpy()
-        dims = ("floor", *self._coverage["p_los"].dims[:-2])
+        threshold_db = threshold_dbm - self._offset_db(eirp_dbm, rx_gain_db, client_dbm)
+        above, dims = self._probability_of(threshold_db), ("floor", *self._coverage["p_los"].dims[:-2])
+        above = np.where(np.isnan(above), threshold_db < 0.0, above)  # a receiver at a transmitter has 0 dB
         if any_transmitter and len(dims) > 1:
-            above, valid, indoor, dims = above.max(axis=0), valid.any(axis=0), indoor.max(axis=0), dims[:1]
-        free = np.broadcast_to(self._coverage["cell_state"].to_numpy() == CellState.FREE, above.shape)
-        rooms = self._rooms()
-        of_rooms = [valid & free & room for room in rooms.values()]
-        weights = np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0), *of_rooms])
+            above, dims = above.max(axis=0), dims[:1]
+        weights = self._floors()
         total = weights.sum(axis=(-2, -1))
         with np.errstate(invalid="ignore"):
             shares = [
-                (weights * np.nan_to_num(each)).sum(axis=(-2, -1)) / total for each in (above >= probability, above)
+                np.einsum("fyx,...yx->f...", weights, each) / total.reshape(-1, *[1] * (len(dims) - 1))
+                for each in (above >= probability, above)
             ]
-        values = {"fraction": shares[0], "fraction_mean": shares[1], "area_m2": total * self._coverage.spacing_m**2}
-        coordinates = {"floor": [*FLOORS, *rooms]} | ({"tx": self._coverage["tx"]} if len(dims) > 1 else {})
+        values: dict[str, Any] = {"fraction": (dims, shares[0]), "fraction_mean": (dims, shares[1])}
+        values["area_m2"] = "floor", total * self._coverage.spacing_m**2
+        coordinates: dict[str, Any] = {"floor": [*FLOORS, *self._rooms()]}
+        coordinates |= {"tx": self._coverage["tx"]} if len(dims) > 1 else {}
         settings = {"threshold_dbm": float(threshold_dbm), "probability": float(probability)}
-        return xr.Dataset({name: (dims, each) for name, each in values.items()}, coordinates, settings)
+        return xr.Dataset(values, coordinates, settings)
+
+    def _floors(self) -> Floats:
+        """Return the weights (floor, ny, nx) of receivers in `area`, the same for all transmitters."""
+        transmitters = tuple(range(self._coverage["valid"].ndim - 2))
+        valid = (self._coverage["valid"].to_numpy() == 1).any(axis=transmitters)
+        indoor = np.nan_to_num(self._coverage["p_indoor"].to_numpy()).max(axis=transmitters)
+        free = self._coverage["cell_state"].to_numpy() == CellState.FREE
+        of_rooms = [valid & free & room for room in self._rooms().values()]
+        return np.stack([valid & free, np.where(valid, np.where(free, 1.0, indoor), 0.0), *of_rooms])
 
     def _rooms(self) -> dict[str, Bools]:
         if ROOM not in self._coverage:
@@ -443,10 +459,13 @@ class CoverageAccessor:
             if number
         }
 
-    def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float) -> Floats:
+    def _offset_db(self, eirp_dbm: ArrayLike, rx_gain_db: float, client_dbm: ArrayLike | None = None) -> Floats:
         maps = transmitters_of(self._coverage)
         require_number("rx_gain_db", rx_gain_db, -200.0, 200.0)
-        offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm") + rx_gain_db
+        offset_db = transmit_powers_dbm(eirp_dbm, len(maps), "eirp_dbm")
+        if client_dbm is not None:
+            offset_db = np.minimum(offset_db, transmit_powers_dbm(client_dbm, len(maps), "client_dbm"))
+        offset_db = offset_db + rx_gain_db
         return offset_db[:, None, None] if "tx" in self._coverage.dims else offset_db[0]
 
     def _level(self, name: str, unit: str, offset_db: Floats) -> xr.Dataset:

@@ -56,7 +56,7 @@ from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
-RECEIVERS = ("indoor", "anywhere")
+RECEIVERS = ("indoor", "anywhere", "inside")
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 Area: TypeAlias = tuple[float, float, float, float]
@@ -147,8 +147,9 @@ def predict_map(
         transmitters farther than 0.5 m from `tx` are not used where walls are opaque; through walls they contribute to
         the material of walls and the offset of powers. Where the material is unknown, the attributes `wall_material`
         and `wall_loss_db` contain its probabilities and the expected loss of a wall.
-    receivers : {"indoor", "anywhere"}
-        Receivers that probabilities and gains refer to.
+    receivers : {"indoor", "anywhere", "inside"}
+        Receivers that probabilities and gains refer to. "inside" is "indoor" without the receivers outside a complete
+        map, which are then not `valid`: faster.
     memory_gb : float
         Memory limit of the process [GB]. Receivers are traced and predicted in blocks that fit.
     progress : bool or callable, optional
@@ -193,14 +194,14 @@ def predict_map(
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     require_choice("receivers", receivers, RECEIVERS)
     require_memory(memory_gb)
-    area_m = _checked_area(model.partial, area_m)
-    names, transmitters = _transmitters(model, tx, tx_antenna, measurements, rx_height_m, spacing_m, area_m)
+    where = GridArea(rx_height_m, spacing_m, _checked_area(model.partial, area_m), inside=receivers == "inside")
+    names, transmitters = _transmitters(model, tx, tx_antenna, measurements, where)
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
     maps, weights = [], []
     with reporting(progress) as report:
         report(0.0, "building the scene")
-        job = CoverageJob(model, rx_height_m, spacing_m, receivers, block, area_m)
-        job = job.with_others(transmitters, measurements)
+        of_receivers = RECEIVERS[0] if where.inside else receivers
+        job = CoverageJob(model, where, of_receivers, block).with_others(transmitters, measurements)
         for number, transmitter in enumerate(transmitters):
             part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
             coverage, of_materials = job.coverage(transmitter, part)
@@ -211,6 +212,16 @@ def predict_map(
     if model.simulation.material_unknown:
         coverage.attrs |= model.wall_materials.attributes(np.mean(weights, axis=0), model.partial.unnamed_walls)
     return coverage
+
+
+@dataclass(frozen=True)
+class GridArea:
+    """Height, spacing and bounds of receivers [m]; `inside` omits those outside a complete map."""
+
+    rx_height_m: float
+    spacing_m: float
+    bounds_m: Area | None = None
+    inside: bool = False
 
 
 @dataclass(frozen=True)
@@ -251,11 +262,9 @@ class CoverageJob:
     """Coverage of one transmitter after the other, `block` receivers at a time."""
 
     model: LinkModel
-    rx_height_m: float
-    spacing_m: float
+    area: GridArea
     receivers: str
     block: int
-    area_m: Area | None = None
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
     """Assimilated measurements of other transmitters, by the transmitter they are used for."""
 
@@ -265,7 +274,7 @@ class CoverageJob:
         if transmitter.position_m is None:
             posterior = self.located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
-            grid = grid_receivers(model, source.tx_m, self.rx_height_m, self.spacing_m, self.area_m)
+            grid = grid_receivers(model, source.tx_m, self.area)
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
@@ -277,8 +286,8 @@ class CoverageJob:
         attributes = provenance(model.simulation, None if complete else model.predictor) | {
             "transmitter_m": source.position_m,
             ANTENNA: str(source.antenna),
-            "rx_height_m": float(self.rx_height_m),
-            "spacing_m": float(self.spacing_m),
+            "rx_height_m": float(self.area.rx_height_m),
+            "spacing_m": float(self.area.spacing_m),
             "receivers": self.receivers,
         }
         if measured is not None and len(measured):
@@ -407,9 +416,7 @@ def _transmitters(
     tx: ArrayLike | Mapping[str, ArrayLike] | None,
     tx_antenna: TxAntenna,
     measurements: Any,
-    rx_height_m: float,
-    spacing_m: float,
-    area_m: Area | None,
+    area: GridArea,
 ) -> tuple[list[str] | None, list[Transmitter]]:
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
     names: list[str] | None = None
@@ -421,7 +428,7 @@ def _transmitters(
     for antenna in {*antennas}:
         antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
-    grids = [grid_receivers(model, tx_m, rx_height_m, spacing_m, area_m) for tx_m in sources_m]
+    grids = [grid_receivers(model, tx_m, area) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)
     if measurements is not None:
         measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
@@ -487,20 +494,20 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
     }
 
 
-def grid_receivers(
-    model: LinkModel, tx_m: Floats, rx_height_m: float, spacing_m: float, area_m: Area | None = None
-) -> Receivers:
+def grid_receivers(model: LinkModel, tx_m: Floats, area: GridArea) -> Receivers:
     """Return the receivers; those near a wall or transmitter (T, 3) [m] are masked."""
     partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
-    require_height(partial, "rx_height_m", rx_height_m)
-    x_m, y_m = grid_axes(partial, spacing_m, area_m)
-    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), rx_height_m)], axis=-1)
+    require_height(partial, "rx_height_m", area.rx_height_m)
+    x_m, y_m = grid_axes(partial, area.spacing_m, area.bounds_m)
+    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), area.rx_height_m)], axis=-1)
     limit_m = nearest_m(frequency_hz)
     cell_state = partial.state_at(points)
     far = np.ones(cell_state.shape, dtype=bool)
     for each_m in tx_m:
         far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
     valid = far & clear_of_walls(partial, points)
+    if area.inside and partial.is_complete:
+        valid &= cell_state != CellState.UNKNOWN
     if not far.any() and limit_m > SHORTEST_M:
         raise PositionError(
             f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
@@ -509,7 +516,7 @@ def grid_receivers(
     if not valid.any():
         raise PositionError(
             "no receiver can stand anywhere, all are inside walls or at the transmitter: "
-            f"spacing_m = {spacing_m:g}, give a smaller one."
+            f"spacing_m = {area.spacing_m:g}, give a smaller one."
         )
     return Receivers(x_m, y_m, cell_state, valid, points[valid])
 

@@ -53,6 +53,55 @@ BANDS = {
 }
 """Bands (IEEE 802.11ax and 802.11be; 3GPP TS 38.104: FR1 and FR2)."""
 
+
+class EirpLimit(NamedTuple):
+    """Largest EIRP [dBm], and EIRP density [dBm/MHz], of access points indoors in a band [Hz]."""
+
+    low_hz: float
+    high_hz: float
+    eirp_dbm: float
+    density_dbm_mhz: float = math.inf
+
+
+EIRP_LIMITS = {
+    "ETSI": (
+        EirpLimit(2.4e9, 2.4835e9, 20.0, 10.0),
+        EirpLimit(5.15e9, 5.35e9, 23.0, 10.0),
+        EirpLimit(5.47e9, 5.725e9, 30.0, 17.0),
+        EirpLimit(5.945e9, 6.425e9, 23.0, 10.0),
+        EirpLimit(57e9, 71e9, 40.0, 23.0),
+    ),
+    "FCC": (
+        EirpLimit(2.4e9, 2.4835e9, 36.0),
+        EirpLimit(5.15e9, 5.25e9, 36.0, 23.0),
+        EirpLimit(5.25e9, 5.35e9, 30.0, 17.0),
+        EirpLimit(5.47e9, 5.725e9, 30.0, 17.0),
+        EirpLimit(5.725e9, 5.85e9, 36.0),
+        EirpLimit(5.925e9, 7.125e9, 30.0, 5.0),
+        EirpLimit(57e9, 71e9, 40.0),
+    ),
+}
+"""Limits with transmit power control and antennas of up to 6 dBi: Europe (ETSI EN 300 328, EN 301 893, EN 303 687 low
+power indoor, EN 302 567), United States (47 CFR 15.247, 15.255, 15.407; 6 GHz low power indoor)."""
+
+
+class AccessPoint(NamedTuple):
+    """Typical conducted power, all chains together [dBm], and antenna gain [dBi], at 2.4, 5 and 6 GHz."""
+
+    power_dbm: tuple[float, float, float]
+    gain_dbi: tuple[float, float, float]
+
+
+ACCESS_POINTS = {
+    "ceiling access point": AccessPoint((22.0, 25.0, 24.0), (4.0, 5.5, 5.5)),
+    "home router": AccessPoint((20.0, 23.0, 23.0), (2.0, 3.0, 3.0)),
+    "wall plate": AccessPoint((17.0, 20.0, 20.0), (3.0, 4.0, 4.0)),
+}
+"""Kinds of access points, with round figures of data sheets; a product's own figures give its EIRP more exactly."""
+
+_WIFI_BANDS_HZ = (1e9, 3e9, 5.925e9, 7.25e9)
+"""Ends of the bands at 2.4, 5 and 6 GHz."""
+
 _NR_SHANNON = 0.6
 """Fraction of the Shannon bound (3GPP TR 36.942, annex A)."""
 
@@ -77,6 +126,42 @@ def transmit_powers_dbm(powers_dbm: ArrayLike, count: int, name: str = "tx_power
     allowed = found.shape in ((), (count,)) and bool((np.abs(found) <= 200.0).all())
     require(allowed, name, powers_dbm, remedy)
     return np.broadcast_to(found, count).copy()
+
+
+def eirp_limit_dbm(frequency_hz: float, bandwidth_hz: float, region: str = "ETSI") -> float:
+    """Return the largest EIRP of an access point indoors [dBm], infinite where `EIRP_LIMITS` has no band."""
+    require_choice("region", region, EIRP_LIMITS)
+    limits = [
+        min(limit.eirp_dbm, limit.density_dbm_mhz + 10.0 * math.log10(bandwidth_hz / 1e6))
+        for limit in EIRP_LIMITS[region]
+        if limit.low_hz <= frequency_hz <= limit.high_hz
+    ]
+    return min(limits, default=math.inf)
+
+
+def access_point_eirp_dbm(model: str, frequency_hz: float, bandwidth_hz: float, region: str = "ETSI") -> float:
+    """Return the EIRP of one of `ACCESS_POINTS` within the limit of its band [dBm].
+
+    Raises
+    ------
+    SettingsError
+        For another model, or a frequency outside the bands of Wi-Fi.
+    """
+    eirp_dbm = access_point_gain_dbi(model, frequency_hz) + ACCESS_POINTS[model].power_dbm[_band_of(frequency_hz)]
+    return min(eirp_dbm, eirp_limit_dbm(frequency_hz, bandwidth_hz, region))
+
+
+def access_point_gain_dbi(model: str, frequency_hz: float) -> float:
+    """Return the antenna gain of one of `ACCESS_POINTS` [dBi], or raise a SettingsError."""
+    require_choice("model", model, ACCESS_POINTS)
+    return ACCESS_POINTS[model].gain_dbi[_band_of(frequency_hz)]
+
+
+def _band_of(frequency_hz: float) -> int:
+    low_hz, *between_hz, high_hz = _WIFI_BANDS_HZ
+    remedy = f"access points have {low_hz / 1e9:g} to {high_hz / 1e9:g} GHz: choose a band of Wi-Fi, or give the EIRP."
+    require(low_hz <= frequency_hz <= high_hz, "frequency_hz", frequency_hz, remedy)
+    return sum(frequency_hz >= end_hz for end_hz in between_hz)
 
 
 class Scheme(NamedTuple):

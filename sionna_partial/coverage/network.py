@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -23,6 +24,8 @@ from sionna_partial.prediction.predictor import LinkPrediction
 MOST_DRAWS = 1_000
 _RECEIVERS_AT_ONCE = 5_000
 _LOWEST_SINR_DB = -60.0
+_PLANNED_RECEIVERS, _PLAN_PASSES = 2_000, 8
+"""Number of receivers by which channels are planned, and largest number of passes over the transmitters."""
 
 
 def _described(long_name: str, units: str = "1") -> dict[str, str]:
@@ -52,16 +55,16 @@ def network_map(
     bandwidth_hz: float = 100e6,
     load: float = 1.0,
     sinr_threshold_db: float = 0.0,
+    channels: Mapping[str, Any] | Sequence[Any] | None = None,
     n: int = 100,
     seed: int = 0,
 ) -> xr.Dataset:
     """Predict best server, SINR and rate of a network, from the coverage of its transmitters.
 
     Links are drawn jointly (`JointLatents`), because one unseen wall blocks several of them. In each draw a receiver is
-    served by the strongest transmitter, and the others interfere: ``SINR = P_b / (N + load * sum of the other P)``,
-    with
-    P = transmit power x path gain and N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate is
-    bandwidth x log2(1 + SINR).
+    served by the strongest transmitter, and the others on its channel interfere: ``SINR = P_b / (N + load * sum of the
+    other P)``, with P = transmit power x path gain and N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate
+    is bandwidth x log2(1 + SINR). A receiver at a transmitter has 0 dB.
 
     Parameters
     ----------
@@ -76,6 +79,9 @@ def network_map(
         Fraction of time in which an interferer transmits, in [0, 1].
     sinr_threshold_db : float
         Threshold of `p_sinr_above` [dB].
+    channels : mapping or sequence, optional
+        Channel of each transmitter by its name: a plan; or the channels that there are, such as ``[1, 6, 11]``, from
+        which a plan with a large mean rate is proposed. Different channels do not interfere. By default all share one.
     n : int
         Number of draws, at most 1,000.
     seed : int
@@ -84,12 +90,13 @@ def network_map(
     Returns
     -------
     xarray.Dataset
-        The `VARIABLES` on (y, x); NaN where no receiver can be. SINRs below -60 dB count as -60 dB.
+        The `VARIABLES` on (y, x), NaN where no receiver can be, and the coordinate `channel` on tx. SINRs below -60 dB
+        count as -60 dB.
 
     Raises
     ------
     SettingsError
-        For a coverage of one transmitter, or a value out of range.
+        For a coverage of one transmitter, a value out of range, or channels for other transmitters.
 
     Examples
     --------
@@ -99,6 +106,8 @@ def network_map(
     >>> network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6)
     >>> network["best_server"].dims, network["sinr_mean_db"].units
     (('y', 'x'), 'dB')
+    >>> sp.network_map(coverage, channels=[1, 6, 11]).channel.values.tolist()
+    ['1', '6']
     """
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
         raise SettingsError("coverage has no dimension tx: give what predict_map returned for several transmitters.")
@@ -108,21 +117,30 @@ def network_map(
     budget = LinkBudget(noise_figure_db, bandwidth_hz, load, sinr_threshold_db)
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
-    valid: Bools = np.all(coverage["valid"].to_numpy(), axis=0)
+    valid: Bools = np.any(coverage["valid"].to_numpy(), axis=0)
     if not valid.any():
-        raise SettingsError("coverage has no position at which receivers of all transmitters can stand.")
+        raise SettingsError("coverage has no position at which a receiver can stand: give a smaller spacing_m.")
     y, x = (axis[valid] for axis in np.meshgrid(coverage["y"], coverage["x"], indexing="ij"))
     rx_m = np.stack([x, y, np.full(len(x), float(coverage.attrs["rx_height_m"]))], axis=1)
     tx_m = np.stack([coverage[name].to_numpy() for name in TX_COORDINATES], axis=1)
-    every = LinkPrediction.of_columns(lambda name: coverage[name].to_numpy()[:, valid].astype(np.float64))
+
+    def column(name: str) -> Floats:
+        """Return the values of a variable; a receiver at a transmitter has 0 dB."""
+        values = coverage[name].to_numpy()[:, valid].astype(np.float64)
+        return np.where(np.isnan(values), float(name == "p_los"), values)
+
+    every = LinkPrediction.of_columns(column)
+    plan = _channel_plan(coverage, channels, every.gain_mean_db + powers_dbm[:, None], budget)
     latents = JointLatents(_map_of(coverage))
     parts = []
     for start in range(0, len(rx_m), _RECEIVERS_AT_ONCE):
         here = slice(start, start + _RECEIVERS_AT_ONCE)
         gain_db = latents.draw(every.take((slice(None), here)), tx_m, rx_m[here], n, [seed])[1]
         received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + powers_dbm[:, None]
-        parts.append(_statistics(received_dbm, budget))
+        parts.append(_statistics(received_dbm, budget, plan))
     found = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in VARIABLES}
+    _limit_outage(found, every.p_outage)
+    coverage = coverage.assign_coords(channel=("tx", plan))
     return _labelled(coverage, found, valid, {"tx_power_dbm": powers_dbm, **asdict(budget), "draws": n, "seed": seed})
 
 
@@ -148,12 +166,48 @@ def _map_of(coverage: xr.Dataset) -> PartialMap:
     return PartialMap(coverage["cell_state"].to_numpy().astype(np.uint8), spacing_m, corner_m)
 
 
-def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[Any]]:
+def _channel_plan(
+    coverage: xr.Dataset, channels: Mapping[str, Any] | Sequence[Any] | None, mean_dbm: Floats, budget: LinkBudget
+) -> list[str]:
+    """Return the channel of each transmitter: as given, or that of the largest mean rate at mean powers (T, N)."""
+    names = [str(name) for name in coverage["tx"].to_numpy()]
+    if isinstance(channels, Mapping):
+        remedy = f"give a channel to each of {', '.join(names)}, or a list of the channels that there are."
+        require({*channels} == {*names}, "channels", channels, remedy)
+        return [str(channels[name]) for name in names]
+    if channels is None:
+        return ["1"] * len(names)
+    listed = isinstance(channels, Sequence) and not isinstance(channels, str) and len(channels) > 0
+    require(listed, "channels", channels, "give a list, such as [1, 6, 11], or a channel for each transmitter.")
+    free, some_mw = list(dict.fromkeys(map(str, channels))), 10.0 ** (mean_dbm[None] / 10.0)
+    some_mw = some_mw[:, :, :: max(1, some_mw.shape[2] // _PLANNED_RECEIVERS)]
+    plan, before = [free[number % len(free)] for number in range(len(names))], -math.inf
+    for _ in range(_PLAN_PASSES):
+        for number in range(len(names)):
+            tried = [[*plan[:number], channel, *plan[number + 1 :]] for channel in free]
+            rates = [float(np.log2(1.0 + _sinr(some_mw, budget, each)).mean()) for each in tried]
+            plan = tried[int(np.argmax(rates))]
+        if max(rates) <= before + 1e-9:
+            break
+        before = max(rates)
+    return plan
+
+
+def _sinr(power_mw: Floats, budget: LinkBudget, plan: Sequence[str]) -> Floats:
+    """Return the SINR (n, N) of the strongest of T transmitters (n, T, N) on their channels."""
+    best, shared = power_mw.argmax(axis=1), np.equal.outer(np.array(plan), np.array(plan)).astype(np.float64)
+    on_channel_mw = np.take_along_axis(np.einsum("st,ntr->nsr", shared, power_mw), best[:, None], axis=1)[:, 0]
+    best_mw = power_mw.max(axis=1)
+    noise_mw = 10.0 ** (budget.noise_dbm / 10.0)
+    return np.asarray(best_mw / (noise_mw + budget.load * np.maximum(on_channel_mw - best_mw, 0.0)))
+
+
+def _statistics(received_dbm: Floats, budget: LinkBudget, plan: Sequence[str]) -> dict[str, NDArray[Any]]:
     power_mw = 10.0 ** (received_dbm / 10.0)
     best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
     received = best_mw > 0.0
     noise_mw = 10.0 ** (budget.noise_dbm / 10.0)
-    sinr = best_mw / (noise_mw + budget.load * (power_mw.sum(axis=1) - best_mw))
+    sinr = _sinr(power_mw, budget, plan)
     with np.errstate(divide="ignore", invalid="ignore"):
         sinr_db = np.maximum(10.0 * np.log10(sinr), _LOWEST_SINR_DB)
         next_mw = np.sort(power_mw, axis=1)[:, -2] if power_mw.shape[1] > 1 else np.zeros_like(best_mw)
@@ -172,6 +226,13 @@ def _statistics(received_dbm: Floats, budget: LinkBudget) -> dict[str, NDArray[A
     }
 
 
+def _limit_outage(found: dict[str, NDArray[Any]], p_outage: Floats) -> None:
+    """Remove the sampling error by which all links (T, N) are in outage more often than the best one."""
+    excess = np.maximum(found["p_all_outage"] - p_outage.min(axis=0), 0.0)
+    found["p_all_outage"] = found["p_all_outage"] - excess
+    found["p_best"][p_outage.argmin(axis=0), np.arange(len(excess))] += excess
+
+
 def _labelled(
     coverage: xr.Dataset, found: dict[str, NDArray[Any]], valid: Bools, settings: dict[str, Any]
 ) -> xr.Dataset:
@@ -185,6 +246,6 @@ def _labelled(
         layers[name] = (("tx", "y", "x")[3 - layer.ndim :], layer, VARIABLES[name])
     kept = coverage[["cell_state", "observed", "wall_parts"]]
     kept = kept.assign_coords(
-        {name: coverage[name] for name in ("tx", *TX_COORDINATES, ANTENNA) if name in coverage.coords}
+        {name: coverage[name] for name in ("tx", "channel", *TX_COORDINATES, ANTENNA) if name in coverage.coords}
     )
     return kept.assign(layers).assign_attrs(title="Predicted network in a partially observed environment", **settings)

@@ -1,7 +1,7 @@
 """Wall cells -> cells for outlines -> chains of cells -> straight runs."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,9 @@ _POST_CELLS = 3
 _ROUGH, _DEEP = 0.05, 0.3
 """Levelled cells, and wall cells behind faces, per cell of a face, from which `CleanWalls.roughness` is 1."""
 
+ROUGH_WINDOW_M = 1.5
+"""Standard deviation of the window in which they are counted [m]."""
+
 _FACE_CELLS = 5
 """Length of the faces on which a cell that sticks out is a sign of range noise [cells]."""
 
@@ -47,9 +50,6 @@ _DEPTH_M = 0.014
 THICK_M, THICK_FRACTIONS = 0.15, (0.1, 0.9)
 """Thickness of thick walls [m], and fractions of their length between which thickness distinguishes walls."""
 
-DEPTH_WINDOW_M, SIGNS_WINDOW_M = 3.0, 5.0
-"""Standard deviations of the windows, about Gaussians, for the depth and for the signs of local noise [m]."""
-
 _EXACT_DEPTH_M, _SIGNS_PER_FACE = 0.001, 0.003
 """Depth of the cells behind exact faces, as of walls cut out of meshes [m]; signs of noise per cell of a face at which
 depth is range noise to 1 - 1/e. A single sign is none: exact walls have them at corners.
@@ -58,8 +58,10 @@ depth is range noise to 1 - 1/e. A single sign is none: exact walls have them at
 LEAST_NOISE = 0.05
 """Noise up to which a map counts as exact, as of cells cut out of meshes."""
 
-STRONG_NOISE = 0.5
-"""Noise, as of ranges with 1 cm, up to which walls are best outlined as on exact maps."""
+CENTRED_NOISE = 0.35, 0.7
+"""Noise near a wall from which its outline moves to the middle of its layers of cells, and where it arrives there: with
+ranges of less than 1 cm, walls are best outlined as on exact maps.
+"""
 
 RAGGED_FACTOR = 2.0
 """Largest distance of a line from ragged walls, in tolerances."""
@@ -81,13 +83,13 @@ _ALL_LINES = np.array([[-1.05, -3.0], [1.05, -3.0], [1.05, 3.0], [-1.05, 3.0]])
 class CleanWalls(NamedTuple):
     """Wall cells (ny, nx) for outlines.
 
-    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `roughness`, 0 to
-    1, counts ragged cells of thick walls.
+    `peeled` (ny, nx) were removed from walls two cells thick, whose outline is between both layers. `roughness`
+    (ny, nx), 0 to 1, counts ragged cells of thick walls in a window.
     """
 
     cells: Bools
     peeled: Bools
-    roughness: float
+    roughness: Floats
 
 
 def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) -> CleanWalls:
@@ -103,11 +105,11 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     wall |= _hidden_corners(wall, free)[0]
     longest = int(bridge_gap_m / resolution_m + 1e-6)
     filled = _unknown_gaps(wall, free, longest)
-    wall, free, roughness = _levelled(wall | filled, free)
+    wall, free, roughness = _levelled(wall | filled, free, resolution_m)
     more = _unknown_gaps(wall, free, longest)
     wall, filled = wall | more, filled | more
-    wall |= _short_gaps(wall, free, resolution_m, bridge_gap_m)
-    wall |= _short_gaps(wall.T, free.T, resolution_m, bridge_gap_m).T
+    rows, columns = (_short_gaps(*turned, resolution_m, bridge_gap_m) for turned in ((wall, free), (wall.T, free.T)))
+    wall |= rows | columns.T
     seen = wall & ndimage.binary_dilation(free, structure=_SQUARE) & ~_hidden_corners(wall, free)[1]
     label, count = ndimage.label(wall, structure=_SQUARE)
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
@@ -167,22 +169,23 @@ def wall_noise(state: States, resolution_m: float) -> float:
     return depth * float(np.interp(_uneven_faces(state), _UNEVEN, (0.0, 1.0))) if depth > 0.0 else 0.0
 
 
-def noise_field(state: States, resolution_m: float) -> Floats:
+def noise_field(state: States, resolution_m: float, windows_m: tuple[float, float] = (3.0, 5.0)) -> Floats:
     """Return the local range noise (ny, nx) of the walls around the centre of each cell: 0 (exact or no walls) to 1.
 
-    Depth is as in `wall_noise`, in a window; it is noise where cells stick out behind the faces of walls.
+    Depth is as in `wall_noise`, in a window; it is noise where cells stick out behind the faces of walls. `windows_m`
+    are the standard deviations of the windows for the depth, and for these signs [m].
     """
     wall, near_free = state == CellState.WALL, ndimage.binary_dilation(state == CellState.FREE, structure=_SQUARE)
     ragged, faces = _ragged_behind(wall, state != CellState.UNKNOWN) & ~near_free, wall & near_free
-    hidden, around = (_counted(cells, DEPTH_WINDOW_M / resolution_m) for cells in (wall & ~near_free, faces))
-    signs, farther = (_counted(cells, SIGNS_WINDOW_M / resolution_m) for cells in (ragged, faces))
+    hidden, around = (counted_near(cells, windows_m[0] / resolution_m) for cells in (wall & ~near_free, faces))
+    signs, farther = (counted_near(cells, windows_m[1] / resolution_m) for cells in (ragged, faces))
     depth_m = np.maximum(hidden / (around + 1.0) * resolution_m - _EXACT_DEPTH_M, 0.0)
     evidence = np.maximum(signs - 1.0, 0.0) / (_SIGNS_PER_FACE * (farther + 1.0))
     return np.asarray(np.sqrt(-np.expm1(-depth_m / _DEPTH_M)) * -np.expm1(-evidence))
 
 
-def _counted(cells: Bools, deviation: float) -> Floats:
-    """Count cells with the weights of a window that is 1 in its middle: three box filters."""
+def counted_near(cells: NDArray[np.generic], deviation: float) -> Floats:
+    """Add up cells with the weights of a window that is 1 in its middle, about a Gaussian: three box filters."""
     half = round((math.sqrt(4.0 * deviation**2 + 1.0) - 1.0) / 2.0)
     counts = np.pad(cells.astype(np.float64), half)  # so that unknown cells around a map change nothing
     for _ in range(3):
@@ -244,16 +247,22 @@ def _sticks_out(columns: Indices) -> Bools:
     return _is_line(np.array([first, before, after, last])) & (2 * middle - before - after == 2)
 
 
-def _levelled(wall: Bools, free: Bools) -> tuple[Bools, Bools, float]:
+def _levelled(wall: Bools, free: Bools, resolution_m: float) -> tuple[Bools, Bools, Floats]:
     facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
-    faces, hidden = max(1, int(facing.sum())), int((wall & ~facing).sum())
-    was_free = free
-    for level in (_without_bumps, _without_notches) * 2:
-        for turns in _TURNS:
-            turned = level(np.rot90(wall, turns), np.rot90(free, turns))
-            wall, free = (np.rot90(mask, -turns) for mask in turned)
-    levelled = int((free != was_free).sum())
-    return wall, free, min(1.0, levelled / faces / _ROUGH) * min(1.0, hidden / faces / _DEEP)
+    hidden, was_free = wall & ~facing, free
+    for level in (_bumps, _notches) * 2:
+        opened, filled = np.zeros((2, *wall.shape), dtype=bool)
+        for turns in _TURNS:  # all faces at once, so that none comes first
+            found = level(np.rot90(wall, turns), np.rot90(free, turns))
+            for total, mask in zip((opened, filled), found, strict=True):
+                total |= np.rot90(mask, -turns)
+        opened &= ~filled
+        wall, free = (wall & ~opened) | filled, (free & ~filled) | opened
+    deviation = ROUGH_WINDOW_M / resolution_m
+    levels, depths, faces = (counted_near(cells, deviation) for cells in (free != was_free, hidden, facing))
+    rough = np.maximum(levels - 1.0, 0.0) / (faces + 1.0) / _ROUGH  # a single cell is none
+    deep = depths / (faces + 1.0) / _DEEP
+    return wall, free, np.minimum(rough, 1.0) * np.minimum(deep, 1.0)
 
 
 def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
@@ -272,13 +281,42 @@ def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
             row = label[around] == index
             ends = np.where(ndimage.binary_dilation(row, structure=_SQUARE), pieces[around], 0)
             if len(np.unique(ends)) > 2:
-                low, high = (np.argwhere(ends == value) for value in (ends[ends > 0].min(), ends.max()))
-                apart = np.abs(low[:, None] - high[None]).max(axis=2)
-                from_to = low[np.argmin(apart) // len(high)], high[np.argmin(apart) % len(high)]
-                line = np.zeros(ends.shape, dtype=bool)
-                line[tuple(np.rint(np.linspace(*from_to, int(apart.min()) + 1)).astype(int).T)] = True
+                line = _shortest_line(ends, row + 2 * free[around])
                 filled[around] |= row if (free[around] & line).any() else line
     return filled & ~wall
+
+
+def _shortest_line(ends: NDArray[np.int32], others: NDArray[np.integer]) -> Bools:
+    """Return the cells of the shortest line between two numbered pieces, the same however the grid is turned."""
+    _, transpose, flips = canonical(((ends > 0) + 2 * others).astype(np.uint8))
+    turned = turned_grid(ends, transpose, flips)
+    numbers = turned[turned > 0]
+    low, high = (np.argwhere(turned == value) for value in (numbers[0], numbers[numbers != numbers[0]][0]))
+    apart = np.abs(low[:, None] - high[None]).max(axis=2)
+    from_to = low[np.argmin(apart) // len(high)], high[np.argmin(apart) % len(high)]
+    line = np.zeros(turned.shape, dtype=bool)
+    line[tuple(np.rint(np.linspace(*from_to, int(apart.min()) + 1)).astype(int).T)] = True
+    return _turned_back(line, transpose, flips)
+
+
+def canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
+    """Turn or mirror a grid to the orientation with the smallest bytes, so that results turn with it.
+
+    Returns the grid, whether it was transposed, and whether columns and rows were then flipped.
+    """
+    turns = [(swap, (x, y)) for swap in (False, True) for y in (False, True) for x in (False, True)]
+    grids = [(turned_grid(state, *turn), *turn) for turn in turns]
+    return min(grids, key=lambda turned: (turned[0].shape, turned[0].tobytes()))
+
+
+def _turned_back(grid: Bools, transpose: bool, flips: tuple[bool, bool]) -> Bools:
+    grid = grid[:: -1 if flips[1] else 1, :: -1 if flips[0] else 1]
+    return grid.T if transpose else grid
+
+
+def turned_grid(grid: NDArray[Any], transpose: bool, flips: tuple[bool, bool]) -> NDArray[Any]:
+    grid = grid.T if transpose else grid
+    return np.ascontiguousarray(grid[:: -1 if flips[1] else 1, :: -1 if flips[0] else 1])
 
 
 def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
@@ -295,27 +333,26 @@ def _fill_pinholes(wall: Bools) -> Bools:
     return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
 
 
-def _without_notches(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
-    """Fill notches of one or two FREE cells in faces towards larger rows; return walls and FREE cells."""
-    wall, free = was_wall.copy(), was_free.copy()
+def _notches(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
+    """Return no cells to open, and those that fill notches of one or two FREE cells in faces towards larger rows."""
+    filled = np.zeros_like(wall)
     row, start, end = row_runs(free)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        if was_wall[i, a - 1] and was_wall[i, b] and not free[i - 1, a - 1 : b + 1].any():
-            wall[i, a:b], free[i, a:b] = True, False
-    return wall, free
+        filled[i, a:b] = wall[i, a - 1] and wall[i, b] and not free[i - 1, a - 1 : b + 1].any()
+    return np.zeros_like(wall), filled
 
 
-def _without_bumps(was_wall: Bools, was_free: Bools) -> tuple[Bools, Bools]:
-    """Remove bumps of one or two cells from faces towards larger rows; return walls and FREE cells."""
-    wall, free = was_wall.copy(), was_free.copy()
+def _bumps(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
+    """Return the bumps of one or two cells on faces towards larger rows, and the cells below them."""
+    bumps, below = np.zeros((2, *wall.shape), dtype=bool)
     row, start, end = row_runs(wall)
     keep = (end - start <= MAX_GAP_CELLS) & (start > 0) & (end < wall.shape[1]) & (row >= 1)
     for i, a, b in zip(row[keep], start[keep], end[keep], strict=True):
-        sides = was_free[i, a - 1] and was_free[i, b] and was_wall[i - 1, a - 1] and was_wall[i - 1, b]
-        if sides and not was_free[i - 1, a:b].any() and was_free[i + 1 : i + 2, a - 1 : b + 1].all():
-            wall[i, a:b], free[i, a:b], wall[i - 1, a:b] = False, True, True
-    return wall, free
+        sides = free[i, a - 1] and free[i, b] and wall[i - 1, a - 1] and wall[i - 1, b]
+        if sides and not free[i - 1, a:b].any() and free[i + 1 : i + 2, a - 1 : b + 1].all():
+            bumps[i, a:b], below[i - 1, a:b] = True, True
+    return bumps, below
 
 
 def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: float) -> Bools:
@@ -344,13 +381,30 @@ def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
     facing = ndimage.binary_dilation(free, structure=_SQUARE)
     kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
-    width, height = _run_lengths(wall)
-    thinned = np.pad(wall, 1)
-    for removable in (~kept & ~facing, ~kept):
+    padded, facing_there, width, height = (np.pad(cells, 1) for cells in (wall, facing, *_run_lengths(wall)))
+    thinned, (label, _) = padded.copy(), ndimage.label(np.pad(wall & ~kept, 1), structure=_SQUARE)
+    for index, box in enumerate(ndimage.find_objects(label), start=1):
+        around = tuple(slice(side.start - 1, side.stop + 1) for side in box)
+        cells = padded[around], label[around] == index, facing_there[around]
+        _, swap, flips = canonical((cells[0] + 2 * cells[1] + 4 * cells[2]).astype(np.uint8))
+        lengths = (height, width) if swap else (width, height)
+        parts = *cells, lengths[0][around], lengths[1][around]
+        left = _thinned(*(turned_grid(part, swap, flips) for part in parts))
+        thinned[around] &= _turned_back(left, swap, flips)
+    thinned = thinned[1:-1, 1:-1]
+    return thinned, wall & ~thinned & facing
+
+
+def _thinned(
+    wall: Bools, removable: Bools, facing: Bools, width: NDArray[np.uint8], height: NDArray[np.uint8]
+) -> Bools:
+    """Remove layers of cells, sides one by one; the result depends on how the grid is turned."""
+    thinned = wall.copy()
+    for cells in (removable & ~facing, removable):
         for (dy, dx), across in (((1, 0), height), ((-1, 0), height), ((0, 1), width), ((0, -1), width)):
             side = ~np.roll(thinned, (-dy, -dx), (0, 1))
-            thinned &= ~_peeled(thinned, side & np.pad(removable & (across <= np.minimum(width, height)), 1))
-    return thinned[1:-1, 1:-1], wall & ~thinned[1:-1, 1:-1] & facing
+            thinned &= ~_peeled(thinned, side & cells & (across <= np.minimum(width, height)))
+    return thinned
 
 
 def _peeled(wall: Bools, candidates: Bools) -> Bools:
@@ -370,47 +424,47 @@ def _peeled(wall: Bools, candidates: Bools) -> Bools:
     return wall & ~left
 
 
-def fit_runs(points: Floats, tolerance: float) -> tuple[NDArray[np.int64], Floats]:
+def fit_runs(points: Floats, tolerance: float | Floats) -> tuple[NDArray[np.int64], Floats]:
     """Split a polyline (n, 2) [cells] of straight elements into few straight runs.
 
-    A run is allowed if a line passes within `tolerance` [cells] of the middle of every unit edge, along the axis that
-    the line is steeper against. Ragged polylines, which turn back at least four times and once in 10 cells, get
-    `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus three times their residual
-    variances, in squared tolerances. Lines are least-squares within the tolerance, or parallel to an axis for ragged
-    runs if that moves their ends by at most half a cell.
+    A run is allowed if a line passes within `tolerance` [cells], of all elements or of each (n - 1,), of the middle of
+    every unit edge, along the axis that the line is steeper against. Ragged polylines, which turn back at least four
+    times and once in 10 cells, get `RAGGED_FACTOR` times the tolerance. The split minimises the number of runs plus
+    three times their residual variances, in squared mean tolerances. Lines are least-squares within the tolerance, or
+    parallel to an axis for ragged runs if that moves their ends by at most half a cell.
 
     Returns the first corner of every run (r,), and a point x, y and the direction x, y of its line (r, 4).
     """
     upright, lying = np.ascontiguousarray(points[:, ::-1]), np.ascontiguousarray(points)
-    tolerance = tolerance + 1e-6
+    tolerances = np.ascontiguousarray(np.broadcast_to(tolerance + 1e-6, len(points) - 1))
     previous, along_y = np.zeros(len(points), np.int64), np.zeros(len(points), np.bool_)
-    _find_runs(lying, upright, tolerance, np.full(len(points), np.inf), previous, along_y)
+    _find_runs(lying, upright, tolerances, np.full(len(points), np.inf), previous, along_y)
     starts, lines, end = [], [], len(points) - 1
     while end > 0:
         starts.append(int(previous[end]))
-        x, y, along, across = _line(upright if along_y[end] else lying, starts[-1], end, tolerance)
+        x, y, along, across = _line(upright if along_y[end] else lying, starts[-1], end, tolerances)
         lines.append((y, x, across, along) if along_y[end] else (x, y, along, across))
         end = starts[-1]
     return np.array(starts[::-1], np.int64), np.array(lines[::-1]).reshape(-1, 4)
 
 
 @njit(cache=True)
-def _find_runs(points, swapped, tolerance, cost, previous, along_y):
+def _find_runs(points, swapped, tolerances, cost, previous, along_y):
     cost[0] = 0.0
     for i in range(len(points) - 1):
         if cost[i] + 1.0 < cost[i + 1]:
             cost[i + 1], previous[i + 1] = cost[i] + 1.0, i
             along_y[i + 1] = abs(points[i + 1, 1] - points[i, 1]) > abs(points[i + 1, 0] - points[i, 0])
-        _extend(points, tolerance, i, False, cost, previous, along_y)
-        _extend(swapped, tolerance, i, True, cost, previous, along_y)
+        _extend(points, tolerances, i, False, cost, previous, along_y)
+        _extend(swapped, tolerances, i, True, cost, previous, along_y)
 
 
 @njit(cache=True)
-def _extend(points, tolerance, start, swap, cost, previous, along_y):
+def _extend(points, tolerances, start, swap, cost, previous, along_y):
     """Lengthen the run from `start` while a line fits; note cheaper splits."""
     near, near_size = _all_lines()
     far, far_size = _all_lines()
-    moments = np.zeros(6)
+    moments, weighted = np.zeros(6), 0.0
     sign, turn, reversals = 0.0, 0.0, 0
     for k in range(start, len(points) - 1):
         ahead, aside = points[k + 1, 0] - points[k, 0], points[k + 1, 1] - points[k, 1]
@@ -420,27 +474,29 @@ def _extend(points, tolerance, start, swap, cost, previous, along_y):
         reversals += int(aside * turn < 0.0)
         turn = aside if aside != 0.0 else turn
         element = _middles(points, start, k)
-        near_size = _clip_element(near, near_size, element, tolerance)
-        far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerance)
+        near_size = _clip_element(near, near_size, element, tolerances[k])
+        far_size = _clip_element(far, far_size, element, RAGGED_FACTOR * tolerances[k])
         if far_size == 0:
             return
         _accumulate(moments, element)
+        weighted += element[4] * tolerances[k]
         length = abs(points[k + 1, 0] - points[start, 0])
         if near_size > 0 or (reversals >= _RAGGED_TURNS and reversals * _RAGGED_SPACING >= length):
-            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(moments) / max(tolerance, 0.25) ** 2
+            tolerance = max(weighted / moments[0], 0.25)
+            total = cost[start] + 1.0 + _RESIDUAL_COST * _residual_variance(moments) / tolerance**2
             if total < cost[k + 1] - 1e-12:
                 cost[k + 1], previous[k + 1], along_y[k + 1] = total, start, swap
 
 
 @njit(cache=True)
-def _line(points, start, end, tolerance):
+def _line(points, start, end, tolerances):
     """Return a point and the direction of the line that fits a run."""
     for factor in (1.0, RAGGED_FACTOR):
-        limit, moments = factor * tolerance, np.zeros(6)
+        moments = np.zeros(6)
         polygon, size = _all_lines()
         for k in range(start, end):
             element = _middles(points, start, k)
-            size = _clip_element(polygon, size, element, limit)
+            size = _clip_element(polygon, size, element, factor * tolerances[k])
             _accumulate(moments, element)
         ragged = factor > 1.0
         if size > 0:
@@ -454,6 +510,7 @@ def _line(points, start, end, tolerance):
     fits = True
     for k in range(start, end):
         x0, y0, x1, y1, _ = _middles(points, start, k)
+        limit = RAGGED_FACTOR * tolerances[k] if ragged else tolerances[k]
         fits = fits and max(abs(slope * x0 + offset - y0), abs(slope * x1 + offset - y1)) <= limit
     if size > 0 and not fits:
         slope, offset = 0.0, 0.0

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.channels.joint import JointLatents
-from sionna_partial.checks import Progress, require_whole
+from sionna_partial.checks import Progress, require_number, require_whole
 from sionna_partial.constants import DEFAULT_HEIGHT_M
 from sionna_partial.display import Pictured, reporting
 from sionna_partial.files import atomic_write
@@ -42,11 +42,11 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     Parameters
     ----------
     positions_m : (K, 3) float64 array
-        Transmitters [m], in the order of choice.
+        Transmitters [m]; each adds most to those before it.
     score : float
         Mean of `values`, in [0, 1].
     scores : (K,) float64 array
-        Scores of the first, the first two etc. before any swap, at some of the receivers.
+        Scores of the first, the first two etc.; the last is `score`.
     candidates_m : (C, 3) float64 array
     rx_m : (N, 3) float64 array
         Receivers [m].
@@ -78,6 +78,11 @@ class NetworkPlacement(Pictured, plot="plots.result_plots:plot_network_placement
     partial: PartialMap
     settings: PlacementSettings
 
+    @property
+    def added(self) -> Floats:
+        """Score (K,) that each transmitter adds to those before it."""
+        return np.diff(self.scores, prepend=0.0)
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write positions, scores and settings as JSON; equal placements give equal files.
 
@@ -97,6 +102,7 @@ def place_transmitters(
     scene: PartialMap | str | Path | Simulation | LinkModel,
     count: int = 2,
     *,
+    goal: float | None = None,
     rx: ArrayLike | None = None,
     threshold_db: float = -100.0,
     tx_height_m: float = DEFAULT_HEIGHT_M,
@@ -111,12 +117,14 @@ def place_transmitters(
 
     Candidates cover different receivers. Their links are drawn jointly (`JointLatents`), because transmitters behind
     one unseen wall are correlated. Transmitters are chosen greedily, then swapped for other candidates while that
-    increases the score.
+    increases the score, the mean probability that a receiver has a gain above the threshold.
 
     Parameters
     ----------
     count : int
-        Number of transmitters K, up to 16.
+        Number of transmitters K, up to 16; with `goal` the largest.
+    goal : float, optional
+        Score in [0, 1] that is wanted, such as 0.95: K is the smallest number for which it is found.
     rx : (N, 3) array-like, optional
         Receivers [m] with equal weights; by default as in `place_transmitter`.
     scene, threshold_db, tx_height_m, rx_height_m, seed, predictor, scene_settings, trace_settings, progress
@@ -134,8 +142,13 @@ def place_transmitters(
     >>> found = sp.place_transmitters(home, count=2, threshold_db=-90.0)
     >>> found.positions_m.shape, bool(found.scores[1] >= found.scores[0])
     ((2, 3), True)
+    >>> few = sp.place_transmitters(home, count=6, goal=0.5, threshold_db=-90.0)  # how many access points?
+    >>> len(few.added) <= 6, few.score >= 0.5
+    (True, True)
     """
     require_whole("count", count, 1, MOST_TRANSMITTERS)
+    if goal is not None:
+        require_number("goal", goal, 0.0, 1.0)
     settings = PlacementSettings("coverage", threshold_db, tx_height_m, rx_height_m, seed)
     search = Search.on(link_model_of(scene, predictor, trace_settings, scene_settings), settings)
     area, partial = search.area, search.model.partial
@@ -149,18 +162,27 @@ def place_transmitters(
         covered = _covered(search, some, candidates_m)
         weight = some.weight / some.weight.sum()
         chosen, scores = _greedy(covered, weight, count)
-        chosen = _swapped(covered, weight, chosen)
-        report(0.9, "evaluating the best positions")
-        values = _covered(search, area, candidates_m[chosen]).any(axis=1).mean(axis=0)
+        needed = len(chosen)
+        if goal is not None:
+            needed = min(1 + int(np.searchsorted(scores, goal)), needed)
+        report(0.8, "evaluating the best positions")
+        while True:
+            best = _swapped(covered, weight, chosen[:needed])
+            of_best = _covered(search, area, candidates_m[best])
+            order, scores = _greedy(of_best, area.weight / area.weight.sum(), needed)
+            if goal is None or scores[-1] >= goal or needed == len(chosen):
+                break
+            needed += 1
+            report(0.9, f"evaluating {needed} transmitters")
         report(1.0, "done")
     return NetworkPlacement(
-        positions_m=candidates_m[chosen],
-        score=float(values @ area.weight / area.weight.sum()),
+        positions_m=candidates_m[best][order],
+        score=scores[-1],
         scores=np.array(scores),
         candidates_m=candidates_m,
         rx_m=area.rx_m,
         weight=area.weight,
-        values=values,
+        values=of_best.any(axis=1).mean(axis=0),
         spacing_m=area.spacing_m,
         partial=partial,
         settings=settings,

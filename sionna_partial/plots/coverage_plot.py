@@ -6,19 +6,19 @@ import json
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
+from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb, to_rgba
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import distance_transform_edt, maximum_filter
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import require, require_choice, require_number
@@ -32,8 +32,20 @@ from sionna_partial.coverage.dataset import (
     transmitters_of,
 )
 from sionna_partial.coverage.network import require_network
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import likely_region
-from sionna_partial.plots.style import STAR, STATE_COLOURS, Figure, legend_below, server_colours, shade, sheet_columns
+from sionna_partial.plots.style import (
+    FAILS,
+    STAR,
+    STATE_COLOURS,
+    Figure,
+    legend_below,
+    material_colour,
+    named_walls,
+    server_colours,
+    shade,
+    sheet_columns,
+)
 from sionna_partial.settings import Material, material_name
 
 DEFAULT_LAYERS = ("link_state", "gain_mean_db", "gain_std_db", "p_above")
@@ -43,11 +55,12 @@ _NARROW_IN, _WIDE_IN, _HIGHEST_IN, _KEY_IN, _KEY_PAD_IN, _DPI, _MAX_PIXELS = 9.0
 _ROW_NAME, _LOW_ASPECT, _OUTAGE_NOTE = 16, 0.2, "an outage counts as a path gain of \N{MINUS SIGN}150 dB"
 _NETWORK_WIDTH_IN, _NETWORK_DPI = 10.0, 130
 _GAINS_DB, _GAINS_THROUGH_WALLS_DB = (GAIN_FLOOR_DB, -60.0), (-110.0, -30.0)
+_FAILS, _HALO, _TITLE_WIDTH = "\\\\\\", 0.8, 90
 _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
-_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 130, (1.1, 0.45), (0.5, 1.0)
+_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 124, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -60,6 +73,24 @@ class Layer:
     norm: Normalize | None = None
     cmap: str | Colormap | None = None
     label: str = ""
+    ticks: tuple[Sequence[float], Sequence[str]] | None = None
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Colours of a layer in steps from `low` to `high`, its ticks and their names, and the title of its bar."""
+
+    palette: Sequence[str]
+    low: float
+    high: float
+    ticks: Sequence[float]
+    names: Sequence[str]
+    title: str
+
+    def of(self, layer: Layer) -> Layer:
+        """Return a layer with this scale."""
+        norm, cmap = Normalize(self.low, self.high), ListedColormap([*self.palette])
+        return replace(layer, norm=norm, cmap=cmap, label=self.title, ticks=(self.ticks, self.names))
 
 
 def mix_state_colours(p_los: ArrayLike, p_nlos: ArrayLike, p_outage: ArrayLike) -> Floats:
@@ -270,10 +301,12 @@ def _draw_triangle(key: Axes) -> None:
         key.text(x_text, y_text, name, ha="center", va=align, fontsize="small")
 
 
-def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset | None = None) -> None:
+def _draw(
+    axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset | None = None, halo_px: int = 0
+) -> None:
     extent = extent_m(coverage)
     wall = wall_cells(coverage)
-    picture = _fill(layer.picture(coverage), coverage["valid"].to_numpy(), wall)
+    picture = _fill(np.asarray(layer.picture(coverage)), coverage["valid"].to_numpy(), wall)
     axis.imshow(picture, extent=extent, origin="lower", interpolation="nearest", norm=layer.norm, cmap=layer.cmap)
     axis.imshow(shade(outside(coverage), grey=255), extent=extent, origin="lower", interpolation="nearest")
     _hatch_unknown(axis, coverage)
@@ -281,9 +314,13 @@ def _draw(axis: Axes, coverage: xr.Dataset, layer: Layer, reference: xr.Dataset 
         axis.imshow(
             shade(wall_cells(reference), opacity=_UNSEEN_OPACITY), extent=extent_m(reference), origin="lower", zorder=3
         )
+    if halo_px:  # walls stay visible on dark layers
+        around = maximum_filter(wall, size=2 * halo_px + 1) & ~wall
+        axis.imshow(shade(around, grey=255, opacity=_HALO), extent=extent, origin="lower", zorder=3)
     axis.imshow(shade(wall), extent=extent, origin="lower", zorder=3)
-    x, y, _ = coverage.attrs["transmitter_m"]
-    axis.plot(x, y, zorder=4, **_STAR)
+    if "transmitter_m" in coverage.attrs:
+        x, y, _ = coverage.attrs["transmitter_m"]
+        axis.plot(x, y, zorder=4, **_STAR)
     for x_m, y_m, inside in likely_area(coverage):
         for colour, width in (("white", 2.4), ("black", 1.0)):
             axis.contour(x_m, y_m, inside, levels=[0.5], colors=colour, linewidths=width, zorder=4)
@@ -347,6 +384,82 @@ def _hatch_unknown(axis: Axes, coverage: xr.Dataset) -> None:
     area.set_hatch_linewidth(0.5)
 
 
+def to_the_edge(coverage: xr.Dataset, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return x and y with the edges of the map, and values (ny + 2, nx + 2) that continue to them, for contours."""
+    x0, x1, y0, y1 = extent_m(coverage)
+    return np.r_[x0, coverage["x"], x1], np.r_[y0, coverage["y"], y1], np.pad(values, 1, mode="edge")
+
+
+@dataclass(frozen=True)
+class Outline:
+    """Line at a level of values (ny, nx), hatching where they are below it, and the legends of both."""
+
+    values: Floats
+    level: float
+    line: str
+    fails: str
+
+    def draw(self, axis: Axes, coverage: xr.Dataset) -> list[Line2D | Patch]:
+        """Draw both, and return the handles of the legend."""
+        filled = _fill(self.values, np.isfinite(self.values), np.zeros(self.values.shape, dtype=bool))
+        x, y, values = to_the_edge(coverage, np.where(outside(coverage), np.nan, filled))
+        handles: list[Line2D | Patch] = []
+        if not np.isfinite(values).any():
+            return handles
+        lowest, highest = np.nanmin(values), np.nanmax(values)
+        if lowest < self.level:
+            fails = axis.contourf(x, y, values, levels=[lowest - 1.0, self.level], colors="none", hatches=[_FAILS])
+            fails.set(edgecolor=FAILS, linewidth=0.0, zorder=2.5)
+            handles.append(Patch(facecolor="none", edgecolor=FAILS, hatch=2 * _FAILS, linewidth=0.0, label=self.fails))
+        if lowest < self.level < highest:
+            for colour, width in (("white", 2.4), ("black", 1.2)):
+                axis.contour(x, y, values, levels=[self.level], colors=colour, linewidths=width, zorder=3.5)
+            handles.append(Line2D([], [], color="black", linewidth=1.2, label=self.line))
+        return handles
+
+
+def _draw_named_walls(axis: Axes, partial: PartialMap | None) -> list[Patch]:
+    """Draw the walls whose material the map names in its colour, and return the handles of the legend."""
+    if partial is None:
+        return []
+    x0, y0, x1, y1 = partial.bounds_m
+    for material, where in named_walls(partial).items():
+        picture = np.zeros((*where.shape, 4))
+        picture[where] = to_rgba(material_colour(material))
+        axis.imshow(picture, extent=(x0, x1, y0, y1), origin="lower", interpolation="nearest", zorder=3.2)
+    return [Patch(facecolor=material_colour(each), label=material_name(each)) for each in named_walls(partial)]
+
+
+def _draw_names(axis: Axes, coverage: xr.Dataset) -> None:
+    x_m, y_m = (coverage[name].to_numpy() for name in TX_COORDINATES[:2])
+    axis.plot(x_m, y_m, zorder=4, **_STAR)
+    for place in zip(coverage["tx"].to_numpy(), zip(x_m, y_m, strict=True), strict=True):
+        axis.annotate(*place, (7, 0), textcoords="offset points", va="center", zorder=5, **_NAME)
+
+
+def plot_layer(
+    coverage: xr.Dataset, one: xr.Dataset, layer: Layer, outline: Outline | None, partial: PartialMap, title: str
+) -> Figure:
+    """Draw a layer of `one` (y, x) with all transmitters of `coverage`, as on the page of the app."""
+    aspect = one.sizes["x"] / one.sizes["y"]
+    figure, ((axis,),) = _panels(1, 1, aspect, keys_in=1.2)
+    _draw(axis, one, layer, halo_px=1)
+    handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR), *_draw_named_walls(axis, partial)]
+    handles += [Patch(facecolor="black", label="wall")] if wall_cells(one).any() else []
+    handles += outline.draw(axis, one) if outline else []
+    if _hatched(one).any():
+        handles.append(_not_observed())
+    _draw_names(axis, coverage)
+    bar = figure.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, label=layer.label, panchor=False)
+    if layer.ticks is not None:
+        bar.set_ticks(layer.ticks[0], labels=layer.ticks[1])
+    heading, _, more = title.partition("\n")
+    axis.set_title(layer.title)
+    figure.suptitle(f"{heading}\n{textwrap.fill(more, _TITLE_WIDTH)}", parse_math=False)
+    legend_below(figure, handles, columns=4)
+    return figure
+
+
 def likely_area(coverage: xr.Dataset) -> list[tuple[Floats, Floats, Floats]]:
     """Return, as `unobserved_area`, cells with 90 % of an unknown transmitter's posterior, or nothing."""
     if "p_transmitter" not in coverage:
@@ -372,32 +485,44 @@ def _add_legend(figure: Figure, coverages: Sequence[xr.Dataset], layers: Sequenc
     if any((walls[0] & ~wall).any() for wall in walls[1:]):
         handles.append(Patch(facecolor="black", alpha=_UNSEEN_OPACITY, label="wall, not observed"))
     if any(_hatched(coverage).any() for coverage in coverages):
-        handles.append(
-            Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
-        )
+        handles.append(_not_observed())
     note = _OUTAGE_NOTE if any(layer.label == "dB" for layer in layers) else ""
     legend_below(figure, handles, columns=4 if located else None, title=note)
 
 
-def report_pdf(coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()) -> bytes:
+def _not_observed() -> Patch:
+    return Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
+
+
+def report_pdf(
+    coverage: xr.Dataset,
+    eirp_dbm: ArrayLike,
+    threshold_dbm: float,
+    heading: Sequence[str] = (),
+    partial: PartialMap | None = None,
+) -> bytes:
     """Return `report_figure` as PDF; equal maps give equal bytes."""
-    figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading), io.BytesIO()
+    figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading, partial), io.BytesIO()
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
 
 
 def report_figure(
-    coverage: xr.Dataset, eirp_dbm: ArrayLike, threshold_dbm: float, heading: Sequence[str] = ()
+    coverage: xr.Dataset,
+    eirp_dbm: ArrayLike,
+    threshold_dbm: float,
+    heading: Sequence[str] = (),
+    partial: PartialMap | None = None,
 ) -> Figure:
-    """Draw a page on named transmitters: maps, covered area, uncertainty."""
+    """Draw a page on named transmitters: maps, covered area, uncertainty; `partial` has the materials of walls."""
     maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
-    notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage))
+    notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage, partial))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
     text_in = _REPORT_LINE_IN * (text.count("\n") + 2)
     figure = Figure(figsize=_A4_IN, layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(_A4_IN[1] - text_in, text_in))
-    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm, _A4_IN[1] - text_in - 0.6)
-    title = " \N{MIDDLE DOT} ".join(["Radio coverage", *heading])
+    _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm, _A4_IN[1] - text_in - 0.6, partial)
+    title = textwrap.fill(" \N{MIDDLE DOT} ".join(["Radio coverage", *heading]), _TITLE_WIDTH)
     figure.suptitle(f"{title}\n{headline('Prediction', maps)}", fontsize="medium", parse_math=False)
     axis = parts[1].subplots()
     axis.set_axis_off()
@@ -427,15 +552,15 @@ def _draw_report(
     powers_dbm: Floats,
     threshold_dbm: float,
     height_in: float,
+    partial: PartialMap | None,
 ) -> None:
     power = coverage.radio.power(eirp_dbm=powers_dbm)["power_mean_dbm"].to_numpy()
     strongest = np.nan_to_num(power, nan=-np.inf).argmax(axis=0)
     thresholds_db = np.clip(threshold_dbm - powers_dbm, GAIN_FLOOR_DB, 0.0)
-    above = np.max(
-        [probability_above(*pair) for pair in zip(maps.values(), thresholds_db.tolist(), strict=True)], axis=0
+    above = np.fmax.reduce(
+        [probability_above(*pair) for pair in zip(maps.values(), thresholds_db.tolist(), strict=True)]
     )
-    nearest = distance_transform_edt(np.isnan(above), return_distances=False, return_indices=True)
-    covered = above[tuple(nearest)]
+    outline = Outline(above, _LIKELY, f"P = {_LIKELY:g}", f"P(> {threshold_dbm:g} dBm) < {_LIKELY:g}")
     spread = _taken(coverage["gain_std_db"].to_numpy(), strongest)
     level, probability = Normalize(threshold_dbm - 30.0, threshold_dbm + 40.0), Normalize(0.0, 1.0)
     servers = Normalize(-0.5, len(maps) - 0.5), ListedColormap(server_colours(len(maps)))
@@ -449,13 +574,11 @@ def _draw_report(
         del panels[2]
     count, columns = _report_grid(len(panels), coverage.sizes["x"] / coverage.sizes["y"], height_in)
     axes = pictures.subplots(math.ceil(count / columns), columns, squeeze=False).ravel()
-    x_m, y_m = (coverage[name].to_numpy() for name in TX_COORDINATES[:2])
+    one = next(iter(maps.values()))
     for axis, layer in zip(axes[:count], panels, strict=False):
-        _draw(axis, next(iter(maps.values())), layer)
-        axis.contour(coverage["x"], coverage["y"], covered, levels=[_LIKELY], colors="black", linewidths=1.0)
-        axis.plot(x_m, y_m, zorder=4, **_STAR)
-        for place in zip(maps, zip(x_m, y_m, strict=True), strict=True):
-            axis.annotate(*place, (7, 0), textcoords="offset points", va="center", zorder=5, **_NAME)
+        _draw(axis, one, layer, halo_px=1)
+        handles = [*_draw_named_walls(axis, partial), *outline.draw(axis, one)]
+        _draw_names(axis, coverage)
         axis.set_title(layer.title, fontsize="medium")
         where = {"location": "right" if columns == 1 else "bottom", "shrink": 0.9}
         bar = pictures.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, label=layer.label, **where)
@@ -463,6 +586,8 @@ def _draw_report(
             bar.set_ticks(range(len(maps)), labels=[name[:_ROW_NAME] for name in maps])
     for axis in axes[count:]:
         axis.set_axis_off()
+    if handles:
+        pictures.legend(handles=handles, loc="outside lower center", ncols=4, frameon=False, fontsize="small")
 
 
 def _taken(values: Floats, index: NDArray[np.integer[Any]]) -> Floats:
@@ -487,13 +612,13 @@ def _report_table(
     return "\n".join(rows)
 
 
-def _report_notes(coverage: xr.Dataset) -> list[str]:
+def _report_notes(coverage: xr.Dataset, partial: PartialMap | None) -> list[str]:
     attributes = coverage.attrs
     notes = [
         f"Receivers are {attributes['rx_height_m']:g} m high and {attributes['spacing_m']:g} m apart. Axes are in m. "
         f"{attributes['map_observed_fraction']:.0%} of the map is observed. Predictor: {attributes['predictor']}. "
-        f"Lines enclose the area above the threshold with a probability of {_LIKELY:g}. Unobserved floor counts with "
-        "the probability that it is indoors."
+        f"The hatched side of a line is not above the threshold with a probability of {_LIKELY:g}. Unobserved floor "
+        "counts with the probability that it is indoors."
     ]
     std_db = coverage["gain_std_db"].to_numpy()
     observed = np.broadcast_to(coverage["observed"].to_numpy() == 1, std_db.shape) & np.isfinite(std_db)
@@ -513,11 +638,15 @@ def _report_notes(coverage: xr.Dataset) -> list[str]:
             "Rays were traced in the observed part; the rest is a distribution learned from other buildings. "
         )
         uncertainty += "An area counts where that distribution exceeds the power with the probability above."
+    fractions = {} if partial is None else partial.wall_fractions
+    named = [f"{material_name(each)} ({part:.0%} of the walls)" for each, part in fractions.items() if each]
     if "wall_material" in attributes:
-        walls = f"not known; probabilities: {attributes['wall_material']}. That is part of the deviation"
+        walls = f"{'others ' if named else ''}not known; probabilities: {attributes['wall_material']}. That is part of "
+        walls = ", ".join([*named, walls + "the deviation"])
     else:
         material = Material(**json.loads(attributes["scene_settings"])["material"])
-        walls = f"{material_name(material)}, except walls whose material the map has"
+        walls = ", ".join([*named, material_name(material) if None in fractions or not named else "no others"])
+        walls += "" if partial else ", except walls whose material the map has"
         walls += "; no path passes through walls" if attributes.get("walls") == "opaque walls" else ""
     return [*notes, uncertainty, f"Material of the walls: {walls}."]
 

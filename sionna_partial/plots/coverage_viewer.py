@@ -142,7 +142,7 @@ def radio_layers(servers: int) -> dict[str, Layer]:
     added: dict[str, tuple[str, Normalize, str | ListedColormap, str]] = {
         "power_mean_dbm": ("Mean received power", *level),
         "snr_mean_db": ("Mean SNR", *ratio),
-        "p_above": ("P(received power > threshold)", Normalize(0.0, 1.0), "cividis", "probability"),
+        "p_above": ("P(power > threshold)", Normalize(0.0, 1.0), "cividis", "probability"),
         "sinr_mean_db": ("Mean SINR of the strongest", *ratio),
         "best_server": ("Strongest transmitter", numbers, ListedColormap(server_colours(servers)), ""),
     }

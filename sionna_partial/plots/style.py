@@ -20,6 +20,7 @@ from sionna_partial.checks import float_array
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap, require_map
+from sionna_partial.settings import WALL_MATERIALS, Material, material_name
 
 YELLOW, RED, BLUE = "#ddaa33", "#bb5566", "#004488"
 """Paul Tol's high-contrast colours, for any colour vision and in grey."""
@@ -40,6 +41,13 @@ WALL, UNKNOWN = "black", "0.86"
 """Colours of cells; free ones are white."""
 
 _SERVERS = "tab20"
+
+_MATERIALS = ("#aa7744", "#cc3311", "#777777", "#444466", "#33bbee", "#0077bb", "#ee7733", "#ee3377", "#9933cc")
+_OTHER_MATERIAL = "#004488"
+"""Colours of `WALL_MATERIALS`, and of other materials."""
+
+FAILS = "#d4145a"
+"""Colour of the hatching where the threshold is not exceeded."""
 
 _POINTS = 72
 """Pixels of a notebook per inch."""
@@ -96,6 +104,19 @@ def server_colours(count: int) -> list[tuple[float, ...]]:
     """Return the colours of transmitters, which repeat beyond 20."""
     cmap = colormaps[_SERVERS]
     return [cmap(number % cmap.N) for number in range(count)]
+
+
+def material_colour(material: Material) -> str:
+    """Return the CSS colour of walls of a material."""
+    return dict(zip(WALL_MATERIALS, _MATERIALS, strict=True)).get(material_name(material), _OTHER_MATERIAL)
+
+
+def named_walls(partial: PartialMap) -> dict[Material, Bools]:
+    """Return the wall cells (ny, nx) of each material that the map names."""
+    if partial.wall_material is None:
+        return {}
+    cells = {each: partial.wall_material == number for number, each in enumerate(partial.wall_materials, 1)}
+    return {material: where for material, where in cells.items() if where.any()}
 
 
 def legend_below(

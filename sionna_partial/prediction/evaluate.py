@@ -60,7 +60,7 @@ class Network:
     def __init__(self, config: Options, weights: Iterable[Array]) -> None:
         self.name: str = config["name"]
         self._input, self._output = config["input_layers"], config["output_layers"]
-        self.layers: dict[str, Layer] = {}
+        self.layers: dict[str, Any] = {}
         self.options: dict[str, Options] = {}
         self._calls: dict[str, Options] = {}
         shapes: dict[str, Shape] = {}
@@ -178,7 +178,7 @@ def _read(dataset: Any, most: int) -> Array:
 
 def _taken(weights: Iterator[Array], *shape: int | None) -> Array:
     """Return the next weights, which must have this shape; None is any length."""
-    found: Array = np.asarray(next(weights, np.empty(0, np.float32)))
+    found: Array = np.asarray(next(weights, np.empty(0)), dtype=np.float32)
     wanted = [length if size is None else size for size, length in itertools.zip_longest(shape, found.shape)]
     if list(found.shape) != wanted:
         raise ValueError(f"weights of shape {found.shape} instead of {shape}")

@@ -244,6 +244,13 @@ def path_unobserved_m(
     return total_m
 
 
+def in_observed_space(
+    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
+) -> Bools:
+    """Return whether paths (P,) as in `path_unobserved_m` are in observed space."""
+    return path_unobserved_m(partial, start_m, interactions, vertices_m, end_m) < SEEN_M
+
+
 def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
     tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
     return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)

@@ -21,17 +21,29 @@ from scipy.spatial import cKDTree
 from sionna_partial.arrays import Bools, Floats, Indices, States, cross, span_in_strip
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import STRONG_NOISE, fit_runs, row_runs, wall_cells
+from sionna_partial.maps.wall_cells import (
+    CENTRED_NOISE,
+    canonical,
+    counted_near,
+    fit_runs,
+    noise_field,
+    row_runs,
+    wall_cells,
+)
 from sionna_partial.process import njit
 
 _KEY = 1 << 32
 _LOOK_EDGES = 6
 _THROUGH_COSINE = -0.85
-_REACH_CELLS = 1.0
-_NOISY_REACH_CELLS = 2.0
+_REACH_CELLS, _MORE_REACH_CELLS = 1.0, 1.0
 _LAYER_CELLS = 3
-_MIN_MIDDLES = 10
+_PRIOR_MIDDLES = 10
 _OFFSET_CELLS = 1.0
+_FACING = 2.0
+
+_WINDOW_M = 2.0
+"""Standard deviation of the windows for range noise and for the depth of walls [m]."""
+
 _MIN_SHIFT_CELLS = 0.25
 
 Points = Floats
@@ -106,24 +118,28 @@ def wall_outlines(partial: PartialMap, *, tolerance_cells: float = 0.5, bridge_g
     move with the map, unless it equals its mirror image.
 
     `tolerance_cells` is the largest distance from the lattice line through the cell centres; from 0.5 on, the
-    staircase of a tilted wall becomes one line. Thick, rough walls get up to twice as much, and again twice for
-    ragged faces (`fit_runs`). Strong range noise puts cells before and behind walls: lines are then in their middle.
+    staircase of a tilted wall becomes one line. Thick walls that are rough there get up to twice as much, and again
+    twice for ragged faces (`fit_runs`). Range noise puts cells before and behind walls: lines move to their middle as
+    the noise within a few metres grows.
     """
     margin = 1 + int(bridge_gap_m / partial.resolution_m + 1e-6)
     row, column = (np.nonzero((partial.state == CellState.WALL).any(axis=axis))[0] for axis in (1, 0))
     (bottom, top), (left, right) = ((used[0], used[-1]) if len(used) else (0, 0) for used in (row, column))
     padded = np.pad(partial.state, margin, constant_values=CellState.UNKNOWN)
-    state, transpose, flips = _canonical(padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1])
+    state, transpose, flips = canonical(padded[bottom : top + 2 * margin + 1, left : right + 2 * margin + 1])
 
     walls = wall_cells(state, partial.resolution_m, bridge_gap_m)
     graph = _wall_graph(walls.cells, cut_spurs=True)
     shift = _layer_shift(graph.points, walls.peeled)
-    chains = [_fitted(graph, shift, points, (1.0 + walls.roughness) * tolerance_cells) for points in _chains(graph)]
-    noisy = partial.wall_noise > STRONG_NOISE
-    if noisy:
-        _centre(chains, graph, state)
+    column, row = graph.points.T // 2
+    tolerances = (1.0 + walls.roughness[row, column]) * tolerance_cells
+    chains = [_fitted(graph, shift, points, tolerances[points]) for points in _chains(graph)]
+    noise = noise_field(state, partial.resolution_m, (_WINDOW_M, _WINDOW_M))[row, column]
+    noisy = np.interp(noise, CENTRED_NOISE, (0.0, 1.0))
+    if noisy.any():
+        _centre(chains, graph, state, noisy, _WINDOW_M / partial.resolution_m)
     while True:
-        lines, runs = _polylines(graph, chains, _NOISY_REACH_CELLS if noisy else _REACH_CELLS)
+        lines, runs = _polylines(graph, chains, _REACH_CELLS + _MORE_REACH_CELLS * noisy)
         if not _make_crossing_plain(lines, runs, chains):
             break
     outlines = _assembled(lines, 1.0)
@@ -148,21 +164,6 @@ def lattice_outlines(partial: PartialMap) -> Outlines:
         kept[[0, -1]] = True
         lines.append(points[kept] / 2.0)
     return _assembled(lines, partial.resolution_m)
-
-
-def _canonical(state: States) -> tuple[States, bool, tuple[bool, bool]]:
-    """Turn or mirror a grid to the orientation with the smallest bytes, so that outlines turn with the map.
-
-    Returns the grid, whether it was transposed, and whether columns and rows were then flipped.
-    """
-
-    def turned(transpose: bool, flip_y: bool, flip_x: bool) -> States:
-        grid = state.T if transpose else state
-        return np.ascontiguousarray(grid[:: -1 if flip_y else 1, :: -1 if flip_x else 1])
-
-    turns = itertools.product((False, True), repeat=3)
-    best = min(turns, key=lambda turn: (turned(*turn).shape, turned(*turn).tobytes()))
-    return turned(*best), best[0], (best[2], best[1])
 
 
 def _wall_graph(wall: Bools, *, cut_spurs: bool) -> _Graph:
@@ -278,10 +279,11 @@ def _layer_shift(points: NDArray[np.int64], peeled: Bools) -> Points:
     return beside @ towards / (1 + beside.sum(axis=1, keepdims=True))
 
 
-def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: float) -> _FittedChain:
+def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerances: Floats) -> _FittedChain:
+    """Fit straight runs to a chain with tolerances (n,)."""
     points = graph.points[chain] / 2.0
     corners = np.concatenate([[0], np.nonzero(_turns(points))[0] + 1, [len(points) - 1]])
-    starts, lines = fit_runs(points[corners], tolerance)
+    starts, lines = _fit_turned(points[corners], np.minimum(tolerances[corners[:-1]], tolerances[corners[1:]]))
     first = corners[starts]
     mean = np.add.reduceat(shift[chain], first) / np.diff(np.append(first, len(points)))[:, None]
     normal = np.stack([-lines[:, 3], lines[:, 2]], axis=1)
@@ -291,30 +293,53 @@ def _fitted(graph: _Graph, shift: Points, chain: NDArray[np.int64], tolerance: f
     return _FittedChain(chain, corners, first, lines, np.full(len(lines), is_square))
 
 
-def _centre(chains: list[_FittedChain], graph: _Graph, state: States) -> None:
-    """Move lines to the middle of noisy walls, on average over their points.
+def _fit_turned(points: Floats, tolerances: Floats) -> tuple[NDArray[np.int64], Floats]:
+    """Fit runs that turn and mirror with the polyline: in one of its turns, and on average of both directions."""
+    middle, forms = (points[0] + points[-1]) / 2.0, []
+    for swap, *signs in itertools.product((False, True), (1.0, -1.0), (1.0, -1.0)):
+        turned = (points - middle) * signs + 0.0  # no negative zeros
+        turned = np.ascontiguousarray(turned[:, ::-1] if swap else turned)
+        forms.append((min(turned.tobytes(), turned[::-1].tobytes()), swap, signs, turned))
+    _, swap, signs, turned = min(forms, key=lambda form: form[:1])
+    (starts, lines), (after, others) = fit_runs(turned, tolerances), fit_runs(turned[::-1], tolerances[::-1])
+    if len(after) == len(starts):
+        others = others[::-1]
+        along = np.sign((lines[:, 2:] * others[:, 2:]).sum(axis=1, keepdims=True))
+        lines = (lines + np.hstack([others[:, :2], along * others[:, 2:]])) / 2.0
+        lines[:, 2:] /= np.linalg.norm(lines[:, 2:], axis=1, keepdims=True)
+    ends = lines.reshape(-1, 2, 2)
+    ends = (ends[..., ::-1] if swap else ends) * signs
+    ends[:, 0] += middle
+    return starts, ends.reshape(-1, 4)
 
-    Lines with too few walls that are seen from one side move away from FREE cells as far as others do.
+
+def _centre(chains: list[_FittedChain], graph: _Graph, state: States, noisy: Floats, deviation: float) -> None:
+    """Move lines to the middle of `noisy` walls (V,), 0 to 1, on average over their points.
+
+    Where few points are of walls that are seen from one side, lines move away from FREE cells as far as others within
+    the `deviation` of a window [cells].
     """
     middle, (column, row) = _to_middle(graph.points, state), graph.points.T // 2
     free = (state == CellState.FREE).astype(np.float64)
     towards_free = np.stack([ndimage.prewitt(free, axis)[row, column] for axis in (1, 0)], axis=1)
-    moves, distances = [], [np.zeros(0)]
+    moves, (distances, counts) = [], np.zeros((2, *state.shape))
     for chain in chains:
         last = np.append(chain.first[1:], len(chain.points) - 1)
         for line, start, end, plain in zip(chain.lines, chain.first, last, chain.plain, strict=True):
             points, normal = chain.points[start : end + 1], np.array([-line[3], line[2]])
             axis = int(abs(normal[1]) > abs(normal[0]))
             offset = middle[points, axis] * normal[axis]
+            seen = points[np.isfinite(offset)]
             offset = offset[np.isfinite(offset)]
             if not plain:
-                moves.append((line, normal, offset, (towards_free[points] @ normal).mean()))
-                distances.append(np.abs(offset))
-    distance = np.concatenate(distances)
-    depth = float(distance.mean()) if len(distance) >= _MIN_MIDDLES else 0.0
-    for line, normal, offset, side in moves:
-        away = -np.sign(side) * depth if abs(side) > 1.0 else 0.0
-        line[:2] += (offset.mean() if len(offset) >= _MIN_MIDDLES else away) * normal
+                moves.append((line, normal, points, offset))
+                np.add.at(distances, (row[seen], column[seen]), np.abs(offset))
+                np.add.at(counts, (row[seen], column[seen]), 1.0)
+    depth = counted_near(distances, deviation) / (counted_near(counts, deviation) + _PRIOR_MIDDLES)
+    for line, normal, points, offset in moves:
+        away = -np.clip((towards_free[points] @ normal).mean() / _FACING, -1.0, 1.0) * depth[row, column][points].mean()
+        move = (offset.sum() + _PRIOR_MIDDLES * away) / (len(offset) + _PRIOR_MIDDLES)
+        line[:2] += noisy[points].mean() * move * normal
 
 
 def _to_middle(points: NDArray[np.int64], state: States) -> Points:
@@ -330,7 +355,7 @@ def _to_middle(points: NDArray[np.int64], state: States) -> Points:
     return np.asarray(middle[:, row, column].T)
 
 
-def _polylines(graph: _Graph, chains: list[_FittedChain], reach: float) -> tuple[list[Points], list[Indices]]:
+def _polylines(graph: _Graph, chains: list[_FittedChain], reach: Floats) -> tuple[list[Points], list[Indices]]:
     nodes = _placed_nodes(graph, chains)
     lines, runs = [], []
     for chain in chains:
@@ -348,7 +373,7 @@ def _polylines(graph: _Graph, chains: list[_FittedChain], reach: float) -> tuple
             elif plain[before[k]] or plain[after[k]]:
                 route.append(positions[k][None])
             else:
-                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k], reach))
+                route.append(_meeting(chain.lines[[before[k], after[k]]], positions[k], reach[chain.points[k]]))
             owner += [before[k]] * (len(route[-1]) - 1) + [after[k]]
         if chain.closed and not fixed[-1]:
             owner = owner[len(route[0]) - 1 :]

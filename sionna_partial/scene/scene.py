@@ -37,10 +37,6 @@ SIONNA_LOAD_GHZ = 3.5
 """Frequency at which Sionna RT evaluates materials while loading [GHz]."""
 
 
-VERTEX_STD_M = 0.02
-"""Standard deviation of the vertices of drawn walls, in x and in y [m]."""
-
-
 class _Walls(NamedTuple):
     """Outlines, and material index and height [m] of each segment (S,)."""
 
@@ -149,16 +145,13 @@ def material_is_unknown(partial: PartialMap, settings: SceneSettings) -> bool:
     return settings.material is None and bool(partial.unnamed_walls.any())
 
 
-def build_scene(partial: PartialMap, settings: SceneSettings | None = None, draw: int = 0) -> SceneGeometry:
-    """Convert a map to walls, floor and ceiling; `draw` >= 1 moves wall vertices at random."""
+def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> SceneGeometry:
+    """Convert a map to walls, floor and ceiling."""
     require_map("partial", partial)
     settings = scene_settings_of(partial, settings)
     walls = _walls(partial, settings)
-    vertices_m = walls.outlines.vertices_m
-    if draw:
-        vertices_m = vertices_m + VERTEX_STD_M * np.random.default_rng(draw).standard_normal(vertices_m.shape)
     return SceneGeometry(
-        vertices_m=vertices_m,
+        vertices_m=walls.outlines.vertices_m,
         segments=walls.outlines.segments,
         open_end=_open_ends(partial, walls.outlines),
         wall_material=walls.material,
@@ -252,7 +245,6 @@ def write_map(
     *,
     offset_m: Sequence[float],
     frequency_hz: float,
-    draw: int = 0,
 ) -> tuple[Path, SceneGeometry | SceneMesh]:
     """Write the scene of a map into an existing folder; return its `scene.xml` and its geometry.
 
@@ -265,7 +257,7 @@ def write_map(
             environment, folder, offset_m=offset_m, default_material=default, frequency_hz=frequency_hz
         )
         return path, environment
-    geometry = build_scene(partial, settings, draw)
+    geometry = build_scene(partial, settings)
     return write_scene(geometry, folder, offset_m=offset_m, frequency_hz=frequency_hz), geometry
 
 

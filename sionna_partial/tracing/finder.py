@@ -1,10 +1,11 @@
 """Scene files of a map, and finders of the paths in them."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,6 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
-from sionna_partial.display import part_of
 from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import narrow_areas
 from sionna_partial.maps.partial_map import PartialMap
@@ -29,7 +29,7 @@ from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, Diffraction
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
 from sionna_partial.tracing.power import ISOTROPIC, Gains, materials_of
-from sionna_partial.tracing.select import NO_POWER, Block, Kind, stages
+from sionna_partial.tracing.select import Block, Kind, stages
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 from sionna_partial.tracing.walls import Bodies, Cells, Interior, SolidMesh, closed_bodies
 
@@ -43,6 +43,12 @@ _DIRECTED, _ESTIMATED = (0.5, 0.5), (4.5, 0.5)
 """Factors of the tolerance for opaque walls and through walls: with a directive antenna, whose gain is bounded within
 one degree, and where paths get the power of others that are left out, for materials that the tolerance ignores, too."""
 
+Purpose = Literal["links", "powers"]
+"""Use of paths: as they are, or for powers alone, where paths get the expected power of others that are left out."""
+
+Counted = Callable[[SolvedPaths], Bools]
+"""Function that selects the paths whose power the tolerance refers to."""
+
 Kinds = tuple[list[Kind], list[Kind]]
 """Kinds of candidates between opaque walls, and through walls."""
 
@@ -51,7 +57,7 @@ Kinds = tuple[list[Kind], list[Kind]]
 class PlanScene:
     """An extruded floor plan on disk, with its shape names in face order.
 
-    `floor` (ny, nx) are the cells that have a floor; with `coarse`, fewer paths through walls are listed.
+    `floor` (ny, nx) are the cells that have a floor.
     """
 
     xml: Path
@@ -61,14 +67,14 @@ class PlanScene:
     wedges: Wedges
     partial: PartialMap
     floor: Bools
-    coarse: bool = False
 
     @cached_property
     def interior(self) -> Interior:
         free = self.partial.state == CellState.FREE
         return Interior.of(free, self.floor, self.partial.resolution_m, self.settings.wall_depth_m)
 
-    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
+    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains, *, coarse: bool) -> Kinds:
+        """Return the kinds of candidates; with `coarse`, fewer paths through walls are listed."""
         geometry, settings = self.geometry, self.settings
         room = Room.of(geometry, tx_m, rx_m, solver.material_of_face, gains)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
@@ -78,7 +84,7 @@ class PlanScene:
             opaque.append(DiffractionCandidates(geometry, self.wedges, room, settings.max_depth, materials, walls))
         if not settings.through_walls:
             return opaque, []
-        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials, coarse=self.coarse)
+        crossing = CrossingCandidates(geometry, room, self.interior, settings, materials, coarse=coarse)
         if not settings.diffraction:
             return opaque, [crossing]
         return opaque, [crossing, CrossedEdgeCandidates(geometry, self.wedges, crossing)]
@@ -94,18 +100,17 @@ class MeshScene:
     vertices_m: Floats
     triangles: NDArray[np.int64]
     cells: Cells
-    coarse: bool = False
 
-    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains) -> Kinds:
+    def kinds(self, solver: SceneSolver, tx_m: Floats, rx_m: Floats, gains: Gains, *, coarse: bool) -> Kinds:
         settings = self.settings
         rays = shoot_rays(solver.mi_scene, solver.shapes, tx_m, settings.samples_per_tx, settings.max_depth)
         materials = materials_of(solver.materials.values(), settings.frequency_hz)
         mesh = SolidMesh(*self.faces, self.cells, materials, solver.material_of_face)
-        opaque: list[Kind] = [MeshReflections(mesh, tx_m, rx_m, settings, rays, gains)]
+        opaque: list[Kind] = [MeshReflections.between_faces(mesh, tx_m, rx_m, settings, rays, gains)]
         if not settings.through_walls:
             return opaque, []
         count = min(SPLIT_RAYS, settings.samples_per_tx)
-        return opaque, [MeshReflections(mesh, tx_m, rx_m, settings, count, gains, coarse=self.coarse)]
+        return opaque, [MeshReflections.through_walls(mesh, tx_m, rx_m, settings, count, gains, coarse=coarse)]
 
     @cached_property
     def faces(self) -> tuple[FaceTree, MeshPlanes, Bodies]:
@@ -117,44 +122,55 @@ class MeshScene:
 
 @dataclass(frozen=True)
 class ExactFinder:
-    """Finder that verifies candidates.
-
-    If it `estimates`, paths get the expected power of those that are left out.
-    """
+    """Finder that verifies candidates. Its limits for powers are coarse if the material of walls is unknown."""
 
     written: PlanScene | MeshScene
     solver: SceneSolver
-    estimates: bool = False
+    material_unknown: bool = False
 
     def paths(
-        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        polarisations: int,
+        report: Progress,
+        antenna: Antenna | None = None,
+        *,
+        purpose: Purpose = "links",
+        counted: Counted | None = None,
     ) -> Iterator[Found]:
         """Find the paths between a transmitter (3,) and receivers (N, 3) in scene coordinates [m].
 
-        An antenna needs both polarisations; paths are left out that are weak with it.
+        An antenna needs both polarisations; paths are left out that are weak with it. The tolerance refers to the
+        power of the `counted` paths, by default of all.
         """
         if not len(rx_m):
             return
         solver, settings = self.solver.polarised(polarisations), self.written.settings
         gains = ISOTROPIC if antenna is None else antenna.largest_gains(settings.frequency_hz)
         directed = gains is not ISOTROPIC
-        estimates = self.estimates and not directed and settings.tolerance_db > 0.0
+        estimates = purpose == "powers" and not directed and settings.tolerance_db > 0.0
         factors = _DIRECTED if directed else _ESTIMATED if estimates else (1.0, 1.0)
         tolerances_db = factors[0] * settings.tolerance_db, factors[1] * settings.tolerance_db
-        power, left_out = np.zeros(len(rx_m)), np.zeros(len(rx_m))
-        kinds = self.written.kinds(solver, tx_m, rx_m, gains)
+        power, reference, left_out = np.zeros((3, len(rx_m)))
+        kinds = self.written.kinds(solver, tx_m, rx_m, gains, coarse=purpose == "powers" and self.material_unknown)
 
         def verified() -> Iterator[Found]:
-            for stage in stages(*kinds, power, tolerances_db, report):
+            for stage in stages(*kinds, reference, tolerances_db, report):
+                before = power.copy()
                 for blocks in stage.rounds:
                     for candidates, paths in _verified(solver, blocks, tx_m, rx_m, report):
                         indirect = ~paths.is_direct
                         strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
                         np.add.at(power, paths.path_rx[indirect], strength[indirect])
+                        indirect = indirect if counted is None else indirect & counted(paths)
+                        np.add.at(reference, paths.path_rx[indirect], strength[indirect])
                         yield candidates, paths
                 if estimates:
-                    more = stage.left_out(power)
-                    left_out[:], power[:] = left_out + more, power + more
+                    more = stage.left_out(power - before)
+                    left_out[:] += more
+                    reference[:] *= 1.0 + more / np.maximum(power, np.finfo(float).tiny)
+                    power[:] += more
 
         yield from (_completed([paths for _, paths in verified()], left_out) if estimates else verified())
 
@@ -166,8 +182,17 @@ class RayFinder:
         self._written, self._scene = written, open_scene(written.xml, written.settings.frequency_hz)
 
     def paths(
-        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        polarisations: int,
+        report: Progress,
+        antenna: Antenna | None = None,
+        *,
+        purpose: Purpose = "links",
+        counted: Counted | None = None,
     ) -> Iterator[Found]:
+        """Find paths as `ExactFinder.paths`, the same for all purposes and antennas."""
         settings = self._written.settings
         set_antennas(self._scene, polarisations)
         for number, paths in enumerate(stock_paths(self._scene, settings, tx_m, rx_m), start=1):
@@ -177,48 +202,15 @@ class RayFinder:
             yield None, paths
 
 
-@dataclass(frozen=True)
-class MeanFinder:
-    """Finder of paths between mapped and drawn walls; the power of a link is the mean over these geometries in dB.
-
-    A link in sight between the mapped walls has the paths of that geometry alone; others have no direct path. An
-    outage counts as -150 dB.
-    """
-
-    mapped: ExactFinder | RayFinder
-    drawn: list[ExactFinder | RayFinder]
-
-    def paths(
-        self, tx_m: Floats, rx_m: Floats, polarisations: int, report: Progress, antenna: Antenna | None = None
-    ) -> Iterator[Found]:
-        count = 1 + len(self.drawn)
-        found = list(self.mapped.paths(tx_m, rx_m, polarisations, part_of(report, 0.0, 1.0 / count), antenna))
-        in_sight, power = np.zeros(len(rx_m), dtype=bool), np.zeros((count, len(rx_m)))
-        for _, paths in found:
-            in_sight[paths.path_rx[paths.is_direct]] = True
-            np.add.at(power[0], paths.path_rx, paths.power)
-        hidden = np.flatnonzero(~in_sight).astype(np.int32)
-        for number, finder in enumerate(self.drawn, start=1):
-            part = part_of(report, number / count, (number + 1) / count)
-            for _, paths in finder.paths(tx_m, rx_m[hidden], polarisations, part, antenna):
-                indirect = paths.take(~paths.is_direct)
-                found.append((None, replace(indirect, path_rx=hidden[indirect.path_rx])))
-                np.add.at(power[number], found[-1][1].path_rx, indirect.power)
-        mean = np.exp(np.log(np.maximum(power, NO_POWER)).mean(axis=0))
-        amplitude = np.where(in_sight, 1.0, np.sqrt(mean / np.maximum(power.sum(axis=0), np.finfo(float).tiny)))
-        for _, paths in found:
-            yield None, _amplified(paths, amplitude[paths.path_rx])
-
-
 def write_scene_of(
-    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings, draw: int = 0
+    partial: PartialMap, folder: Path, settings: TraceSettings, scene_settings: SceneSettings
 ) -> PlanScene | MeshScene:
     """Write the scene of a map to a folder, with the origin at the map's lower-left corner.
 
-    `settings` come from `resolved_settings`; `draw` is as in `build_scene`.
+    `settings` come from `resolved_settings`.
     """
     offset_m, frequency_hz = partial.origin_m, settings.frequency_hz
-    xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz, draw=draw)
+    xml, geometry = write_map(partial, folder, scene_settings, offset_m=offset_m, frequency_hz=frequency_hz)
     if isinstance(geometry, SceneMesh):
         shapes = tuple(f"part{index}" for index in range(len(geometry.materials)))
         free = partial.state == CellState.FREE

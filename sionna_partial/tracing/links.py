@@ -4,16 +4,15 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, fields
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
-from sionna_partial.checks import require_choice
+from sionna_partial.checks import Progress, require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
 from sionna_partial.display import Shown, later
-from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 from sionna_partial.tracing.paths import SolvedPaths
@@ -80,14 +79,6 @@ class TracedLinks(Shown):
     trace_settings: TraceSettings
     scene_settings: SceneSettings
 
-    _partial: ClassVar[PartialMap | None] = None
-    """Map of links with the default tolerance, which channels do not have."""
-
-    def of_map(self, partial: PartialMap) -> TracedLinks:
-        """Remember the map, from which `channels` adds the paths that were left out."""
-        object.__setattr__(self, "_partial", partial)
-        return self
-
     @property
     def a(self) -> NDArray[np.complex128]:
         """Complex path gain (P,) between isotropic, vertically polarised antennas."""
@@ -103,6 +94,38 @@ class TracedLinks(Shown):
         """Index (P,) of the link of each path in the flattened `gain_db`."""
         return self.path_tx.astype(np.int64) * len(self.rx) + self.path_rx
 
+    def with_every_path(self, scene: Any, *, progress: Progress | bool | None = None) -> TracedLinks:
+        """Trace the links again with ``power_tolerance_db=0``: channels then contain the weakest paths, too.
+
+        Parameters
+        ----------
+        scene : PartialMap, path, Simulation or LinkModel
+            The map on which the links were traced.
+        progress : bool or callable, optional
+            As in `predict_map`.
+
+        Returns
+        -------
+        TracedLinks
+            These links themselves, if they were traced without a tolerance.
+
+        Raises
+        ------
+        MapError, PositionError, BackendError
+            As `trace_links`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> home = sp.make_home(3)
+        >>> links = sp.trace_links(home, (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> every = links.with_every_path(home)
+        >>> every.trace_settings.power_tolerance_db, len(every.a) > len(links.a)
+        (0.0, True)
+        """
+        found: TracedLinks = later("tracing.simulation:with_every_path")(self, scene, progress)
+        return found
+
     def cir(
         self,
         *,
@@ -116,10 +139,8 @@ class TracedLinks(Shown):
     ) -> xr.Dataset:
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
-        Channels have every path. Links traced with the default ``TraceSettings.power_tolerance_db`` lack weak paths:
-        for the first channel they are traced again without a tolerance. With ``power_tolerance_db=0.0``, links and
-        channels have the same paths. A tolerance that was set is kept, as is any tolerance of links that were read from
-        a folder or changed; it is the attribute `power_tolerance_db` of the result.
+        Channels have the paths of the links, which lack weak ones within ``TraceSettings.power_tolerance_db``, the
+        attribute `power_tolerance_db` of the result. `with_every_path`, or a trace with a tolerance of 0, has all.
 
         Parameters
         ----------

@@ -40,7 +40,10 @@ _ANGLES, _MARGIN = 1024, 1.01
 """Steps of the table of largest coefficients, and factor that enlarges them."""
 
 _CANCELLED, _ROUGH = 0.02, 0.05
-"""Fractions of the terms of a diffraction that single precision, and a rough bound, may leave where they cancel."""
+"""Error of a sum of diffraction terms, in single precision and in a rough bound, relative to the sum of magnitudes."""
+
+EXPECTED = 0.5
+"""Expected power of unlisted paths, relative to their rough bounds."""
 
 _STEPS, _ASYMPTOTIC = 128, 3.0
 """Entries of the table of the UTD transition function per unit, and the start of its asymptotic series."""
@@ -143,7 +146,7 @@ class Gains(NamedTuple):
 ISOTROPIC = Gains(np.ones((1, 1)), np.ones(1), 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def gain_towards(gains, x, y, z):
     if len(gains.table) == 1:
         return 1.0
@@ -151,14 +154,14 @@ def gain_towards(gains, x, y, z):
     return gains.table[int(zenith + 0.5), int(azimuth + 360.5) % 360]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def gain_at_azimuth(gains, x, y):
     if len(gains.by_azimuth) == 1:
         return 1.0
     return gains.by_azimuth[int(math.degrees(math.atan2(y, x)) + 360.5) % 360]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def gain_between(by_azimuth, first_deg, second_deg):
     """Return the largest gain between two azimuths, counterclockwise."""
     if len(by_azimuth) == 1:
@@ -204,21 +207,21 @@ def _transition_table() -> NDArray[np.complex128]:
     return math.sqrt(0.5 * math.pi) * table
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def reflected_power(largest, cosine):
     """Return the largest fraction of power reflected, for any material and polarisation."""
     at = min(int(abs(cosine) * _ANGLES), _ANGLES - 1)
     return max(largest[at, 0], largest[at, 1]) ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def power_near(table, material, cosine):
     at = min(int(cosine * COSINES + 0.5), COSINES)
     te, tm = table[material, at, 0], table[material, at, 1]
     return max(te.real**2 + te.imag**2, tm.real**2 + tm.imag**2)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _coefficients(table, material, cosine):
     at = cosine * COSINES
     low = min(int(at), COSINES - 1)
@@ -226,14 +229,34 @@ def _coefficients(table, material, cosine):
     return te + part * (table[material, low + 1, 0] - te), tm + part * (table[material, low + 1, 1] - tm)
 
 
-@njit(cache=True)
+class Field(NamedTuple):
+    """Bounds of a field at a path: its vertical and horizontal parts, and the vertical part that is never turned."""
+
+    vertical: float
+    horizontal: float
+    pure: float
+
+
+VERTICAL = Field(1.0, 0.0, 1.0)
+
+
+@njit(cache=True, borrows=True)
 def most_at_wall(largest, material, cosine):
     return largest[material, min(int(abs(cosine) * _ANGLES), _ANGLES - 1), 3]
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
+def _mixed(field, kept, mixed, other):
+    vertical, horizontal = (
+        kept * field.vertical + mixed * field.horizontal,
+        mixed * field.vertical + other * field.horizontal,
+    )
+    return Field(vertical, horizontal, kept * field.pure)
+
+
+@njit(cache=True, borrows=True)
 def at_wall(largest, material, cosine, sine, slope, field):
-    """Return bounds of a reflected field: vertical, horizontal, and the part that is never turned.
+    """Return the bounds of a reflected field.
 
     `cosine` is for incidence seen from above; `sine` and `slope` are the horizontal and vertical part of the direction.
     """
@@ -242,11 +265,10 @@ def at_wall(largest, material, cosine, sine, slope, field):
     te, tm, both = largest[material, at, 0], largest[material, at, 1], largest[material, at, 2]
     part = _te_part(1.0 - cosine * cosine, sine, slope)
     kept, mixed, other = te * part + tm * (1.0 - part), both * math.sqrt(part * (1.0 - part)), te + (tm - te) * part
-    vertical, horizontal, pure = field
-    return kept * vertical + mixed * horizontal, mixed * vertical + other * horizontal, kept * pure
+    return _mixed(field, kept, mixed, other)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
     """Return bounds of a diffracted field as `at_wall` does, without the spread of the wave.
 
@@ -259,12 +281,11 @@ def at_edge(tables, material, terms, boundary, cosines, sine, slope, field):
     own_0, mixed_0, other_0 = at_face(faces, material, cosine_0, sine, slope)
     own_n, mixed_n, other_n = at_face(faces, material, cosine_n, sine, slope)
     kept = _size(own_0 * by_0 + own_n * by_n) + _CANCELLED * (_size(own_0) * size_0 + _size(own_n) * size_n)
-    vertical, horizontal, pure = field
     mixed, other = mixed_0 * size_0 + mixed_n * size_n, other_0 * size_0 + other_n * size_n
-    return kept * vertical + mixed * horizontal, mixed * vertical + other * horizontal, kept * pure
+    return _mixed(field, kept, mixed, other)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def most_at_edge(terms, boundary, face_0, face_n):
     """Return a rough bound of a field diffracted in the plan, from the coefficients of both faces as of `at_face`."""
     by_0, near_0, sum_0 = _rough_terms(terms, 0, 3, boundary)
@@ -274,7 +295,7 @@ def most_at_edge(terms, boundary, face_0, face_n):
     return _size(face_0 * by_0 + face_n * by_n) + _ROUGH * (_size(face_0) * sum_0 + _size(face_n) * sum_n)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _rough_terms(terms, k, other, boundary):
     """Return the difference of two terms without phases, whether a shadow boundary is near, and their sum."""
     first, second = terms[k, 0], terms[other, 0]
@@ -285,16 +306,15 @@ def _rough_terms(terms, k, other, boundary):
     return abs(first) * min(1.0, 2.0 * here) + abs(second) * min(1.0, 2.0 * there), True, size
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def at_flats(largest, material, slope, bounces, field):
     """Return a bound of a vertical field after reflections off floor and ceiling."""
     at = min(int(slope * _ANGLES), _ANGLES - 1)
     te, tm = largest[material, at, 0], largest[material, at, 1]
-    vertical, _, pure = field
-    return tm**bounces * pure + max(te, tm) ** bounces * (vertical - pure)
+    return tm**bounces * field.pure + max(te, tm) ** bounces * (field.vertical - field.pure)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _te_part(along, sine, slope):
     """Return the TE fraction of a vertical field's power at a wall.
 
@@ -303,7 +323,7 @@ def _te_part(along, sine, slope):
     return min(along / (slope * slope + sine * sine * along), 1.0) if slope * slope > 1e-12 else 1.0
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def at_face(faces, material, cosine, sine, slope):
     """Return the coefficient of a vertical field at a face of a wedge, and magnitudes of the others.
 
@@ -319,13 +339,13 @@ def at_face(faces, material, cosine, sine, slope):
     return part * te - (1.0 - part) * tm, mixed, (1.0 - part) * _size(te) + part * _size(tm)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _size(number):
     """Return the magnitude of a complex number; `abs` guards against overflow and is slower."""
     return math.sqrt(number.real * number.real + number.imag * number.imag)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def wedge_angle(angle, exterior):
     """Return sine and cosine of an angle / 2 n, and of half of it; n is the exterior angle / pi."""
     scaled = angle * 0.5 * math.pi / exterior
@@ -339,7 +359,7 @@ def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(parts, axis=1)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def utd_terms(wedge, arrival, departure, terms):
     """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
 
@@ -360,7 +380,7 @@ def utd_terms(wedge, arrival, departure, terms):
         terms[k, 0], terms[k, 1], terms[k, 2] = cotangent, y, 1.0 / (y * y)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def utd_term(transition, terms, k, boundary):
     y = boundary * terms[k, 1]
     if y < _ASYMPTOTIC:
@@ -370,21 +390,21 @@ def utd_term(transition, terms, k, boundary):
     return complex(terms[k, 0] * (1.0 - 0.75 * x * x), terms[k, 0] * x * (0.5 - 1.875 * x * x))
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def vertical_field(k):
     """Return the unit vector along theta of spherical coordinates."""
     flat = max(np.hypot(k[0], k[1]), 1e-12)
     return complex(k[0] * k[2] / flat), complex(k[1] * k[2] / flat), complex(-flat)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def received_power(k, e):
     vertical = vertical_field(k)
     field = e[0] * vertical[0] + e[1] * vertical[1] + e[2] * vertical[2]
     return field.real**2 + field.imag**2
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def at_slab(k, e, n, materials, material, kind):
     """Return direction and field after a reflection at a slab with unit normal `n`, or a refraction."""
     along = k[0] * n[0] + k[1] * n[1] + k[2] * n[2]

@@ -87,7 +87,7 @@ class Block(NamedTuple):
 class Stage(NamedTuple):
     """Candidates to verify, round after round.
 
-    `left_out` returns the expected power (N,) of the others by the power (N,) found.
+    `left_out` returns the expected power (N,) of the others by the power (N,) that this stage has found.
     """
 
     rounds: Iterable[Iterator[Block]]
@@ -105,7 +105,7 @@ class Selection:
     power: Floats
 
     def __post_init__(self) -> None:
-        self.end, self._before = np.zeros(len(self.power), np.int64), np.zeros(len(self.power))
+        self.end = np.zeros(len(self.power), np.int64)
 
     @classmethod
     def of(cls, kinds: Sequence[Kind], found: Floats, tolerance_db: float, report: Progress) -> "Selection":
@@ -130,7 +130,7 @@ class Selection:
 
     def rounds(self, found: Floats, tolerance_db: float, span: tuple[float, float]) -> Iterator[Iterator[Block]]:
         """Select candidates as if paths were as strong as their bounds, then more if `found` (N,) is less by then."""
-        self._before, middle = found.copy(), span[0] + 0.85 * (span[1] - span[0])
+        middle = span[0] + 0.85 * (span[1] - span[0])
         for expected, *part in ((expected_power(self.power), span[0], middle), (0.0, middle, span[1])):
             first, self.end = self.end, np.maximum(self.end, self.needed(found + expected, tolerance_db))
             yield self._blocks(first, *part)
@@ -140,7 +140,7 @@ class Selection:
         """Expect the ratio of power and bounds of the selected candidates for the others, too."""
         total, weaker = self.power[:, 1:].sum(axis=1), np.arange(LEVELS) >= self.end[:, None]
         rest = np.where(weaker, self.power, 0.0).sum(axis=1)
-        ratio = (found - self._before) / np.maximum(total - rest, np.finfo(float).tiny)
+        ratio = found / np.maximum(total - rest, np.finfo(float).tiny)
         return np.asarray(np.where(total > rest, np.clip(ratio, 0.0, 1.0), _FOUND) * rest)
 
     def _blocks(self, first: NDArray[np.int64], low: float, high: float) -> Iterator[Block]:
@@ -176,7 +176,7 @@ def stages(
 ) -> Iterator[Stage]:
     """Yield candidates of opaque walls, then of paths through walls, kind after kind, with a tolerance of each.
 
-    The caller adds the power of indirect paths to `found` (N,) as it verifies candidates.
+    The caller adds the power of the indirect paths that the tolerance refers to, to `found` (N,), as it verifies them.
     """
     low, share = (0.6, 0.4 / len(through_walls)) if through_walls else (1.0, 0.0)
     ends = [0.0, *(low + share * number for number in range(len(through_walls) + 1))]
@@ -228,7 +228,7 @@ class Limits(NamedTuple):
         return self.weakest * np.maximum(found, NO_POWER)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def discount_after(limits, reflections):
     return limits.discount ** max(0, reflections - _USUAL_REFLECTIONS)
 
@@ -253,7 +253,7 @@ def needs_by_distance(tx_m: Floats, rx_m: Floats, power: Floats, wavelength_m: f
     return NeedsByDistance(distance_m, relative, np.minimum.accumulate(power))
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def matters(fraction, near, needed):
     """Return whether a ray, at least `near` long, may matter to any receiver with a fraction of its power left."""
     at = np.searchsorted(needed.distance_m, near)

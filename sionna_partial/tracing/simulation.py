@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cached_property
@@ -25,28 +25,25 @@ from sionna_partial.checks import (
     settings_or_default,
     transmitter_names,
 )
-from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S
+from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, position_array
-from sionna_partial.maps.wall_cells import STRONG_NOISE
 from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
-from sionna_partial.tracing.finder import ExactFinder, Found, MeanFinder, RayFinder, write_scene_of
+from sionna_partial.tracing.finder import Counted, ExactFinder, Found, Purpose, RayFinder, write_scene_of
 from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
 from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
 from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
 
-GEOMETRIES = 3
-"""Default of `SceneSettings.geometries` on nearly complete maps with strong range noise."""
-
-DRAWN_TOLERANCE_DB = 0.5
-"""Tolerance of powers between drawn walls [dB]."""
+Observed = Callable[[Floats, NDArray[np.uint8], Floats, Floats], Bools]
+"""Function that returns which paths (P,) are in observed space: from points (P, 3) by interactions (P, D) at vertices
+(P, D, 3) to points (P, 3) [m]."""
 
 InvalidLinks = Literal["raise", "nan"]
 
@@ -67,6 +64,15 @@ class ResolvedSettings(NamedTuple):
 
     trace_settings: TraceSettings
     scene_settings: SceneSettings
+
+
+class Request(NamedTuple):
+    """Paths that are wanted: with 1 or 2 polarisations, for an antenna and purpose as in `ExactFinder.paths`."""
+
+    polarisations: int = 1
+    antenna: Antenna | None = None
+    purpose: Purpose = "links"
+    observed: Observed | None = None
 
 
 class Simulation:
@@ -169,9 +175,7 @@ class Simulation:
             if folder is None:
                 columns = PathColumns(*room)
                 ends |= self._fill(columns, tx_m, rx_m, valid, part, polarisations)
-                links = TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
-                return links if self.trace_settings.power_tolerance_db is not None else links.of_map(self.partial)
-            settings["scene_settings"] = replace(self.resolved.scene_settings, geometries=1)
+                return TracedLinks(**_shaped(ends), **vars(columns.paths()), **settings)
             with atomic_files(folder) as files:
                 paths = PathFiles(room[0], files, polarisations)
                 ends |= self._fill(paths, tx_m, rx_m, valid, part, polarisations)
@@ -202,17 +206,20 @@ class Simulation:
         return found
 
     def blocks(
-        self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
+        self,
+        tx_m: Floats,
+        rx_m: Floats,
+        report: Progress,
+        antenna: Antenna | None = None,
+        observed: Observed | None = None,
     ) -> Iterator[SolvedPaths]:
-        """Find the paths from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
+        """Find the paths for powers from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
 
-        `antenna` is as in `ExactFinder.paths`. Sums of powers are within the tolerance; weak paths are left out, and
-        others amplified by their expected power. Limits are coarse where the material of walls is unknown.
+        `antenna` is as in `ExactFinder.paths`. The power of a link is within the tolerance, and with `observed` its
+        power through observed space: weak paths are left out, and others amplified by their expected power.
         """
-        polarisations = 1 if antenna is None else 2
-        every = [np.arange(len(rx_m))]
-        finder = self._predicting_finder
-        for group in self._groups(tx_m[None], rx_m, every, report, polarisations, antenna, finder=finder):
+        every, request = [np.arange(len(rx_m))], Request(1 if antenna is None else 2, antenna, "powers", observed)
+        for group in self._groups(tx_m[None], rx_m, every, report, request):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
 
@@ -222,7 +229,7 @@ class Simulation:
         """Find the paths of `paths` in blocks, for checked positions; `rx_of_tx` selects receivers by transmitter."""
         sources_m = tx_m.reshape(-1, 3)
         chosen = [np.arange(len(rx_m))] * len(sources_m) if rx_of_tx is None else rx_of_tx
-        for group in self._groups(sources_m, rx_m, chosen, report):
+        for group in self._groups(sources_m, rx_m, chosen, report, Request()):
             for candidates, paths in group:
                 if candidates is not None:
                     yield PathSet(self, tx_m, rx_m, [(replace(candidates, rx=paths.path_rx), paths)])
@@ -278,56 +285,22 @@ class Simulation:
     @cached_property
     def _finder(self) -> ExactFinder | RayFinder:
         """Load the finder of paths; log a warning where only rays find them."""
-        return self._finder_of(0)
-
-    @cached_property
-    def _mean_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        draws = range(1, self.resolved.scene_settings.geometries or 1)
-        return MeanFinder(self._finder, [*map(self._finder_of, draws)]) if draws else self._finder
-
-    @cached_property
-    def _predicting_finder(self) -> ExactFinder | RayFinder | MeanFinder:
-        """Finder for predictions, which need every path only on maps where weak paths in observed space matter."""
-        estimates = self.partial.is_complete or self.partial.is_nearly_complete
-
-        def predicting(finder: ExactFinder | RayFinder) -> ExactFinder | RayFinder:
-            if not isinstance(finder, ExactFinder):
-                return finder
-            coarse = replace(finder.written, coarse=True) if self.material_unknown else finder.written
-            return replace(finder, written=coarse, estimates=estimates)
-
-        finder = self._mean_finder
-        if not isinstance(finder, MeanFinder):
-            return predicting(finder)
-        return MeanFinder(predicting(finder.mapped), [*map(predicting, finder.drawn)])
-
-    def _finder_of(self, draw: int) -> ExactFinder | RayFinder:
         if self._only_by_rays:
             names = [f"{kind.setting} on a mesh" if kind.exact_on else kind.setting for kind in self._only_by_rays]
             message = "%s: Sionna RT shoots %d rays for one receiver after the other, and finds most paths, not all"
             _log.warning(message, " and ".join(names).replace("_", " "), self.trace_settings.samples_per_tx)
         with temporary_folder() as folder:
             settings, scene_settings = self.resolved
-            if draw:
-                settings = replace(settings, power_tolerance_db=DRAWN_TOLERANCE_DB)
-            scene = write_scene_of(self.partial, folder, settings, scene_settings, draw)
+            scene = write_scene_of(self.partial, folder, settings, scene_settings)
             if self._only_by_rays or engine_fault():
                 return RayFinder(scene)
             materials = self.partial.environment.scene_materials(scene_settings.traced_material)
-            return ExactFinder(scene, SceneSolver(scene.xml, scene.shapes, settings, materials))
+            solver = SceneSolver(scene.xml, scene.shapes, settings, materials)
+            return ExactFinder(scene, solver, self.material_unknown)
 
     def _groups(
-        self,
-        tx_m: Floats,
-        rx_m: Floats,
-        rx_of_tx: Iterable[Indices],
-        report: Progress,
-        polarisations: int = 1,
-        antenna: Antenna | None = None,
-        *,
-        finder: ExactFinder | RayFinder | MeanFinder | None = None,
+        self, tx_m: Floats, rx_m: Floats, rx_of_tx: Iterable[Indices], report: Progress, request: Request
     ) -> Iterator[Iterator[Found]]:
-        finder = finder or self._finder
         at_once = self.partial.environment.receivers_at_once
         groups = [
             (tx, chosen[start : start + at_once].astype(np.int32))
@@ -336,8 +309,32 @@ class Simulation:
         ]
         for number, (tx, chosen) in enumerate(groups):
             part = part_of(report, number / len(groups), (number + 1) / len(groups))
-            ends = self.in_scene(tx_m[tx]), self.in_scene(rx_m[chosen])
-            yield self._in_world(tx, chosen, finder.paths(*ends, polarisations, part, antenna))
+            counted = self._counted(tx_m[tx], rx_m[chosen], request.observed)
+            found = self._finder.paths(
+                self.in_scene(tx_m[tx]),
+                self.in_scene(rx_m[chosen]),
+                request.polarisations,
+                part,
+                request.antenna,
+                purpose=request.purpose,
+                counted=counted,
+            )
+            yield self._in_world(tx, chosen, found)
+
+    def _counted(self, tx_m: Floats, rx_m: Floats, observed: Observed | None) -> Counted | None:
+        """Count the paths in observed space where both ends are observed, elsewhere all paths."""
+        if observed is None or self.partial.state_at(tx_m) == CellState.UNKNOWN:
+            return None
+        rx_seen = self.partial.state_at(rx_m) != CellState.UNKNOWN
+
+        def counted(paths: SolvedPaths) -> Bools:
+            rows, rx = np.flatnonzero(rx_seen[paths.path_rx]), paths.path_rx
+            vertices_m, start_m = self.in_world(paths.vertices_m[rows]), np.broadcast_to(tx_m, (len(rows), 3))
+            mask = np.ones(len(rx), dtype=bool)
+            mask[rows] = observed(start_m, paths.interactions[rows], vertices_m, rx_m[rx[rows]])
+            return mask
+
+        return counted
 
     def _in_world(self, tx: int, chosen: NDArray[np.int32], found: Iterator[Found]) -> Iterator[Found]:
         for candidates, paths in found:
@@ -356,8 +353,7 @@ class Simulation:
     ) -> dict[str, Any]:
         sums = LinkSums(*valid.shape)
         rx_of_tx = map(np.flatnonzero, valid)
-        finder = self._mean_finder if isinstance(columns, PathColumns) else self._finder
-        for group in self._groups(tx_m, rx_m, rx_of_tx, report, polarisations, finder=finder):
+        for group in self._groups(tx_m, rx_m, rx_of_tx, report, Request(polarisations)):
             parts = [paths for _, paths in group]
             columns.append(parts)
             for paths in parts:
@@ -376,7 +372,7 @@ class Simulation:
         all_m = rx_m[valid[source]]
         some = all_m[np.linspace(0, len(all_m) - 1, min(len(all_m), SAMPLE)).astype(int)]
         every = [np.arange(len(some))]
-        groups = self._groups(tx_m[source][None], some, every, no_progress, finder=self._mean_finder)
+        groups = self._groups(tx_m[source][None], some, every, no_progress, Request())
         found = sum(len(paths.a) for group in groups for _, paths in group)
         count = round(found / len(some) * valid.sum())
         size_gb = 2 * count * bytes_each / 1e9
@@ -486,6 +482,17 @@ def trace_links(
     return simulation.links(tx, rx, folder=folder, memory_gb=memory_gb, invalid=invalid, progress=progress)
 
 
+def with_every_path(
+    links: TracedLinks, scene: PartialMap | str | Path | Simulation | Simulated, progress: Progress | bool | None
+) -> TracedLinks:
+    """Trace links again on their map, as `TracedLinks.with_every_path`."""
+    if links.trace_settings.power_tolerance_db == 0.0:
+        return links
+    settings = replace(links.trace_settings, power_tolerance_db=0.0)
+    every = Simulation(simulation_of(scene).partial, settings, links.scene_settings)
+    return every.links(links.tx, links.rx, invalid="nan", progress=progress)
+
+
 def resolved_settings(
     partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings
 ) -> ResolvedSettings:
@@ -493,18 +500,7 @@ def resolved_settings(
     scene_settings = scene_settings_of(partial, scene_settings)
     for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
-    scene_settings = replace(scene_settings, geometries=_geometries(partial, trace_settings, scene_settings))
     return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
-
-
-def _geometries(partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings) -> int:
-    if not partial.environment.is_extruded or trace_settings.power_tolerance_db is not None:
-        return 1
-    if scene_settings.geometries is not None:
-        return scene_settings.geometries
-    if trace_settings.through_walls or partial.is_complete or not partial.is_nearly_complete:
-        return 1
-    return 1 if partial.wall_noise <= STRONG_NOISE else GEOMETRIES
 
 
 def nearest_m(frequency_hz: float) -> float:

@@ -43,6 +43,9 @@ LEVEL_M, LEVEL_FRACTION = 0.1, 0.3
 """Height of a level in which flat surfaces are counted [m]; least fraction of the largest level for floor or
 ceiling."""
 
+UPRIGHT_NORMAL = 0.2
+"""Largest vertical part of the normal of a wall."""
+
 RIM_M = 0.3
 """Largest width of free rims between walls and unknown cells, which become unknown [m]."""
 
@@ -103,7 +106,7 @@ def mesh_map(mesh: SceneMesh, reading: MeshReading, *, is_metric: bool = False) 
         known = observed_cells(empty, reading.observed)
     else:
         known = _cells_with_surfaces(mesh, empty, (-math.inf, math.inf), upper=True)
-        known |= _without_floor(known, upper, empty)
+        known |= _without_floor(known, upper, empty) if _is_upright(mesh) else False
     lower = _cells_with_surfaces(mesh, empty, band_m, upper=False)
     lost = np.pad(upper & ~known, ((0, 1), (0, 1)))
     state = np.where(known, CellState.FREE, CellState.UNKNOWN).astype(np.uint8)
@@ -239,14 +242,21 @@ def observed_cells(empty: PartialMap, observed: ArrayLike | PartialMap) -> Bools
     return cells
 
 
+def _is_upright(mesh: SceneMesh) -> bool:
+    """Return whether most surfaces are walls."""
+    corners = mesh.corners_m
+    doubled = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(doubled, axis=1)
+    return bool(size[np.abs(doubled[:, 2]) < UPRIGHT_NORMAL * size].sum() > size.sum() / 2)
+
+
 def _without_floor(known: Bools, wall: Bools, empty: PartialMap) -> Bools:
     """Return the extent of walls (ny, nx) with hardly any floor or ceiling, with a warning; else no cells."""
     state = states_of_lines(np.zeros((0, 2, 2)), empty, wall)
     inside, apart = state == CellState.FREE, ~ndimage.binary_dilation(wall, np.ones((3, 3)))
     if not (inside & apart).any():
-        row, column = np.nonzero(wall)
-        inside[row.min(initial=0) : row.max(initial=-1) + 1, column.min(initial=0) : column.max(initial=-1) + 1] = True
-        inside &= ~wall
+        for extent in ndimage.find_objects(wall.astype(np.uint8)):
+            inside[extent] = ~wall[extent]
     solid = state == CellState.WALL
     if not (inside & apart).any() or (known & inside).sum() >= ENCLOSED_FRACTION * min(inside.sum(), solid.sum()):
         return np.zeros_like(known)

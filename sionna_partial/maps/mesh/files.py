@@ -25,7 +25,7 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, lies_in, read_bytes
-from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
+from sionna_partial.maps.environment import MAX_COORDINATE_M, MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.import_report import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.upright import TURNS, levelling, looks_y_up, mesh_ends, surfaces_of, warn_of_axis
 from sionna_partial.settings import Material
@@ -76,13 +76,15 @@ def read_mesh(path: Path, up: str | None = None, notes: ImportNotes | None = Non
     vertices, triangles = _read_triangles(path, kind, notes)
     usual = "y" if kind in Y_UP_KINDS else "z"
     axis, what = up or usual, f"path = '{path}'"
-    if len(triangles) and np.isfinite(vertices[triangles]).all():
-        if up is None:
-            why = ", against the specification of glTF" if usual == "y" else ""
-            warn_of_axis(what, _axis_up(vertices * notes.unit_m, triangles, usual), axis, why)
-        vertices = vertices @ TURNS[axis].T
-        turn = levelling(what, surfaces_of(vertices[triangles] * notes.unit_m), notes)
-        middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    is_valid = bool((np.abs(vertices[triangles]) <= MAX_COORDINATE_M).all())  # others are refused below
+    if up is None and is_valid:
+        why = ", against the specification of glTF" if usual == "y" else ""
+        warn_of_axis(what, _axis_up(vertices * notes.unit_m, triangles, usual), axis, why)
+    vertices = vertices @ TURNS[axis].T
+    if is_valid:
+        corners = vertices[triangles]
+        turn = levelling(what, surfaces_of(corners * notes.unit_m), notes)
+        middle = (corners.min(axis=(0, 1), initial=np.inf) + corners.max(axis=(0, 1), initial=-np.inf)) / 2
         vertices = (vertices - middle) @ turn.T + middle if turn[2, 2] < 1.0 else vertices
     reason = "up" if up else "the specification of glTF" if axis == "y" else "the default"
     notes.notes.append(f"{axis} of the file points up ({reason})")

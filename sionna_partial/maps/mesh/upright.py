@@ -151,10 +151,10 @@ def direction_up(surfaces: Surfaces) -> Floats:
         angle <= math.radians(SEARCHED_DEG)
     ]
     scores = np.zeros(len(tried))
-    for start in range(0, len(area), 10_000):
-        along = (normal[start : start + 10_000] @ tried.T) ** 2
+    for start in range(0, len(area), 2_000):
+        along = (normal[start : start + 2_000] @ tried.T) ** 2
         fits = np.exp(-(1.0 - along) / (2 * step**2)) + np.exp(-along / (2 * step**2))
-        scores += area[start : start + 10_000] @ fits
+        scores += area[start : start + 2_000] @ fits
     up = tried[np.argmax(scores > (1.0 - 1e-9) * scores.max())]
     for cone_deg in CONES_DEG:
         flat, steep = _fitting(normal, up, cone_deg)
@@ -191,6 +191,8 @@ def _plateaus_m2(corners_m: Floats) -> float:
         return 0.0
     bounds_m = np.stack([corners_m.min(axis=(0, 1)), corners_m.max(axis=(0, 1))])
     cell_m = max(PLATEAU_CELL_M, float(np.ptp(bounds_m[:, :2], axis=0).max()) / 2000)
+    if cell_m > PLATEAU_M:
+        return 0.0
     empty = fitted_grid(bounds_m, cell_m)
     polygons = np.zeros((len(corners_m), 5, 2))
     polygons[:, :3] = (corners_m[..., :2] - empty.origin_m) / cell_m

@@ -98,13 +98,12 @@ class Met(NamedTuple):
     at: Floats
     stack: NDArray[np.int64]
 
+    @classmethod
+    def empty(cls) -> "Met":
+        return cls(np.empty(MOST_FACES, np.int64), np.empty(MOST_FACES), np.empty(128, np.int64))
 
-@njit(cache=True)
-def scratch():
-    return Met(np.empty(MOST_FACES, np.int64), np.empty(MOST_FACES), np.empty(128, np.int64))
 
-
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def faces_between(tree, a, b, own, other, met):
     """Write the faces between two points, one for each plane except `own` and `other`; return their number."""
     dx, dy, dz = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -133,7 +132,7 @@ def faces_between(tree, a, b, own, other, met):
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _meets(corner, a, dx, dy, dz):
     """Return the fraction of a line at which it meets a triangle, or -1 (Moeller and Trumbore 1997)."""
     ux, uy, uz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
@@ -153,7 +152,7 @@ def _meets(corner, a, dx, dy, dz):
     return (vx * qx + vy * qy + vz * qz) / area
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _insert(face, t, plane, own, other, met, count):
     p = plane[face]
     if p in (own, other) or count == MOST_FACES:
@@ -228,7 +227,7 @@ def group_planes(vertices_m: NDArray[np.float64], triangles: NDArray[np.int64]) 
     return MeshPlanes(plane, normal, offset_m, 0.5 * (low + high), radius_m, bins)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def mix(a, b):
     h = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) ^ np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F)
     h ^= h >> np.uint64(29)
@@ -272,7 +271,7 @@ def _plane_ids(order, normal, offset, corner):
     return plane, first[:count].copy()
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _in_plane(first, f, normal, offset, corner):
     nx, ny, nz = normal[first]
     sign = 1.0 if nx * normal[f, 0] + ny * normal[f, 1] + nz * normal[f, 2] > 0.0 else -1.0
@@ -313,7 +312,7 @@ def _fill_bins(plane, corner, low, edge, columns, first_bin):
     return start, items
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def face_at(bins, p, x, y, z):
     axes, low, edge, columns, first_bin, start, face, corner = bins
     u, v = axes[p, 0], axes[p, 1]
@@ -330,7 +329,7 @@ def face_at(bins, p, x, y, z):
     return -1
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _inside(corner, f, x, y):
     px, py, qx, qy = corner[f, 1, 0], corner[f, 1, 1], corner[f, 2, 0], corner[f, 2, 1]
     turn = (px - corner[f, 0, 0]) * (qy - corner[f, 0, 1]) - (py - corner[f, 0, 1]) * (qx - corner[f, 0, 0])

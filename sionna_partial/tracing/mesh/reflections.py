@@ -4,7 +4,6 @@ A path is a straight line from an image of the transmitter, reflected in the pla
 sequences and, seen from the image, directions and reach of the last leg. A receiver in or near them is a candidate if
 the line to it, folded back, meets a face of each plane. Between opaque faces, Sionna RT finds the faces in the way;
 through walls, every leg is cast through the mesh, and its faces are grouped to walls, which gives the power.
-`unfold` of `plan/reflections.py` shares one line only.
 """
 
 import itertools
@@ -21,7 +20,8 @@ from sionna_partial.process import in_order, njit
 from sionna_partial.scene.outlines import grow
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION
-from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, divide, face_at, faces_between, scratch
+from sionna_partial.tracing.line import add_slab, has_long_legs, jones_power, reflects_inside
+from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, Met, divide, face_at, faces_between
 from sionna_partial.tracing.mesh.sequences import (
     MeshLinks,
     Rays,
@@ -31,18 +31,10 @@ from sionna_partial.tracing.mesh.sequences import (
     split_rays,
     view_sequences,
 )
-from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates
-from sionna_partial.tracing.power import (
-    ISOTROPIC,
-    Gains,
-    at_slab,
-    gain_towards,
-    received_power,
-    reflected_power,
-    vertical_field,
-)
+from sionna_partial.tracing.paths import Candidates
+from sionna_partial.tracing.power import ISOTROPIC, Gains, gain_towards, reflected_power
 from sionna_partial.tracing.select import Limits, Listed, discount_after, needs_by_distance
-from sionna_partial.tracing.walls import SolidMesh, is_inside, mark_walls, met_faces, reflects_inside
+from sionna_partial.tracing.walls import MetFaces, SolidMesh, is_inside, mark_walls
 
 _REACH, _REACH_M = 1.1, 0.3
 """Factor and length [m] by which receivers may be farther than the rays reached."""
@@ -97,8 +89,7 @@ class Images(NamedTuple):
     wavelength_m: float
 
 
-@njit(cache=True)
-def images_of(traced, mesh):
+def images_of(traced: Traced, mesh: SolidMesh) -> Images:
     (sequences, views), materials = traced, mesh.materials
     columns = sequences.parent, sequences.plane, views.depth, views.source_m
     return Images(*columns, mesh.planes, mesh.material, materials.largest, materials.wavelength_m)
@@ -113,43 +104,57 @@ class Pairs(NamedTuple):
 
 
 class MeshReflections:
-    """Specular paths between a transmitter (3,) and receivers (N, 3), all between opaque faces, or all through walls.
+    """Specular paths between a transmitter and receivers, all between opaque faces, or all through walls."""
 
-    With `rays` from `shoot_rays`, of the same transmitter and depth, no face is crossed. With a number of rays, paths
-    cross 1 to `max_walls` walls.
-    """
+    def __init__(self, name: str, links: MeshLinks, opaque: Traced | None = None, rays: int = 0) -> None:
+        self.name, self._links, self._opaque, self._rays = name, links, opaque, rays
 
-    def __init__(
-        self,
+    @classmethod
+    def between_faces(
+        cls,
         mesh: SolidMesh,
         tx_m: Floats,
         rx_m: Floats,
         settings: TraceSettings,
-        rays: Iterable[Rays] | int,
+        rays: Iterable[Rays],
+        gains: Gains = ISOTROPIC,
+    ) -> "MeshReflections":
+        """Return the paths between opaque faces; `rays` are from `shoot_rays` for this transmitter and depth."""
+        depth, sequences = settings.max_depth, collect_sequences(rays, mesh.planes)
+        links = MeshLinks.of(mesh, tx_m, rx_m, Limits(depth, depth, 0, 1.0, 0.0), gains)
+        views = view_sequences(sequences, mesh.planes, links.tx_m, _OPAQUE_MARGIN)
+        return cls("reflections", links, Traced(sequences, views))
+
+    @classmethod
+    def through_walls(
+        cls,
+        mesh: SolidMesh,
+        tx_m: Floats,
+        rx_m: Floats,
+        settings: TraceSettings,
+        rays: int,
         gains: Gains = ISOTROPIC,
         *,
         coarse: bool = False,
-    ) -> None:
-        ends, depth = (np.array(tx_m, np.float64), np.array(rx_m, np.float64, order="C")), settings.max_depth
-        if isinstance(rays, int):
-            self.name, self._opaque, self._rays = "paths through walls", None, rays
-            limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1, coarse=coarse)
-        else:
-            self.name, limits = "reflections", Limits(depth, depth, 0, 1.0, 0.0)
-            sequences = collect_sequences(rays, mesh.planes)
-            self._opaque = Traced(sequences, view_sequences(sequences, mesh.planes, ends[0], _OPAQUE_MARGIN))
-        self._links = MeshLinks(mesh, *ends, limits, gains)
+    ) -> "MeshReflections":
+        """Return the paths that cross 1 to `max_walls` walls, by so many rays that are split at faces."""
+        limits = Limits.of(settings, settings.max_walls, directed=len(gains.table) > 1, coarse=coarse)
+        return cls("paths through walls", MeshLinks.of(mesh, tx_m, rx_m, limits, gains), rays=rays)
 
     def listed(self, found: Floats, *, sequences_at_once: int = _SEQUENCES_AT_ONCE) -> Iterator[Listed]:
         links, every = self._links, np.arange(len(self._links.rx_m), dtype=np.int32)
-        direct = _straight(links) if self._opaque is None else np.full(len(every), np.inf)
+        direct = np.full(len(every), np.inf)
+        if self._opaque is None:
+            direct[:] = 0.0
+            _straight(links, Scratch.of(links), direct)
         needed = links.limits.min_power(found + direct) if self._opaque is None else np.zeros(len(every))
         traced, boxes = self._opaque or self._split(needed), divide(links.rx_m, links.rx_m, _LEAF)
         count = len(traced.views.order)
         step = max(sequences_at_once, count // _PARTS)
 
         def of_sequences(start: int) -> Pairs:
-            return _pairs(traced.views.order[start : start + step], traced, boxes, needed, links)  # type: ignore[no-any-return]
+            nodes, images = traced.views.order[start : start + step], images_of(traced, links.mesh)
+            return _pairs(nodes, traced, boxes, needed, links, images, Scratch.of(links))  # type: ignore[no-any-return]
 
         straight = Pairs(np.full(len(every), -1, np.int32), every, direct)
         parts: Iterable[Pairs] = itertools.chain([straight], in_order(of_sequences, range(0, count, step)))
@@ -168,53 +173,54 @@ class MeshReflections:
         return Traced(sequences, view_sequences(sequences, links.mesh.planes, links.tx_m, _MARGIN))
 
     def _written(self, traced: Traced, node: NDArray[np.int32], rx: NDArray[np.int32], rows: Indices) -> Candidates:
-        depth = max(1, self._links.limits.depth)
-        kind, face, vertices_m, same_wall = _write(
-            node[rows], rx[rows], traced, self._links, depth if self._opaque else _ENTRIES
+        room, images = (
+            max(1, self._links.limits.depth) if self._opaque else _ENTRIES,
+            images_of(traced, self._links.mesh),
         )
+        scratch = Scratch.of(self._links, room)
+        kind, face, vertices_m, same_wall = _write(node[rows], rx[rows], traced, self._links, images, scratch)
         candidates = Candidates(rx[rows], kind, face, vertices_m)
         return candidates if self._opaque else replace(candidates, same_wall=same_wall).narrowed()
 
 
-@njit(cache=True, nogil=True)
-def _straight(links):
-    met, entries, power = scratch(), met_faces(_ENTRIES), np.zeros(len(links.rx_m))
-    faces, points = np.empty(0, np.int32), np.empty((0, 3))
+class Scratch(NamedTuple):
+    """Scratch of one path: faces on a line, entries, and the faces and points of its reflections."""
+
+    met: Met
+    entries: MetFaces
+    faces: NDArray[np.int32]
+    points: Floats
+
+    @classmethod
+    def of(cls, links: MeshLinks, room: int = _ENTRIES) -> "Scratch":
+        depth = max(1, links.limits.depth)
+        return cls(Met.empty(), MetFaces.empty(room), np.empty(depth, np.int32), np.empty((depth, 3)))
+
+
+@njit(cache=True, borrows=True, nogil=True)
+def _straight(links, scratch, power):
+    """Write the powers (N,) of straight paths through walls."""
     for rx in range(len(power)):
-        number = _follow(0, links.rx_m[rx], links, met, entries, faces, points)
+        number = _follow(0, links.rx_m[rx], links, scratch)
         if number >= 0:
-            power[rx] = _power(entries, number, links.rx_m[rx], links)
-    return power
+            power[rx] = _power(scratch.entries, number, links.rx_m[rx], links)
 
 
 @njit(cache=True, nogil=True)
-def _pairs(nodes, traced, boxes, needed, links):
-    (sequences, views), mesh, limits, rx_m, tx_m = traced, links.mesh, links.limits, links.rx_m, links.tx_m
-    all_node, all_rx, all_power = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024)
-    met, entries, depth, through, count = scratch(), met_faces(_ENTRIES), max(1, limits.depth), limits.walls > 0, 0
-    faces, points, spread = np.empty(depth, np.int32), np.empty((depth, 3)), mesh.materials.wavelength_m / (4.0 * np.pi)
-    images, gains, planes = images_of(traced, mesh), links.gains, mesh.planes
+def _pairs(nodes, traced, boxes, needed, links, images, scratch):
+    """Pair sequences with the receivers in their view that need them."""
+    (sequences, views), limits, rx_m = traced, links.limits, links.rx_m
+    all_node, all_rx, all_power, count = np.empty(1024, np.int32), np.empty(1024, np.int32), np.empty(1024), 0
     seen, stack, bounds = np.empty(len(rx_m), np.int64), np.empty(128, np.int64), np.empty((5, 3))
     for node in nodes:
         source, discount = views.source_m[node], discount_after(limits, views.depth[node])
         reach = _REACH * sequences.reach_m[node] + _REACH_M
         view = View(source, sequences.low[node], sequences.high[node], views.margin[node], reach)
-        bound_view(view, farthest(source, boxes), planes, sequences.plane[node], bounds)
+        bound_view(view, farthest(source, boxes), links.mesh.planes, sequences.plane[node], bounds)
         number = receivers_in_view(view, boxes, rx_m, bounds, stack, seen)
-        most = sequences.left[node] * spread**2
         for rx in seen[:number]:
             least = needed[rx] / discount
-            x, y, z = rx_m[rx, 0] - source[0], rx_m[rx, 1] - source[1], rx_m[rx, 2] - source[2]
-            if through and most < _PART * least * (x * x + y * y + z * z):
-                continue
-            power = fold_line(node, rx_m[rx], images, faces, points)
-            if power < 0.0:
-                continue
-            x, y, z = points[0, 0] - tx_m[0], points[0, 1] - tx_m[1], points[0, 2] - tx_m[2]
-            power *= gain_towards(gains, x, y, z)
-            if through and power >= least:
-                entered = _follow(views.depth[node], rx_m[rx], links, met, entries, faces, points)
-                power = _power(entries, entered, rx_m[rx], links) if entered >= 0 else -1.0
+            power = _pair_power(node, rx, least, sequences.left[node], links, images, scratch)
             if power >= least:
                 all_node, all_rx = grow(all_node, count + 1), grow(all_rx, count + 1)
                 all_power = grow(all_power, count + 1)
@@ -223,12 +229,32 @@ def _pairs(nodes, traced, boxes, needed, links):
     return Pairs(all_node[:count].copy(), all_rx[:count].copy(), all_power[:count].copy())
 
 
+@njit(cache=True, borrows=True)
+def _pair_power(node, rx, least, left, links, images, scratch):
+    """Return the bound of a path, or through walls its power; less than `least` if it is weaker or there is no path."""
+    target, tx, points, through = links.rx_m[rx], links.tx_m, scratch.points, links.limits.walls > 0
+    sx, sy, sz = images.source_m[node, 0], images.source_m[node, 1], images.source_m[node, 2]
+    x, y, z = target[0] - sx, target[1] - sy, target[2] - sz
+    most = left * (images.wavelength_m / (4.0 * np.pi)) ** 2
+    if through and most < _PART * least * (x * x + y * y + z * z):
+        return -1.0
+    power = fold_line(node, target, images, scratch.faces, points)
+    if power < 0.0:
+        return -1.0
+    power *= gain_towards(links.gains, points[0, 0] - tx[0], points[0, 1] - tx[1], points[0, 2] - tx[2])
+    if not through or power < least:
+        return power
+    entered = _follow(images.depth[node], target, links, scratch)
+    return _power(scratch.entries, entered, target, links) if entered >= 0 else -1.0
+
+
 @njit(cache=True, nogil=True)
-def _write(nodes, rx, traced, links, room):
-    met, entries, shape = scratch(), met_faces(room), (len(nodes), room)
+def _write(nodes, rx, traced, links, images, scratch):
+    """Return kinds, faces, vertices and further faces of a wall of candidates: sequences and receivers (C,)."""
+    entries, room = scratch.entries, len(scratch.entries.face)
+    shape, faces, points = (len(nodes), room), scratch.faces, scratch.points
     kind, face, same_wall = np.zeros(shape, np.uint8), np.full(shape, -1, np.int32), np.zeros(shape, np.bool_)
-    vertices, depth = np.zeros((len(nodes), room, 3)), max(1, links.limits.depth)
-    faces, points, images = np.empty(depth, np.int32), np.empty((depth, 3)), images_of(traced, links.mesh)
+    vertices = np.zeros((len(nodes), room, 3))
     for c in range(len(nodes)):
         node, target, reflections = nodes[c], links.rx_m[rx[c]], 0
         if node >= 0:
@@ -238,13 +264,13 @@ def _write(nodes, rx, traced, links, room):
             kind[c, :reflections], face[c, :reflections] = REFLECTION, faces[:reflections]
             vertices[c, :reflections] = points[:reflections]
             continue
-        number = _follow(reflections, target, links, met, entries, faces, points)
+        number = _follow(reflections, target, links, scratch)
         kind[c, :number], face[c, :number] = entries.kind[:number], entries.face[:number]
         vertices[c, :number], same_wall[c, :number] = entries.point_m[:number], entries.same_wall[:number]
     return kind, face, vertices, same_wall
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def receivers_in_view(view, boxes, rx, bounds, stack, found):
     source, low, high, margin, reach = view
     count, stack[0], top = 0, 0, 1
@@ -272,7 +298,7 @@ def receivers_in_view(view, boxes, rx, bounds, stack, found):
     return count
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def farthest(source, boxes):
     total = 0.0
     for axis in range(3):
@@ -280,7 +306,7 @@ def farthest(source, boxes):
     return np.sqrt(total) + 1e-3
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def bound_view(view, farthest, planes, p, bounds):
     """Write bounds of the points in view of an image and beyond its last plane.
 
@@ -306,7 +332,7 @@ def bound_view(view, farthest, planes, p, bounds):
     bounds[4, 0], bounds[4, 1] = width, bounds[3, 0] ** 2 + bounds[3, 1] ** 2 + bounds[3, 2] ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _apart(low, high, bounds):
     for axis in range(3):
         if low[axis] > bounds[1, axis] or high[axis] < bounds[0, axis]:
@@ -322,7 +348,7 @@ def _apart(low, high, bounds):
     return beside > (radius + (np.sqrt(distance) + radius) * bounds[4, 0]) ** 2
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def fold_line(node, target, images, face, points):
     """Write the faces and points at which the line from a sequence's image to a receiver is reflected.
 
@@ -353,10 +379,10 @@ def fold_line(node, target, images, face, points):
     return power
 
 
-@njit(cache=True)
-def _follow(reflections, target, links, met, entries, faces, points):
+@njit(cache=True, borrows=True)
+def _follow(reflections, target, links, scratch):
     """Write all faces on a path with reflections; return their number, -1 if it crosses no or too many walls."""
-    mesh, count, crossed = links.mesh, 0, 0
+    (met, entries, faces, points), mesh, count, crossed = scratch, links.mesh, 0, 0
     a, own, before = links.tx_m, np.int64(-1), (False, False)
     for k in range(reflections + 1):
         b, other = target, np.int64(-1)
@@ -377,39 +403,38 @@ def _follow(reflections, target, links, met, entries, faces, points):
                 last = met.face[number - 1]
                 before = is_inside(mesh, last, faces[k], last, entries.point_m[count - 1], b)
             entries.face[count], entries.kind[count], entries.same_wall[count] = faces[k], REFLECTION, False
-            entries.point_m[count] = b
+            for axis in range(3):
+                entries.point_m[count, axis] = b[axis]
             count += 1
         a, own = b, other
-    return count if crossed > 0 and _has_long_legs(entries, count, links.tx_m, target) else -1
+    _measure(entries, count, links.tx_m, target)
+    return count if crossed > 0 and has_long_legs(entries.at_m, count, entries.at_m[count], 1.0) else -1
 
 
-@njit(cache=True)
-def _has_long_legs(entries, count, tx, target):
+@njit(cache=True, borrows=True)
+def _measure(entries, count, tx, target):
+    """Write the lengths of a path to its `count` entries and to its end."""
+    total = 0.0
     for k in range(count + 1):
-        square = 0.0
-        for axis in range(3):
-            before = entries.point_m[k - 1, axis] if k > 0 else tx[axis]
-            after = entries.point_m[k, axis] if k < count else target[axis]
-            square += (after - before) ** 2
-        if square < SHORTEST_LEG_M**2:
-            return False
-    return True
+        before = entries.point_m[k - 1] if k > 0 else tx
+        after = entries.point_m[k] if k < count else target
+        dx, dy, dz = after[0] - before[0], after[1] - before[1], after[2] - before[2]
+        total += np.sqrt(dx * dx + dy * dy + dz * dz)
+        entries.at_m[k] = total
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _power(entries, count, target, links):
-    planes, materials, tx = links.mesh.planes, links.mesh.materials, links.tx_m
+    """Return the power of a path with `count` entries, of which `_follow` wrote the lengths."""
+    mesh, tx, used = links.mesh, links.tx_m, 0
     first = entries.point_m[0] if count else target
     kx, ky, kz = first[0] - tx[0], first[1] - tx[1], first[2] - tx[2]
-    total = np.sqrt(kx * kx + ky * ky + kz * kz)
-    k = kx / total, ky / total, kz / total
-    e, gain = vertical_field(k), gain_towards(links.gains, kx, ky, kz)
+    size = entries.at_m[0]
     for j in range(count):
-        here, after = entries.point_m[j], entries.point_m[j + 1] if j + 1 < count else target
-        total += np.sqrt((after[0] - here[0]) ** 2 + (after[1] - here[1]) ** 2 + (after[2] - here[2]) ** 2)
         if not entries.same_wall[j]:
             face = entries.face[j]
-            p = planes.plane[face]
-            normal = planes.normal[p, 0], planes.normal[p, 1], planes.normal[p, 2]
-            k, e = at_slab(k, e, normal, materials, links.mesh.material[face], entries.kind[j])
-    return (links.mesh.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain
+            p, normals = mesh.planes.plane[face], mesh.planes.normal
+            normal = normals[p, 0], normals[p, 1], normals[p, 2]
+            used = add_slab(entries.slabs, used, normal, mesh.material[face], entries.kind[j])
+    power = jones_power((kx / size, ky / size, kz / size), entries.at_m[count], entries.slabs, used, mesh.materials)
+    return power * gain_towards(links.gains, kx, ky, kz)

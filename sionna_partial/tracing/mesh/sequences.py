@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.outlines import grow
-from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, Met, faces_between, mix, scratch
+from sionna_partial.tracing.line import is_as_deep
+from sionna_partial.tracing.mesh.faces import MOST_FACES, MeshPlanes, Met, faces_between, mix
 from sionna_partial.tracing.power import COSINES, Gains, gain_towards
 from sionna_partial.tracing.select import Limits, NeedsByDistance, discount_after, matters
 from sionna_partial.tracing.walls import SolidMesh, cosine_at, is_one_wall
@@ -33,6 +34,10 @@ class MeshLinks(NamedTuple):
     rx_m: Floats
     limits: Limits
     gains: Gains
+
+    @classmethod
+    def of(cls, mesh: SolidMesh, tx_m: Floats, rx_m: Floats, limits: Limits, gains: Gains) -> "MeshLinks":
+        return cls(mesh, np.array(tx_m, np.float64), np.array(rx_m, np.float64, order="C"), limits, gains)
 
 
 class Rays(NamedTuple):
@@ -174,7 +179,7 @@ def _with_room(sequences, size, more):
     return Sequences(parent, plane, low, high, reach, left, table, size, rays)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _add_rays(sequences, size, added, face, leg, direction, plane_of):
     parent, plane, low, high, reach, _, table, _, _ = sequences  # attributes cost time in a loop
     depth = face.shape[1]
@@ -191,7 +196,7 @@ def _add_rays(sequences, size, added, face, leg, direction, plane_of):
     return added, size
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _slot(table, parent, plane, node, last):
     mask = np.uint64(len(table) - 1)
     slot = mix(node + 1, last) & mask
@@ -200,7 +205,7 @@ def _slot(table, parent, plane, node, last):
     return slot
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _next_sequence(table, parent, plane, size, node, last):
     slot = _slot(table, parent, plane, node, last)
     if table[slot] < 0:
@@ -208,7 +213,7 @@ def _next_sequence(table, parent, plane, size, node, last):
     return np.int64(table[slot])
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _widen(low, high, node, direction):
     for axis in range(3):
         low[node, axis], high[node, axis] = (
@@ -235,16 +240,16 @@ def split_rays(links: MeshLinks, count: int, needed: NeedsByDistance) -> Sequenc
     boxes = links.mesh.tree.boxes
     low, high = np.minimum(boxes.low_m[0], links.tx_m), np.maximum(boxes.high_m[0], links.tx_m)
     far = float(np.linalg.norm(high - low)) + 1.0
-    directions = lattice(np.arange(count), count).astype(np.float64)
-    sequences, size = _split(_no_sequences(), directions, needed, links, far)
+    directions, room = lattice(np.arange(count), count).astype(np.float64), MOST_FACES * (links.limits.reflections + 1)
+    stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), Met.empty())
+    sequences, size = _split(_no_sequences(), directions, needed, links, far, stack)
     return sequences._replace(size=size, rays=count)  # type: ignore[no-any-return]
 
 
 @njit(cache=True)
-def _split(sequences, directions, needed, links, far):
+def _split(sequences, directions, needed, links, far, stack):
     """Add the sequences of rays in directions (R, 3), and count them; `far` is the size of the mesh."""
-    room, size = MOST_FACES * (links.limits.reflections + 1), sequences.size
-    stack = _RayStack(np.empty((room, 8)), np.empty((room, 3), np.int64), np.empty(3), scratch())
+    size = sequences.size
     for direction in directions:
         stack.value[0, :3], stack.value[0, 3:6] = links.tx_m, direction
         gain = gain_towards(links.gains, direction[0], direction[1], direction[2])
@@ -274,7 +279,7 @@ def _go_on(sequences, size, stack, top, needed, links, far):
         face, t = met.face[j], met.at[j]
         cosine, near = cosine_at(mesh.planes, face, d[0], d[1], d[2]), length + t * far
         steep = min(steep, cosine)
-        same = j > 0 and (t - start) * far * steep <= mesh.cells.depth_m
+        same = j > 0 and is_as_deep((t - start) * far, steep, mesh.cells.depth_m)
         if same and is_one_wall(mesh, met.face[j - 1], face, a, end, met.at[j - 1], t):
             continue
         material = mesh.material[face]
@@ -300,7 +305,7 @@ def _go_on(sequences, size, stack, top, needed, links, far):
     return size, top
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _reflect(a, d, length, planes, p, ray):
     along = d[0] * planes.normal[p, 0] + d[1] * planes.normal[p, 1] + d[2] * planes.normal[p, 2]
     for axis in range(3):

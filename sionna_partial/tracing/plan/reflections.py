@@ -6,32 +6,32 @@ floor and ceiling. They are selected by their power, as in `power.py`.
 
 from collections.abc import Iterator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.process import in_order, njit
-from sionna_partial.scene.outlines import bin_points, grow
+from sionna_partial.scene.outlines import bin_points
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
+from sionna_partial.tracing.line import add_slab, has_long_legs, jones_power
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.beams import Beams, BeamTree, Sources, Task, follow, needed_of, trace_beams
+from sionna_partial.tracing.plan.obstacles import Lowered
 from sionna_partial.tracing.plan.room import (
     FACES,
     Building,
     Leg,
-    Lowered,
     Room,
+    WrittenPaths,
     add_entry,
     candidates_of,
     cross_leg,
-    empty_paths,
     fraction_at_turn,
     gain_of_departure,
-    has_long_legs,
     has_variant,
     height_at,
     is_reflected_inside,
@@ -40,15 +40,13 @@ from sionna_partial.tracing.plan.room import (
     write_path,
 )
 from sionna_partial.tracing.power import (
+    VERTICAL,
     Materials,
     at_flats,
-    at_slab,
     at_wall,
     gain_at_azimuth,
     gain_towards,
     power_near,
-    received_power,
-    vertical_field,
 )
 from sionna_partial.tracing.select import Limits, Listed
 from sionna_partial.tracing.walls import Interior
@@ -63,7 +61,7 @@ _PAIRS_AT_ONCE = 5_000
 """Number of pairs that one thread works on at a time."""
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def unfold(tree, node, pieces_m, target, walls, bounce):
     """Write the reflections at walls of a path; return their number, -1 without a path, and the length in the plan.
 
@@ -92,48 +90,64 @@ def unfold(tree, node, pieces_m, target, walls, bounce):
     return k, total
 
 
-@njit(cache=True)
-def _departure(k, building, target, trail):
-    x, y = (trail.bounce[0, 0], trail.bounce[0, 1]) if k > 0 else (target[0], target[1])
-    return x - building.room.tx_m[0], y - building.room.tx_m[1]
+@njit(cache=True, borrows=True)
+def _departure(k, tx_m, target, bounce):
+    x, y = (bounce[0, 0], bounce[0, 1]) if k > 0 else (target[0], target[1])
+    return x - tx_m[0], y - tx_m[1]
 
 
-@njit(cache=True, forceinline=True)
+@njit(cache=True, borrows=True)
+def _reflect(k, trail):
+    """Write the `k` reflections at walls of a path between opaque walls as entries; return their number."""
+    count = 0
+    for level in range(k):
+        x, y, stop = trail.bounce[level, 0], trail.bounce[level, 1], trail.bounce[level, 2]
+        count = add_entry(trail, count, trail.walls[level], REFLECTION, x, y, stop)
+    return count
+
+
+@njit(cache=True, borrows=True)
 def _meet(k, building, target, trail):
     """Write all that a path with `k` reflections at walls meets in the plan.
 
     Returns the number of entries, -1 if there is no path, and the number of walls crossed.
     """
-    count = crossed = np.int64(0)
-    start, done, own = (building.room.tx_m[0], building.room.tx_m[1]), 0.0, np.int64(-1)
+    count, crossed, start, done, own = 0, 0, (building.room.tx_m[0], building.room.tx_m[1]), 0.0, np.int64(-1)
     for level in range(k + 1):
         end, stop, other = (target[0], target[1]), 1.0, np.int64(-1)
         if level < k:
             end, stop = (trail.bounce[level, 0], trail.bounce[level, 1]), trail.bounce[level, 2]
             other = trail.walls[level]
-        if building.limits.walls > 0:
-            leg = Leg(start, end, own, other, done, stop)
-            count, more = cross_leg(building.plan, building.interior, leg, count, trail)
-            crossed += more
-            if count < 0 or crossed > building.limits.walls or count >= len(trail.surface) - 1:
-                return -1, crossed
+        count, more = cross_leg(building.plan, building.interior, Leg(start, end, own, other, done, stop), count, trail)
+        crossed += more
+        if count < 0 or crossed > building.limits.walls or count >= len(trail.surface) - 1:
+            return -1, crossed
         if level < k:
-            count = add_entry(trail, count, other, np.int64(REFLECTION), end[0], end[1], stop)
+            count = add_entry(trail, count, other, REFLECTION, end[0], end[1], stop)
         start, done, own = end, stop, other
     if building.interior.depth_m > 0.0 and is_reflected_inside(building.plan, building.interior, count, trail):
         return -1, crossed
     return count, crossed
 
 
-@njit(cache=True, nogil=True)
-def _write_paths(tree, pairs, variants, building, trail, size):
-    paths, room, owner = empty_paths(len(pairs), size), building.room, building.plan.owner
+@njit(cache=True, borrows=True, nogil=True)
+def _write_opaque(tree, pairs, variants, pieces_m, owner, room, trail, paths):
+    """Write the paths of pairs (beam, receiver) between opaque walls."""
+    for c in range(len(pairs)):
+        target = room.rx_m[pairs[c, 1]]
+        k, _ = unfold(tree, pairs[c, 0], pieces_m, target, trail.walls, trail.bounce)
+        write_path(trail, _reflect(k, trail), room, owner, target, variants[c], paths, c)
+
+
+@njit(cache=True, borrows=True, nogil=True)
+def _write_crossing(tree, pairs, variants, building, trail, paths):
+    """Write the paths of pairs (beam, receiver) through walls."""
+    room, owner = building.room, building.plan.owner
     for c in range(len(pairs)):
         target = room.rx_m[pairs[c, 1]]
         k, _ = unfold(tree, pairs[c, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
         count, _ = _meet(k, building, target, trail)
-        write_path(trail, count, room, owner, target, np.int64(variants[c]), paths, c)
-    return paths
+        write_path(trail, count, room, owner, target, variants[c], paths, c)
 
 
 class SpecularCandidates:
@@ -152,7 +166,11 @@ class SpecularCandidates:
 
         def of_pairs(start: int) -> Listed:
             some = pairs[start : start + pairs_at_once]
-            pair, variant, bound = _list_variants(tree, some, self._building, trail_of(plan))
+            size = len(some) * (2 * depth + 2)
+            columns: tuple[Any, ...] = np.empty(size, np.int32), np.empty(size, np.int8), np.empty(size)
+            inputs = plan.pieces_m, self._building.material, self._building.materials, room, trail_of(plan)
+            count = _list_variants(tree, some, depth, *inputs, columns)
+            pair, variant, bound = (column[:count].copy() for column in columns)
             write = partial(self._written, tree, some, pair, variant)
             return Listed(some[pair, 1], bound, write, (start + len(some)) / len(pairs))
 
@@ -163,48 +181,46 @@ class SpecularCandidates:
     ) -> Candidates:
         size, trail = max(1, self._building.limits.depth), trail_of(self._building.plan)
         pairs = pairs[pair[rows]]
-        paths = _write_paths(tree, pairs, variant[rows], self._building, trail, size)
+        paths = WrittenPaths.empty(len(pairs), size)
+        plan, room = self._building.plan, self._building.room
+        _write_opaque(tree, pairs, variant[rows], plan.pieces_m, plan.owner, room, trail, paths)
         return candidates_of(self._geometry, pairs[:, 1], paths, opaque=True)
 
 
-@njit(cache=True, nogil=True)
-def _list_variants(tree, pairs, building, trail):
-    room, largest, max_depth = building.room, building.materials.largest, building.limits.depth
-    rx_m, wall_material, directed = room.rx_m, building.material, len(room.gains.table) > 1
-    wavelength, pieces_m = building.materials.wavelength_m, building.plan.pieces_m
-    walls, bounce = trail.walls, trail.bounce
-    pair, variants, bound = np.empty(1024, np.int32), np.empty(1024, np.int8), np.empty(1024)
-    count = np.int64(0)
+@njit(cache=True, borrows=True, nogil=True)
+def _list_variants(tree, pairs, depth, pieces_m, material, materials, room, trail, columns):
+    """List every variant of pairs (beam, receiver): numbers of pairs, variants and bounds in `columns` (C,).
+
+    Return their number. The bound of a direct path is infinite.
+    """
+    (pair, variants, bound), walls, bounce, count = columns, trail.walls, trail.bounce, 0
     for i in range(len(pairs)):
-        target = rx_m[pairs[i, 1]]
+        target = room.rx_m[pairs[i, 1]]
         k, length = unfold(tree, pairs[i, 0], pieces_m, target, walls, bounce)
-        if k < 0:
-            continue
-        for variant in range(2 * (max_depth - k) + 2):
+        for variant in range(2 * (depth - k) + 2 if k >= 0 else 0):
             if not has_variant(variant, room):
                 continue
             rise = rise_of(variant, room, target)
             total = np.hypot(length, rise.height_m)
-            sine, slope, field = length / total, rise.height_m / total, (1.0, 0.0, 1.0)
+            sine, slope, field = length / total, rise.height_m / total, VERTICAL
             for level in range(k):
-                field = at_wall(largest, wall_material[walls[level]], bounce[level, 3], sine, slope, field)
-            strength = at_flats(largest, room.flat_material, slope, rise.bounces, field)
-            power = (wavelength / (4.0 * np.pi * total) * strength) ** 2
-            if directed:
-                x, y = _departure(k, building, target, trail)
+                field = at_wall(materials.largest, material[walls[level]], bounce[level, 3], sine, slope, field)
+            strength = at_flats(materials.largest, room.flat_material, slope, rise.bounces, field)
+            power = (materials.wavelength_m / (4.0 * np.pi * total) * strength) ** 2
+            if len(room.gains.table) > 1:
+                x, y = _departure(k, room.tx_m, target, bounce)
                 power *= gain_of_departure(room, x, y, rise, length)
-            pair, variants, bound = grow(pair, count + 1), grow(variants, count + 1), grow(bound, count + 1)
             pair[count], variants[count] = i, variant
             bound[count] = power if k + rise.bounces > 0 else np.inf
             count += 1
-    return pair[:count].copy(), variants[:count].copy(), bound[:count].copy()
+    return count
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _bounds(k, length, through, building, target, least, trail, possible):
     """Mark the variants of a path that may have the power `least`; return whether any has."""
     room, table, some = building.room, building.materials.reflection, False
-    x, y = _departure(k, building, target, trail)
+    x, y = _departure(k, room.tx_m, target, trail.bounce)
     through *= gain_at_azimuth(room.gains, x, y)
     for variant in range(_VARIANTS):
         rise = rise_of(variant, room, target)
@@ -222,48 +238,46 @@ def _bounds(k, length, through, building, target, least, trail, possible):
     return some
 
 
-@njit(cache=True, nogil=True)
-def _pair_powers(tree, pair, through, building, needed, trail):
-    """Return the power (K, V) of each variant of pairs (beam, receiver), of which walls leave at most `through` (K,).
+@njit(cache=True, borrows=True, nogil=True)
+def _pair_powers(tree, pair, through, building, needed, trail, possible, power):
+    """Write the power (K, V) of each variant of pairs (beam, receiver), of which walls leave at most `through` (K,).
 
-    It is 0 for paths through no wall or below the power `needed` (N,).
+    It stays 0 for paths through no wall or below the power `needed` (N,). `possible` (V,) is scratch.
     """
-    power, possible = np.zeros((len(pair), _VARIANTS)), np.empty(_VARIANTS, np.bool_)
     for i in range(len(pair)):
         target, least = building.room.rx_m[pair[i, 1]], needed[pair[i, 1]]
         k, length = unfold(tree, pair[i, 0], building.plan.pieces_m, target, trail.walls, trail.bounce)
         if k < 0 or not _bounds(k, length, through[i], building, target, least, trail, possible):
             continue
         count, crossed = _meet(k, building, target, trail)
-        if count < 0 or crossed == 0 or not has_long_legs(trail, count, length):
+        if count < 0 or crossed == 0 or not has_long_legs(trail.points[:, 2], count, 1.0, length):
             continue
         for variant in range(_VARIANTS):
             if possible[variant]:
                 rise = rise_of(variant, building.room, target)
                 power[i, variant] = _path_power(trail, count, length, rise, building, target)
-    return power
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _path_power(trail, count, length, rise, building, target):
-    room, total = building.room, np.hypot(length, rise.height_m)
-    end = (trail.points[0, 0], trail.points[0, 1]) if count > 0 else (target[0], target[1])
+    """Return the power of one variant of a path; 0 if it is reflected where there is no floor."""
+    room, total, slabs, used = building.room, np.hypot(length, rise.height_m), trail.slabs, 0
+    x, y = (trail.points[0, 0], trail.points[0, 1]) if count > 0 else (target[0], target[1])
     ax, ay, done = room.tx_m[0], room.tx_m[1], 0.0
-    size = max(np.hypot(end[0] - ax, end[1] - ay), 1e-12) * total / length
-    k = (end[0] - ax) / size, (end[1] - ay) / size, rise.up * rise.height_m / total
-    e, gain = vertical_field(k), gain_towards(room.gains, k[0], k[1], k[2])
-    item = turn = np.int64(0)
+    size = max(np.hypot(x - ax, y - ay), 1e-12) * total / length
+    k = (x - ax) / size, (y - ay) / size, rise.up * rise.height_m / total
+    item = turn = 0
     while item < count or turn < rise.bounces:
-        fraction = fraction_at_turn(turn, room, rise)
+        fraction = fraction_at_turn(turn, rise)
         if item < count and trail.points[item, 2] <= fraction:
             ax, ay, done = trail.points[item]
             piece = trail.surface[item]
             above = building.plan.low[piece] and trail.kind[item] == REFRACTION
             if above:
-                above = height_at(done, room, rise) > room.top_m[building.plan.owner[piece]]
+                above = height_at(done, rise) > room.top_m[building.plan.owner[piece]]
             if not (trail.same_wall[item] or above):
                 normal, material = _normal(building.plan, piece), building.material[piece]
-                k, e = at_slab(k, e, normal, building.materials, material, trail.kind[item])
+                used = add_slab(slabs, used, normal, material, trail.kind[item])
             item += 1
             continue
         bx, by, stop = target[0], target[1], 1.0
@@ -272,12 +286,12 @@ def _path_power(trail, count, length, rise, building, target):
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         if not _has_floor(building.interior, ax + part * (bx - ax), ay + part * (by - ay)):
             return 0.0
-        k, e = at_slab(k, e, (0.0, 0.0, 1.0), building.materials, room.flat_material, np.int64(REFLECTION))
+        used = add_slab(slabs, used, (0.0, 0.0, 1.0), room.flat_material, REFLECTION)
         turn += 1
-    return (building.materials.wavelength_m / (4.0 * np.pi * total)) ** 2 * received_power(k, e) * gain
+    return jones_power(k, total, slabs, used, building.materials) * gain_towards(room.gains, k[0], k[1], k[2])
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _normal(plan, piece):
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
     wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
@@ -285,7 +299,7 @@ def _normal(plan, piece):
     return wy / size, -wx / size, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _has_floor(interior, x, y):
     column, row = int(x / interior.cell_m), int(y / interior.cell_m)
     return 0 <= row < interior.floor.shape[0] and 0 <= column < interior.floor.shape[1] and interior.floor[row, column]
@@ -351,8 +365,10 @@ class CrossingCandidates:
 
         def of_pairs(start: int) -> Floats:
             rows = slice(start, start + _PAIRS_AT_ONCE)
-            trail = trail_of(self._geometry.plan)
-            return _pair_powers(tree, pair[rows], through[rows], self.building, needed, trail)  # type: ignore[no-any-return]
+            trail, some, power = trail_of(self._geometry.plan), pair[rows], np.zeros((len(pair[rows]), _VARIANTS))
+            possible = np.empty(_VARIANTS, np.bool_)
+            _pair_powers(tree, some, through[rows], self.building, needed, trail, possible, power)
+            return power
 
         parts = in_order(of_pairs, range(0, len(pair), _PAIRS_AT_ONCE))
         power = np.concatenate([np.zeros((0, _VARIANTS)), *parts])
@@ -361,5 +377,6 @@ class CrossingCandidates:
 
     def _written(self, tree: BeamTree, pair: NDArray[np.int32], variant: Indices, rows: Indices) -> Candidates:
         pair, trail, variant = pair[rows], trail_of(self._geometry.plan), variant[rows].astype(np.int8)
-        paths = _write_paths(tree, pair, variant, self.building, trail, len(trail.surface) + 2)
+        paths = WrittenPaths.empty(len(pair), len(trail.surface) + 2)
+        _write_crossing(tree, pair, variant, self.building, trail, paths)
         return self.lowered(candidates_of(self._geometry, pair[:, 1], paths, opaque=False))

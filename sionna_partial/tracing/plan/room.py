@@ -6,21 +6,21 @@ reflections at floor and ceiling depend. Paths cross obstacles or run above them
 number of reflections at floor and ceiling, plus 1 if the first is at the ceiling.
 """
 
-from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.process import njit
 from sionna_partial.scene.outlines import Plan
 from sionna_partial.scene.scene import SceneGeometry
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
-from sionna_partial.tracing.paths import SHORTEST_LEG_M, Candidates, Wedges
+from sionna_partial.tracing.line import Slabs, group_faces, is_far_inside, is_free_between, reflects_inside
+from sionna_partial.tracing.paths import Candidates, Wedges
 from sionna_partial.tracing.power import ISOTROPIC, Gains, Materials, gain_towards
 from sionna_partial.tracing.select import Limits
-from sionna_partial.tracing.walls import Interior, group_faces, is_far_inside, is_free_between, reflects_inside
+from sionna_partial.tracing.walls import Interior
 
 NOTHING, FLOOR, CEILING, EDGE, WALLS = range(5)
 """Surfaces: none, floor, ceiling, vertical edge; from `WALLS` on walls or entries of a trail."""
@@ -33,9 +33,6 @@ _ENTRIES = 64
 
 _REFLECTIONS = 16
 """Largest number of reflections of a path at walls."""
-
-_MAX_LIDS = 8
-"""Largest number of tops of obstacles that a path may cross."""
 
 
 class Room(NamedTuple):
@@ -96,16 +93,19 @@ class Building(NamedTuple):
 class Rise(NamedTuple):
     """Heights along an unfolded path [m]: `height_m` in all, `to_first_m` to its first reflection at floor or ceiling.
 
-    `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections.
+    `up` is 1 where the path rises at first and -1 where it falls, `bounces` the number of these reflections. The path
+    begins at `start_m` in a room of the height `room_m`.
     """
 
     height_m: float
     to_first_m: float
     up: float
     bounces: int
+    start_m: float
+    room_m: float
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def has_variant(variant, room):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
@@ -115,61 +115,61 @@ def has_variant(variant, room):
     return room.floor and room.ceiling
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def rise_of(variant, room, target):
     bounces, first = variant // 2, FLOOR + variant % 2
     if bounces == 0:
         rise = target[2] - room.tx_m[2]
-        return Rise(abs(rise), 0.0, 1.0 if rise >= 0.0 else -1.0, bounces)
+        return Rise(abs(rise), 0.0, 1.0 if rise >= 0.0 else -1.0, bounces, room.tx_m[2], room.height_m)
     to_first = room.tx_m[2] if first == FLOOR else room.height_m - room.tx_m[2]
     last_is_floor = (bounces % 2 == 1) == (first == FLOOR)
     from_last = target[2] if last_is_floor else room.height_m - target[2]
     height = to_first + (bounces - 1) * room.height_m + from_last
-    return Rise(height, to_first, -1.0 if first == FLOOR else 1.0, bounces)
+    return Rise(height, to_first, -1.0 if first == FLOOR else 1.0, bounces, room.tx_m[2], room.height_m)
 
 
-@njit(cache=True)
-def height_at(fraction, room, rise):
+@njit(cache=True, borrows=True)
+def height_at(fraction, rise):
     travelled = fraction * rise.height_m
     if rise.bounces == 0 or travelled <= rise.to_first_m:
-        return room.tx_m[2] + rise.up * travelled
-    legs = int((travelled - rise.to_first_m) // room.height_m)
-    rest = travelled - rise.to_first_m - legs * room.height_m
-    return rest if (legs % 2 == 0) == (rise.up < 0.0) else room.height_m - rest
+        return rise.start_m + rise.up * travelled
+    legs = int((travelled - rise.to_first_m) // rise.room_m)
+    rest = travelled - rise.to_first_m - legs * rise.room_m
+    return rest if (legs % 2 == 0) == (rise.up < 0.0) else rise.room_m - rest
 
 
-@njit(cache=True)
-def fraction_at_turn(turn, room, rise):
+@njit(cache=True, borrows=True)
+def fraction_at_turn(turn, rise):
     """Return the fraction of a path's length at reflection number `turn` at floor or ceiling; 2 if there is none."""
-    return (rise.to_first_m + turn * room.height_m) / rise.height_m if turn < rise.bounces else 2.0
+    return (rise.to_first_m + turn * rise.room_m) / rise.height_m if turn < rise.bounces else 2.0
 
 
-@njit(cache=True)
-def merge_heights(trail, count, room, target, rise, surface, vertices, row):
-    """Write one row in path order: the `count` entries of a trail, and the reflections at floor and ceiling."""
-    entry = turn = np.int64(0)
-    px, py, done = room.tx_m[0], room.tx_m[1], 0.0
+@njit(cache=True, borrows=True)
+def merge_heights(points, count, tx_m, target, rise, surface, vertices, row):
+    """Write one row in path order: the `count` points of a trail, and the reflections at floor and ceiling."""
+    entry = turn = 0
+    px, py, done = tx_m[0], tx_m[1], 0.0
     for depth in range(count + rise.bounces):
-        fraction = fraction_at_turn(turn, room, rise)
-        if entry < count and trail.points[entry, 2] <= fraction:
-            px, py, done = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+        fraction = fraction_at_turn(turn, rise)
+        if entry < count and points[entry, 2] <= fraction:
+            px, py, done = points[entry, 0], points[entry, 1], points[entry, 2]
             surface[row, depth] = WALLS + entry
             vertices[row, depth, 0], vertices[row, depth, 1] = px, py
-            vertices[row, depth, 2] = height_at(done, room, rise)
+            vertices[row, depth, 2] = height_at(done, rise)
             entry += 1
             continue
         nx, ny, stop = target[0], target[1], 1.0
         if entry < count:
-            nx, ny, stop = trail.points[entry, 0], trail.points[entry, 1], trail.points[entry, 2]
+            nx, ny, stop = points[entry, 0], points[entry, 1], points[entry, 2]
         part = (fraction - done) / (stop - done) if stop > done else 0.0
         is_floor = (turn % 2 == 0) == (rise.up < 0.0)
         surface[row, depth] = FLOOR if is_floor else CEILING
         vertices[row, depth, 0], vertices[row, depth, 1] = px + part * (nx - px), py + part * (ny - py)
-        vertices[row, depth, 2] = 0.0 if is_floor else room.height_m
+        vertices[row, depth, 2] = 0.0 if is_floor else rise.room_m
         turn += 1
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def gain_of_departure(room, x, y, rise, length):
     if len(room.gains.table) == 1:
         return 1.0
@@ -208,6 +208,7 @@ class Trail(NamedTuple):
     found: Floats
     wall: NDArray[np.int64]
     visit: NDArray[np.int64]
+    slabs: Slabs
 
 
 def trail_of(plan: Plan) -> Trail:
@@ -222,10 +223,11 @@ def trail_of(plan: Plan) -> Trail:
         np.empty(_ENTRIES),
         np.empty(_ENTRIES, np.int64),
         np.full(len(plan.pieces_m) + 1, -1, np.int64),
+        Slabs.empty(2 * _ENTRIES),
     )
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def cross_leg(plan, interior, leg, count, trail):
     """Add the faces that a leg crosses to `count` entries; return their number, -1 if too many, and walls crossed."""
     dx, dy = leg.end[0] - leg.start[0], leg.end[1] - leg.start[1]
@@ -240,11 +242,13 @@ def cross_leg(plan, interior, leg, count, trail):
         trail.surface[entry], trail.kind[entry], trail.cosine[entry] = i, REFRACTION, _cosine(plan, i, dx, dy, length)
         trail.points[entry, 0], trail.points[entry, 1] = leg.start[0] + t * dx, leg.start[1] + t * dy
         trail.points[entry, 2] = leg.done + t * (leg.stop - leg.done)
+        trail.same_wall[entry] = False
+    line, order = (leg.start, leg.end, length), (dx < 0.0 or (dx == 0.0 and dy < 0.0), False)
     cosine, same_wall = trail.cosine[count : count + n], trail.same_wall[count : count + n]
-    return count + n, group_faces(interior, leg.start, leg.end, trail.found[:n], cosine, same_wall)
+    return count + n, group_faces(interior, line, trail.found[:n], cosine, same_wall, order)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _faces_on(plan, leg, dx, dy, length, trail):
     """Write the pieces that a leg crosses in order, with fractions; return their number, -1 if too many."""
     (ax, ay), (bx, by) = leg.start, leg.end
@@ -286,7 +290,7 @@ def _faces_on(plan, leg, dx, dy, length, trail):
     return n
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _crossed_at(piece, ax, ay, dx, dy, length):
     """Return the fraction of a leg at which it crosses a piece of a wall, or -1.
 
@@ -300,14 +304,14 @@ def _crossed_at(piece, ax, ay, dx, dy, length):
     return ((px + u * (qx - px) - ax) * dx + (py + u * (qy - py) - ay) * dy) / (length * length)
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _cosine(plan, piece, dx, dy, length):
     wx = plan.pieces_m[piece, 1, 0] - plan.pieces_m[piece, 0, 0]
     wy = plan.pieces_m[piece, 1, 1] - plan.pieces_m[piece, 0, 1]
     return abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def is_reflected_inside(plan, interior, count, trail):
     """Return whether a wall reflects a path in it or in another wall."""
     before, after = (False, False), (False, False)
@@ -320,7 +324,7 @@ def is_reflected_inside(plan, interior, count, trail):
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def _is_inside(plan, interior, i, trail):
     """Return whether a path is in one wall between entry i and the next, and as `is_far_inside`."""
     first, second = trail.surface[i], trail.surface[i + 1]
@@ -328,42 +332,42 @@ def _is_inside(plan, interior, i, trail):
     if plan.low[crossed]:
         return False, False
     (ax, ay, _), (bx, by, _) = trail.points[i], trail.points[i + 1]
-    dx, dy, turned = bx - ax, by - ay, plan.pieces_m[first, 1] - plan.pieces_m[first, 0]
-    length, size = max(np.hypot(dx, dy), 1e-12), np.hypot(turned[0], turned[1])
+    dx, dy, length = bx - ax, by - ay, max(np.hypot(bx - ax, by - ay), 1e-12)
+    wx = plan.pieces_m[first, 1, 0] - plan.pieces_m[first, 0, 0]
+    wy = plan.pieces_m[first, 1, 1] - plan.pieces_m[first, 0, 1]
     cosine = min(_cosine(plan, first, dx, dy, length), _cosine(plan, second, dx, dy, length))
     inside = length * cosine <= interior.depth_m and not is_free_between(interior, (ax, ay), (bx, by), 0.0, 1.0)
-    turn = _cosine(plan, second, -turned[1], turned[0], size)
+    turn = _cosine(plan, second, -wy, wx, np.hypot(wx, wy))
     return inside, is_far_inside(interior, turn, length * _cosine(plan, crossed, dx, dy, length))
 
 
-@njit(cache=True)
-def has_long_legs(trail, count, length):
-    previous = 0.0
-    for k in range(count):
-        if (trail.points[k, 2] - previous) * length < SHORTEST_LEG_M:
-            return False
-        previous = trail.points[k, 2]
-    return (1.0 - previous) * length >= SHORTEST_LEG_M
-
-
-@njit(cache=True)
+@njit(cache=True, borrows=True)
 def add_entry(trail, count, piece, kind, x, y, fraction):
     trail.surface[count], trail.kind[count], trail.same_wall[count] = piece, kind, False
     trail.points[count, 0], trail.points[count, 1], trail.points[count, 2] = x, y, fraction
     return count + 1
 
 
-@njit(cache=True)
-def empty_paths(count, size):
-    vertices, same_wall = np.zeros((count, size, 3)), np.zeros((count, size), np.bool_)
-    return np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8), vertices, same_wall
+class WrittenPaths(NamedTuple):
+    """C paths with up to S interactions: `surface`, `kind`, `same_wall` (C, S) and `vertices_m` (C, S, 3)."""
+
+    surface: NDArray[np.int32]
+    kind: NDArray[np.uint8]
+    vertices_m: Floats
+    same_wall: Bools
+
+    @classmethod
+    def empty(cls, count: int, size: int) -> "WrittenPaths":
+        surface, kind = np.zeros((count, size), np.int32), np.zeros((count, size), np.uint8)
+        return cls(surface, kind, np.zeros((count, size, 3)), np.zeros((count, size), np.bool_))
 
 
-@njit(cache=True, forceinline=True)  # copying the arguments of a call would take longer than the function
+@njit(cache=True, borrows=True, forceinline=True)  # copying the arguments would take as long as the function
 def write_path(trail, count, room, owner, target, variant, paths, row):
+    """Write the `count` entries of a trail, with the reflections at floor and ceiling of a variant, as one row."""
     surface, kind, vertices, same_wall = paths
     rise = rise_of(variant, room, target)
-    merge_heights(trail, count, room, target, rise, surface, vertices, row)
+    merge_heights(trail.points, count, room.tx_m, target, rise, surface, vertices, row)
     for d in range(count + rise.bounces):
         entry = surface[row, d] - WALLS
         if entry < 0:
@@ -377,7 +381,7 @@ def write_path(trail, count, room, owner, target, variant, paths, row):
 def candidates_of(
     geometry: SceneGeometry,
     rx: NDArray[np.integer],
-    paths: tuple[NDArray[np.int32], NDArray[np.uint8], Floats, Bools],
+    paths: WrittenPaths,
     *,
     opaque: bool,
     wedge: NDArray[np.int32] | None = None,
@@ -392,120 +396,3 @@ def candidates_of(
         face = np.where(kind == DIFFRACTION, wedges.face[wedge, :1], face)
     candidates = Candidates(rx.astype(np.int32), kind, face, vertices_m, wedge, wedges, None if opaque else same_wall)
     return candidates if opaque else candidates.narrowed()
-
-
-@dataclass(frozen=True)
-class Lowered:
-    """Function that lowers walls on candidates, which all reach the ceiling, to obstacles.
-
-    `walls_m` (S, 2, 2) are the walls, `corners_m` (T, 3, 2) the triangles of the tops of obstacles, `lid_m` (T,) their
-    heights and `lid_face` (T,) a face of each in the scene.
-    """
-
-    building: Building
-    walls_m: Floats
-    corners_m: Floats
-    lid_m: Floats
-    lid_face: Indices
-    max_walls: int
-
-    @classmethod
-    def of(cls, geometry: SceneGeometry, building: Building, max_walls: int) -> "Lowered":
-        lids, count = geometry.lids, [len(lid.triangles) for lid in geometry.lids]
-        corners_m = np.concatenate([np.zeros((0, 3, 2)), *(lid.corners_m[lid.triangles] for lid in lids)])
-        lid_m = np.repeat(np.array([lid.top_m for lid in lids], float), count)
-        return cls(
-            building,
-            geometry.walls_m,
-            corners_m,
-            lid_m,
-            np.repeat(np.array(geometry.lid_faces, np.intp), count),
-            max_walls,
-        )
-
-    def __call__(self, candidates: Candidates) -> Candidates:
-        """Remove walls below paths, and candidates that then cross nothing; add the tops of obstacles."""
-        room, interior = self.building.room, self.building.interior
-        if (room.top_m >= room.height_m).all() or not len(candidates.rx):
-            return candidates
-        wide = candidates.widened(candidates.kind.shape[1] + _MAX_LIDS)
-        kind, face, vertices_m = wide.kind.copy(), wide.face.copy(), wide.vertices_m.copy()
-        same = np.zeros(kind.shape, dtype=bool)
-        lids = self.corners_m, self.lid_m, self.lid_face
-        ends_m = room.tx_m, room.rx_m[candidates.rx]
-        walls = _lower(kind, face, vertices_m, same, (self.walls_m, room.top_m), lids, ends_m, interior)
-        lowered = replace(wide, kind=kind, face=face, vertices_m=vertices_m, same_wall=same)
-        return lowered.rows(np.flatnonzero((walls > 0) & (walls <= self.max_walls)))
-
-
-@njit(cache=True)
-def _lower(kind, face, vertices, same, walls, lids, ends, interior):
-    """Write the walls that candidates cross at their heights, in place; return numbers (C,), -1 if too many."""
-    (tx_m, targets), (walls_m, top_m) = ends, walls
-    crossings, most = np.zeros(len(kind), np.int64), kind.shape[1]
-    old_kind, old_face, old = np.empty(most, np.uint8), np.empty(most, np.int32), np.empty((most, 3))
-    for c in range(len(kind)):
-        old_kind[:], old_face[:], old[:] = kind[c], face[c], vertices[c]
-        kind[c], face[c], vertices[c] = 0, -1, 0.0
-        here, start, begin, count, d = tx_m, tx_m, np.int64(0), 0, 0
-        while count >= 0:
-            there = old[d] if old_kind[d] > 0 else targets[c]
-            count = _add_lids(here, there, lids, kind[c], face[c], vertices[c], count)
-            crossed = old_kind[d] == REFRACTION
-            if count < 0 or count >= most - 1:
-                crossings[c] = -1
-                break
-            if not crossed:
-                crossings[c] += _group(face[c], vertices[c], same[c], (begin, count), (start, there), walls_m, interior)
-            if old_kind[d] == 0:
-                break
-            if not crossed or there[2] <= top_m[old_face[d] // 2]:
-                kind[c, count], face[c, count], vertices[c, count] = old_kind[d], old_face[d], there
-                count += 1
-            if not crossed:
-                start, begin = there, count
-            here, d = there.copy(), d + 1
-    return crossings
-
-
-@njit(cache=True)
-def _add_lids(here, there, lids, kind, face, vertices, count):
-    """Add the tops that a segment crosses to `count` entries, in order; return their number, -1 if too many."""
-    corners, heights, faces = lids
-    first = count
-    for i in range(len(heights)):
-        if (here[2] - heights[i]) * (there[2] - heights[i]) >= 0.0:
-            continue
-        t = (heights[i] - here[2]) / (there[2] - here[2])
-        x, y = here[0] + t * (there[0] - here[0]), here[1] + t * (there[1] - here[1])
-        inside = True
-        for k in range(3):
-            a, b = corners[i, k], corners[i, (k + 1) % 3]
-            inside &= (b[0] - a[0]) * (y - a[1]) - (b[1] - a[1]) * (x - a[0]) >= -1e-9
-        if not inside or (count > first and face[count - 1] == faces[i]):
-            continue
-        if count >= len(kind) - 1:
-            return -1
-        at = count
-        while at > first and abs(vertices[at - 1, 2] - here[2]) > abs(heights[i] - here[2]):
-            kind[at], face[at], vertices[at] = kind[at - 1], face[at - 1], vertices[at - 1]
-            at -= 1
-        kind[at], face[at] = REFRACTION, faces[i]
-        vertices[at, 0], vertices[at, 1], vertices[at, 2] = x, y, heights[i]
-        count += 1
-    return count
-
-
-@njit(cache=True)
-def _group(face, vertices, same, span, ends, walls_m, interior):
-    (begin, end), (here, there) = span, ends
-    dx, dy = there[0] - here[0], there[1] - here[1]
-    length, cosine, found = max(np.hypot(dx, dy), 1e-9), np.ones(end - begin), np.empty(end - begin)
-    for j in range(end - begin):
-        vertex = vertices[begin + j]
-        found[j] = np.hypot(vertex[0] - here[0], vertex[1] - here[1]) / length
-        if face[begin + j] < 2 * len(walls_m):
-            wall = walls_m[face[begin + j] // 2]
-            wx, wy = wall[1, 0] - wall[0, 0], wall[1, 1] - wall[0, 1]
-            cosine[j] = abs(wx * dy - wy * dx) / (length * np.hypot(wx, wy))
-    return group_faces(interior, here, there, found, cosine, same[begin:end])
