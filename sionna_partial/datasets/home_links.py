@@ -194,7 +194,8 @@ def home_links(home: PartialMap, name: str, settings: DatasetSettings) -> LinkTa
     rng = np.random.default_rng(_home_seed(name, settings))
     seed, sensor = int(rng.integers(2**31)), home_sensor(name, settings)
     maps = explore_trajectory(home, settings.stages, seed, sensor=sensor, progress=False).maps
-    if settings.stages[-1] == 1.0 and len(maps) > 1 and maps[-1].is_nearly_complete:
+    by_fraction = not all(map(is_whole, settings.stages))
+    if by_fraction and settings.stages[-1] == 1 and maps[-1].is_nearly_complete:
         maps[-1] = enclosed_map(maps[-1])
     positions = _draw_positions(home, maps, name, settings, rng)
     inside, link_state, gain_db, cir = _truth(home, positions, settings)

@@ -466,11 +466,6 @@ def context_of(phi: LinkFeatures) -> LinkContext:
     return phi.context
 
 
-def excess_noise(wall_noise: Floats) -> Floats:
-    """Return the weight, 0 to 1, of the errors at full noise: a little noise causes most of them."""
-    return np.sqrt(np.maximum(wall_noise - LEAST_NOISE, 0.0) / (1.0 - LEAST_NOISE))
-
-
 def shifted_gain_db(gain_db: Any, shift_db: Any, ops: ModuleType = np) -> Any:
     """Shift gains by some dB, except the gains of outages."""
     return ops.where(gain_db > GAIN_FLOOR_DB, gain_db + shift_db, gain_db)
