@@ -8,7 +8,7 @@ gradients:
   missing; one that becomes invalid loses its power in a step, which has no derivative.
 - When the transmitter moves, lengths in unknown cells and in walls are the traced lengths times the ratio of
   `SmoothLengths`, as exact lengths have derivatives that jump; a length of 0 remains 0.
-- Map features, exposure and routes are bilinear between cells of 0.3 m.
+- Map features, exposure and routes are bilinear between cells of 0.3 m, and range noise between cells of the map.
 - On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
 
@@ -535,10 +535,12 @@ class DifferentiableLinks:
         unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
         ops, space, base_m = import_keras().ops, MapSpace.of(scene.partial), self.base.tx_m
         exposed = space.exposure_at(tx_m[None], ops) - space.exposure_at(base_m[None])
+        noise = by_differences(lambda at: scene.partial.noise_near(at["tx_m"][None]), {"tx_m": tx_m})
         return numeric | {
             "exposure": numeric["exposure"] + exposed[:, None] * np.array([1.0, 0.0]),
             "route": numeric["route"]
             + (space.routes(tx_m, self._paths.rx_m, ops) - space.routes(base_m, self._paths.rx_m)),
+            "wall_noise": numeric["wall_noise"] + 0.5 * (noise - scene.partial.noise_near(base_m[None])),
             "distance_m": distance_m,
             "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
             "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
