@@ -11,6 +11,7 @@ origin or orientation matter. A random walk, whose steps known walls stop, defin
 import itertools
 import math
 import weakref
+from collections import deque
 from functools import cached_property
 from typing import Any
 
@@ -46,7 +47,11 @@ _SEPARATE = 1e-9
 _FREE_ROUTE = math.log(2.0 * math.pi * (WALK_M / CELL_M) ** 2) - 0.5 * math.log(math.pi / 2.0)
 """Route in unobserved space without walls, less distance and half of its logarithm, in `WALK_M` (asymptote of K0)."""
 
+_FACTORS_KEPT = 8
+"""Number of maps with factors in memory, some 10 MB each."""
+
 _kept: dict[int, tuple[Any, "MapSpace"]] = {}
+_factorised: deque["MapSpace"] = deque()
 
 
 class MapSpace:
@@ -82,7 +87,8 @@ class MapSpace:
         inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
         fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
         self.image = np.stack(fractions, axis=-1).astype(np.float32)
-        self._walls = _sampled_walls(state == CellState.WALL, first, self._cells, self.shape)
+        walls = _sampled_walls(state == CellState.WALL, first, self._cells, self.shape)
+        self._conductances = _conductances(walls, self.shape)
 
     @classmethod
     def of(cls, partial: PartialMap) -> "MapSpace":
@@ -95,12 +101,22 @@ class MapSpace:
         return kept[1]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name != "_walk"}
+        return {name: value for name, value in vars(self).items() if name != "_factors"}
 
-    @cached_property
+    @property
     def _walk(self) -> Any:
-        """Factors of the operator of the walk, 1 - (WALK_M / CELL_M)^2 times the Laplacian between walls."""
-        across, down = _conductances(self._walls, self.shape)
+        """Factors of the operator of the walk; the latest maps keep them, at most `_FACTORS_KEPT`."""
+        factors = vars(self).get("_factors")
+        if factors is None:
+            factors = self._factors = self._factorised()
+            _factorised.append(self)
+            while len(_factorised) > _FACTORS_KEPT:
+                vars(_factorised.popleft()).pop("_factors", None)
+        return factors
+
+    def _factorised(self) -> Any:
+        """Return the factors of 1 - (WALK_M / CELL_M)^2 times the Laplacian between walls."""
+        across, down = (each.astype(np.float64) for each in self._conductances)
         numbers = np.arange(math.prod(self.shape)).reshape(self.shape)
         pairs = [(numbers[:, :-1], numbers[:, 1:], across), (numbers[:-1], numbers[1:], down)]
         weight = (WALK_M / CELL_M) ** 2
@@ -219,6 +235,6 @@ def _conductances(walls: Bools, shape: tuple[int, ...]) -> tuple[Floats, Floats]
 
     def across(lines: Bools, height: int, width: int) -> Floats:
         inner = lines[:, half : half + _PARTS * (width - 1)].reshape(height, _PARTS, width - 1, _PARTS)
-        return np.maximum((~inner.any(axis=3)).mean(axis=1), _SEPARATE)
+        return np.maximum((~inner.any(axis=3)).mean(axis=1), _SEPARATE).astype(np.float32)
 
     return across(walls, shape[0], shape[1]), across(walls.T, shape[1], shape[0]).T
