@@ -384,6 +384,8 @@ class DifferentiableLinks:
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
         self._phi = scene.model.features(paths.base.tx_m, paths.rx_m)
+        if not scene.model.by_mean_losses and doubt(feature_values(self._phi)).any():
+            assert scene.networks  # loaded here: a tape would watch variables that are made under it
 
     def __call__(
         self,

@@ -38,9 +38,10 @@ Parts = tuple[Any, Any, Any]
 
 
 def doubt(values: Mapping[str, Any], ops: Any = array_ops) -> Any:
-    """Return the doubt (N,) about the trace, 0 to 1."""
-    exposure = values["exposure"]
-    return 1.0 - ops.exp(-DOUBT_SCALE * (exposure[:, 0] + exposure[:, 1] + values["wall_noise"]))
+    """Return the doubt (N,) about the trace, 0 to 1; 1 for links without an observed end."""
+    exposure, unseen = values["exposure"], ~(values["tx_seen"] | values["rx_seen"])
+    doubts = 1.0 - ops.exp(-DOUBT_SCALE * (exposure[:, 0] + exposure[:, 1] + values["wall_noise"]))
+    return ops.where(unseen, 1.0, doubts)
 
 
 def traced_parts(traced: Any, gain_db: Any, ops: Any = array_ops) -> Parts:
