@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from predictor_links import QUIET, assert_symmetric, context_predictor, make_seen_links
+from predictor_links import QUIET, assert_symmetric, features, make_seen_links
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState, LinkState
@@ -135,9 +135,9 @@ class TestGate:
             phi = replace(phi, link_state=np.zeros(50), gain_db=np.full(50, -150.0), context=nothing)
         else:
             partial = sp.PartialMap(np.full((20, 20), CellState.UNKNOWN), 0.5)
-            ends = [(5.0, 5.0, 1.5), (5.0, 5.3, 1.5), (9.5, 9.5, 1.5), (300.0, -40.0, 1.0)]
-            phi = sp.LinkModel(partial).features((5.0, 5.001, 1.5), ends)
-        predictor = context_predictor("paths")
+            ends = [(5.0, 5.001, 1.5), (5.0, 5.3, 1.5), (9.5, 9.5, 1.5), (300.0, -40.0, 1.0)]
+            phi = features(partial, ends, tx_m=(5.0, 5.0, 1.5), gain_db=-150.0, state=OUTAGE)
+        predictor = sp.Predictor.load()
         inputs = gate_inputs(rule_values(phi, 28e9), predictor.predict(phi).by_state)
         assert inputs.shape == (len(phi), len(GATE_INPUTS))
         assert np.abs(inputs).max() < 50.0
@@ -166,6 +166,5 @@ def test_the_residual_is_about_gains_of_links_with_a_path():
     assert not wide[2][OUTAGE].any()
 
 
-@pytest.mark.parametrize("networks", ["paths", "map"])
-def test_predictions_are_symmetric_in_the_ends(networks):
-    assert_symmetric(context_predictor(networks), make_seen_links(300, seed=6)[0])
+def test_predictions_are_symmetric_in_the_ends():
+    assert_symmetric(sp.Predictor.load(), make_seen_links(300, seed=6)[0])
