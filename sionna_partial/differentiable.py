@@ -512,16 +512,16 @@ class DifferentiableLinks:
             inputs = {name: values[name][:, None] for name in GAIN_INPUTS}
             return free_db, distribution_by_paper(networks, inputs, self._phi.link_state, shift_db, ops)
         inputs, points = tf.cast(link_inputs(values, frequency_hz, shift_db, ops), tf.float32), None
-        if self._map_features is not None:
+        features = self._map_features()
+        if features is not None:
             ends_m = self.base.tx_m if tx_m is None else tx_m, self._paths.rx_m
             ends_m = tuple(tf.broadcast_to(end_m, self._paths.rx_m.shape) for end_m in ends_m)
-            points = MapSpace.of(self._scene.partial).read(self._map_features, line_points_m(*ends_m), ops)
+            points = MapSpace.of(self._scene.partial).read(features, line_points_m(*ends_m), ops)
         outputs = tf.cast(link_outputs(networks, inputs, points, ops), tf.float64)
         return free_db, expert_parts(outputs, free_db, context_of(self._phi).possible, ops)
 
-    @cached_property
     def _map_features(self) -> Any:
-        """Features (H, W, F) of the map, or None."""
+        """Return the features (H, W, F) of the map, which depend on the weights, or None."""
         networks, image = self._scene.networks, MapSpace.of(self._scene.partial).image
         return networks[MAP_NETWORK](image[None])[0] if MAP_NETWORK in networks else None
 

@@ -42,7 +42,7 @@ def values(exposure=0.0, noise=0.0, *, possible=True):
         "wall_noise": np.full(count, noise),
         "possible": np.full((count, 3), possible),
         "tx_seen": np.array([True, True, False, False]),
-        "rx_seen": np.array([True, False, True, False]),
+        "rx_seen": np.array([True, False, True, True]),
         "route": np.linspace(2.0, 5.0, count),
         "distance_m": np.linspace(1.0, 9.0, count),
         "unobserved_distance_m": np.linspace(0.0, 3.0, count),
@@ -82,6 +82,7 @@ def test_without_doubt_the_prediction_is_the_trace(gate):
 
 def test_doubt_grows_with_exposure_and_noise():
     assert doubt(values()).tolist() == [0.0] * 4
+    assert doubt(values() | {"rx_seen": np.array([True, False, True, False])}).tolist() == [0.0, 0.0, 0.0, 1.0]
     found = doubt(values(0.1, 0.02))
     np.testing.assert_allclose(found, 1.0 - np.exp(-DOUBT_SCALE * 0.12))
     for more in (values(0.11, 0.02), values(0.1, 0.03)):
