@@ -649,7 +649,7 @@ def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> No
 
     after.do(fail)
     other.waiting.pop()()
-    assert after.status == Status("a fault of ours", is_error=True)
+    assert after.status == Status("this failed (ValueError: 'a fault of ours').", is_error=True)
     after.upload_map([("mine.zip", content)])
     assert other.settle() == "Ready."
     after.close()
