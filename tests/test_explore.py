@@ -136,7 +136,7 @@ def test_stages_do_not_depend_on_which_are_asked_for(home, sensor):
             ({"steps": steps}, "give increasing whole numbers of 0 to 100,000")
             for steps in ((5, 5), (1.5,), 50, (10**9,))
         ),
-        *(({"steps": steps}, r"fractions of the free area in \[0, 1\)") for steps in ((0.5, 0.25), (0.5, 1.0))),
+        *(({"steps": steps}, r"fractions of the free area in \[0, 1\]") for steps in ((0.5, 0.25), (0.5, 1.5))),
         ({"seed": -1}, r"seed = -1 is not allowed: give a whole number of 0 or more\."),
         ({"policy": "haste"}, "policy = 'haste' is not allowed: choose one of random, coverage"),
         ({"policy": "coverage", "tx": (99.0, 0.0)}, "tx = .* is outside the map"),

@@ -51,7 +51,8 @@ Antenna azimuth_deg number [-360, 360], downtilt_deg number [-90, 90], rows whol
     beam whole [0, 4095]
 Transmitter x_m number [-1e+06, 1e+06], y_m number [-1e+06, 1e+06], z_m number [0, 1000], eirp_dbm number [-200, 200]
 RadioSettings frequency_hz number [1e+06, 1e+12], rx_height_m number [0, 1000], spacing_m number [0.02, 10],
-    bandwidth_hz number [1000, 1e+11], threshold_dbm number [-200, 100], eirp_dbm number [-200, 200]
+    bandwidth_hz number [1000, 1e+11], threshold_dbm number [-200, 100], eirp_dbm number [-200, 200],
+    client_dbm number [-200, 200]
 LinkBudget noise_figure_db number [0, 100], bandwidth_hz number [1, 1e+11], load number [0, 1],
     sinr_threshold_db number [-200, 200]
 LiveSettings threshold_db number [-150, 0], spacing_m number (0, 10], rx_height_m number [0, 100],
@@ -64,7 +65,7 @@ BESIDE = {
     ("DatasetSettings", "links_per_home"): {"transmitters_per_home": 1},
     ("DatasetSettings", "transmitters_per_home"): {"links_per_home": 1000},
     ("Antenna", "beam"): {"rows": 64, "columns": 64},
-    **{("Transmitter", name): {"x_m": 0.0, "y_m": 0.0} for name in ("x_m", "y_m", "z_m", "eirp_dbm")},
+    **{("Transmitter", name): {"x_m": 0.0, "y_m": 0.0} for name in ("x_m", "y_m", "z_m", "eirp_dbm", "model", "channel")},
 }
 """Other fields that make the ends of an interval valid."""
 
@@ -138,7 +139,7 @@ def test_switches(name: str, field: str) -> None:
 def test_texts(name: str, field: str) -> None:
     for value in (3, b"map", ["map"]):
         with pytest.raises(SettingsError, match=f"^{field}.* is not allowed: "):
-            CLASSES[name](**{field: value})
+            CLASSES[name](**BESIDE.get((name, field), {}), **{field: value})
 
 
 @pytest.mark.parametrize(

@@ -328,8 +328,8 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @cached_property
     def wall_noise(self) -> float:
-        """Range noise from the depth of uneven walls: 0 (exact) to 1."""
-        return wall_noise(self.state, self.resolution_m)
+        """Range noise from the depth of uneven walls: 0 (exact; always where the map is complete) to 1."""
+        return 0.0 if self.is_complete else wall_noise(self.state, self.resolution_m)
 
     @cached_property
     def _noise_field(self) -> Floats:

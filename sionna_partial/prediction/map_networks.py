@@ -70,6 +70,12 @@ The likelihood widens the 90 % intervals to cover long tails, such as the errors
 EXPERT_WEIGHT = 0.5
 """Weight of the score of the networks alone against the score of the mixture with the trace."""
 
+BATCH_STATISTICS = 0.6
+"""Fraction of the steps that normalise by the statistics of a batch; the last ones normalise as predictions do.
+
+Batches have maps of similar size, and so other statistics than all maps together.
+"""
+
 _WIDTHS = (12, 24, 32, 48)
 _HIDDEN_UNITS, _GATE_UNITS = 96, 24
 _LOS_MOST_DB = 10.0
@@ -364,7 +370,7 @@ def fit_context_networks(
     step = _gradient_step(networks, steps)
     losses = []
     for number, batch in enumerate(examples.batches(steps, np.random.default_rng(settings.seed))):
-        losses.append(float(step(*batch)))
+        losses.append(float(step(number < BATCH_STATISTICS * steps, *batch)))
         if progress and number % _REPORT_STEPS == 0:
             recent = np.mean(losses[-_REPORT_STEPS:])
             progress(number / steps, f"step {number} of {steps}, loss {recent:.4f}")
@@ -427,11 +433,11 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer, ops = adam_w(weights, steps), import_keras().ops
 
-    def step(columns: Any, images: Any = None, cells: Any = None, point_weights: Any = None) -> Any:
+    def step(of_batch: bool, columns: Any, images: Any = None, cells: Any = None, point_weights: Any = None) -> Any:
         with tf.GradientTape() as tape:
             points = None
             if images is not None:
-                features = tf.reshape(networks[MAP_NETWORK](images, training=True), (-1, MAP_FEATURES))
+                features = tf.reshape(networks[MAP_NETWORK](images, training=of_batch), (-1, MAP_FEATURES))
                 points = tf.reduce_sum(tf.gather(features, cells) * point_weights[..., None], axis=2)
             outputs = link_outputs(networks, columns["inputs"], points, ops)
             expert = expert_parts(outputs, columns["free_db"], columns["possible"], ops)
