@@ -322,7 +322,7 @@ def _truth(
     """Return inside (N,), link state, path gain [dB] and impulse response `CIR` of receivers."""
     inside = [home.state_at(rx) == CellState.FREE for rx in positions.rx_m]
     indoors = [rx[where] for rx, where in zip(positions.rx_m, inside, strict=True)]
-    links = _traced(home, positions.tx_m, indoors, settings)
+    links = _traced(home, positions.tx_m, indoors, settings, polarisations=2 if settings.cir_paths else 1)
     where = np.concatenate(inside)
     link_state = np.full(len(where), LinkState.OUTAGE, dtype=np.uint8)
     gain_db = np.full(len(where), GAIN_FLOOR_DB)
@@ -348,11 +348,16 @@ def _strongest(links: TracedLinks, count: int) -> tuple[Floats, Floats, Floats]:
 
 
 def _traced(
-    partial: PartialMap, tx_m: list[Floats], rx_m: list[Floats], settings: DatasetSettings
+    partial: PartialMap,
+    tx_m: list[Floats],
+    rx_m: list[Floats],
+    settings: DatasetSettings,
+    polarisations: Literal[1, 2] = 1,
 ) -> list[TracedLinks]:
     scene_settings = replace(settings.scene, material=settings.scene.traced_material)
     simulation = Simulation(partial, settings.trace, scene_settings)
-    return [simulation.links(*ends, polarisations=1, progress=False) for ends in zip(tx_m, rx_m, strict=True)]
+    pairs = zip(tx_m, rx_m, strict=True)
+    return [simulation.links(*ends, polarisations=polarisations, progress=False) for ends in pairs]
 
 
 def _features(maps: list[PartialMap], positions: _Positions, settings: DatasetSettings) -> list[LinkFeatures]:
