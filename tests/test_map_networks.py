@@ -30,7 +30,7 @@ from sionna_partial.prediction.map_networks import (
     scaled_inputs,
     symmetric,
 )
-from sionna_partial.prediction.paper_networks import STD_RANGE_DB, assemble, import_keras
+from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.settings import PredictorSettings
 
@@ -56,7 +56,7 @@ def networks():
         value = rng.normal(0.0, spread, shape)
         value = np.exp(value) if weight.path.endswith(("gamma", "variance")) else value
         weight.assign(np.asarray(symmetric(value)) if len(shape) == 4 else value)
-    return Network.from_keras(assemble(found)).layers
+    return {name: Network.from_keras(network) for name, network in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -212,7 +212,7 @@ def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
     monkeypatch.setattr(module, "LEARNING_RATE", 0.01)
     monkeypatch.setattr(module, "_WIDTHS", (8, 16))
     found = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=16))
-    networks = Network.from_keras(assemble(found)).layers
+    networks = {name: Network.from_keras(network) for name, network in found.items()}
     probabilities, means_db, _ = predict_by_context(networks, others, FREQUENCY_HZ, MapFeatures(networks))
     assert (probabilities.argmax(axis=0) == state).mean() > 0.9
     assert means_db[NLOS][state == NLOS].mean() == pytest.approx(GAIN_DB, abs=4.0)

@@ -65,7 +65,10 @@ BESIDE = {
     ("DatasetSettings", "links_per_home"): {"transmitters_per_home": 1},
     ("DatasetSettings", "transmitters_per_home"): {"links_per_home": 1000},
     ("Antenna", "beam"): {"rows": 64, "columns": 64},
-    **{("Transmitter", name): {"x_m": 0.0, "y_m": 0.0} for name in ("x_m", "y_m", "z_m", "eirp_dbm", "model", "channel")},
+    **{
+        ("Transmitter", name): {"x_m": 0.0, "y_m": 0.0}
+        for name in ("x_m", "y_m", "z_m", "eirp_dbm", "model", "channel")
+    },
 }
 """Other fields that make the ends of an interval valid."""
 

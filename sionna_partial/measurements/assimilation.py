@@ -636,7 +636,7 @@ def grouped(rx_m: Floats, received: Bools, most: int) -> tuple[NDArray[np.intp],
 
     Return the first measurement of each group, the group of each measurement, and the group sizes.
     """
-    edge_m, middle_m = 0.01, 0.5 * (rx_m.min(axis=0, initial=np.inf) + rx_m.max(axis=0, initial=-np.inf))
+    edge_m, middle_m = 0.01, 0.5 * (rx_m.min(axis=0) + rx_m.max(axis=0)) if len(rx_m) else np.zeros(3)
     while True:
         keys = np.column_stack([np.round((rx_m - middle_m) / edge_m), received])
         _, first, group, count = np.unique(keys, axis=0, return_index=True, return_inverse=True, return_counts=True)

@@ -16,10 +16,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+import sionna_partial.tracing.plan.layers as layers
+import sionna_partial.tracing.plan.views as views
 from sionna_partial.arrays import Floats
 from sionna_partial.process import in_order
 from sionna_partial.scene.outlines import PointBins
-from sionna_partial.tracing.plan import layers, views
 from sionna_partial.tracing.plan.clipping import Children, Clipped
 from sionna_partial.tracing.plan.room import Building, Room
 from sionna_partial.tracing.select import needs_by_distance
