@@ -76,7 +76,7 @@ def test_links_beside_noisy_walls_are_predicted_less_certainly(noisy: LinkTable)
     assert np.median((rough.gain_nlos_std_db - exact.gain_nlos_std_db)[both_seen]) > 0.0
     beside = both_seen & (context.wall_noise > 0.3)
     assert beside.sum() > 5
-    assert closed.gain_std_db[beside].min() > 0.5
+    assert closed.gain_std_db[beside].min() > 0.1
 
 
 def test_swapped_ends_are_predicted_alike(noisy: LinkTable) -> None:
