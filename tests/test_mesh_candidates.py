@@ -18,11 +18,11 @@ from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.mesh.faces import (
     PLANE_TOLERANCE_M,
     MeshPlanes,
+    Met,
     face_at,
     face_tree,
     faces_between,
     group_planes,
-    scratch,
 )
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import Rays, Sequences, collect_sequences, shoot_rays, view_sequences
@@ -199,7 +199,7 @@ def test_faces_between_points_are_those_of_brute_force() -> None:
     ball = trimesh.creation.icosphere(2, 1.0)
     ends = rng.uniform(-1.2, 1.2, (200, 2, 3))
     planes = planes_of(ball)
-    tree, met = face_tree(np.asarray(ball.triangles), planes.plane), scratch()
+    tree, met = face_tree(np.asarray(ball.triangles), planes.plane), Met.empty()
     for a, b in ends:
         count = faces_between(tree, a, b, -1, -1, met)
         inside = (np.linalg.norm([a, b], axis=1) < 0.97).sum()

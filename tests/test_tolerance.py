@@ -25,7 +25,7 @@ def test_the_tolerance_bounds_power_and_power_through_observed_space(frequency_h
         settings = sp.TraceSettings(frequency_hz, max_depth=3, power_tolerance_db=tolerance_db)
         simulation = sp.Simulation(partial, settings, sp.SceneSettings(material="drywall"))
         paths = simulation.blocks(tx_m, np.array(rx_m), no_progress, None, observed)
-        return features_of_paths(partial, tx_m, np.array(rx_m), paths, simulation.resolved, np.zeros((1, 1)))
+        return features_of_paths(partial, tx_m, np.array(rx_m), paths, simulation.resolved)
 
     every, some = features(0.0), features(0.1)
     np.testing.assert_allclose(some.gain_db, every.gain_db, atol=0.2)

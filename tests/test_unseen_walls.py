@@ -11,6 +11,7 @@ from sionna_partial.prediction.unseen_walls import (
     DISPERSION,
     LONGEST_M,
     WEIGHTS_FILE,
+    DirectLines,
     UnseenWalls,
     corrected,
     count_probabilities,
@@ -40,7 +41,7 @@ def unseen_home() -> list[Lines]:
 def test_no_walls_are_expected_in_what_is_known():
     model = sp.LinkModel(half_known(), trace_settings=WIFI)
     phi = model.features((4.0, 0.0, 1.5), [(x, 0.0, 1.5) for x in (6.0, 7.5, 9.0, 10.5)])
-    walls = UnseenWalls.shipped().of_map(model.partial).counts(phi)
+    walls = UnseenWalls.shipped().of_map(model.partial).counts(DirectLines.of(phi))
     assert walls[0] == 0.0
     assert (np.diff(walls) > 0.0).all()
     seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
@@ -66,7 +67,7 @@ def test_long_lines_have_as_many_walls_on_a_metre_as_the_longest_of_the_training
     model = sp.LinkModel(partial, trace_settings=sp.TraceSettings(5e9, max_depth=0))
     lengths_m = np.array([0.5, 1.0, 2.0, 4.0]) * LONGEST_M
     phi = model.features((5.0, 2.0, 1.5), [(5.0 + length_m, 2.0, 1.5) for length_m in lengths_m])
-    per_m = density.counts(phi) / lengths_m
+    per_m = density.counts(DirectLines.of(phi)) / lengths_m
     assert per_m[0] > per_m[1]
     np.testing.assert_allclose(per_m[2:], per_m[1], rtol=0.1)
 
