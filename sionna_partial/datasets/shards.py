@@ -10,7 +10,6 @@ import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
 from os import PathLike
 from pathlib import Path
 from typing import Any
@@ -127,7 +126,7 @@ class LinkTable(Shown):
         assert self.features.context is not None
         return self.features.context
 
-    @cached_property
+    @property
     def phi(self) -> LinkFeatures:
         """The features."""
         return self.features

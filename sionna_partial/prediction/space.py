@@ -24,6 +24,7 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.evaluate import array_ops
+from sionna_partial.prediction.unobserved import overlaps
 
 CELL_M = 0.3
 WALK_M = 2.0
@@ -82,7 +83,7 @@ class MapSpace:
         entered = _entered(state)
         masks = (state == CellState.FREE, state == CellState.WALL, entered)
         edges = [first[axis] + np.arange(self.shape[axis] + 1) * self._cells for axis in (0, 1)]
-        rows, columns = (_overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
+        rows, columns = (overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
         fractions = [rows @ mask.astype(np.float64) @ columns.T for mask in masks]
         inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
         fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
@@ -200,18 +201,6 @@ def _outside_is_entered(state: NDArray[np.uint8], entered: Bools) -> float:
     rim[1:-1, 1:-1] = False
     free = state == CellState.FREE
     return float((rim & (entered | free)).any() or not free.any())
-
-
-def _overlaps(edges: Floats, count: int) -> Any:
-    """Return the fractions (K, count), sparse, of intervals between `edges` (K + 1,) covered by unit cells."""
-    low, high = np.clip(edges[:-1], 0.0, count), np.clip(edges[1:], 0.0, count)
-    widest = math.ceil(float(edges[1] - edges[0])) + 1
-    cells = np.floor(low).astype(np.intp)[:, None] + np.arange(widest)
-    part = np.minimum(high[:, None], cells + 1) - np.maximum(low[:, None], cells)
-    part = np.where(cells < count, np.maximum(part, 0.0), 0.0) / (edges[1] - edges[0])
-    row = np.broadcast_to(np.arange(len(low))[:, None], cells.shape)
-    kept = part > 0.0
-    return sparse.csr_array((part[kept], (row[kept], cells[kept])), shape=(len(low), count)).toarray()
 
 
 def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, ...]) -> Bools:

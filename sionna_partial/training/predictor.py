@@ -130,7 +130,7 @@ def train(
     with reporting(progress) as report:
         report(0.0, f"training on {len(indoors)} links in {len(train_homes)} homes")
         predictor = Predictor.fit(
-            indoors.phi if settings.networks == "map" else indoors.features,
+            indoors.features,
             indoors.link_state,
             indoors.gain_db,
             homes=train_homes,
