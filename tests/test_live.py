@@ -223,7 +223,7 @@ def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     assert (grid.cost[percent != 0] == -1).all()
     assert (grid.unknown_cost[percent != -1] == -1).all()
     assert grid.cost.max() == grid.unknown_cost.max() == 98  # nav2 reads 99 and 100 as obstacles
-    assert len({*grid.cost.ravel().tolist()}) > 10
+    assert len({*grid.cost.ravel().tolist()}) > 5
     assert (grid.unknown_cost >= 0).sum() > 0.9 * (percent == -1).sum()
     assert [*Topics(unknown=True).messages(grid)][:2] == ["/radio/tx", "/radio/tx/unknown"]
     assert list(Topics().messages(grid)) == ["/radio/tx", "/radio/tx/filter_info"]
