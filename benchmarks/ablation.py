@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.datasets.shards import LinkTable, LinkTraces, open_links, require_like, settings_for
-from sionna_partial.evaluation import DEFINITIONS, Metrics, home_scores, mean_and_error, measure
 from sionna_partial.files import atomic_write
-from sionna_partial.reports import markdown_table
+from sionna_partial.lab.datasets.shards import LinkTable, LinkTraces, open_links, require_like, settings_for
+from sionna_partial.lab.evaluation import DEFINITIONS, Metrics, home_scores, mean_and_error, measure
+from sionna_partial.lab.reports import markdown_table
+from sionna_partial.lab.training.predictor import split_homes
 from sionna_partial.settings import NetworkKind
-from sionna_partial.training.predictor import split_homes
 
 SEED = 0
 """Of the split of the homes, and of the trainings."""
