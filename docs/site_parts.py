@@ -30,7 +30,7 @@ SECTIONS = {
     ],
     "Reference": [
         *("docs/method", "docs/results", "docs/model_card", "build/api/index"),
-        *("docs/development", "docs/experiments", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
+        *("docs/development", "benchmarks/README", "docs/experiments", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
     ],
 }
 """Pages of the sidebar, if they exist; other pages of `docs/` follow under "More"."""
