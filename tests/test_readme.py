@@ -105,7 +105,7 @@ def test_every_page_and_picture_is_linked() -> None:
         reached |= new
         new = {target for page in new for target, _ in links(page) if target in PAGES} - reached
     assert reached == set(PAGES)
-    assert set((ROOT / "docs").glob("*.png")) <= linked
+    assert {picture for end in ("png", "svg") for picture in (ROOT / "docs").glob(f"*.{end}")} <= linked
     for page in PAGES[1:]:
         assert README in {target for target, _ in links(page)}, f"{page.name} does not lead back"
 
@@ -116,7 +116,7 @@ def test_dates_of_figures_are_in_the_table_of_benchmarks() -> None:
 
 
 def test_every_command_is_in_the_table() -> None:
-    table = (ROOT / "docs" / "five_minutes.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
+    table = (ROOT / "docs" / "start.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
     rows = re.findall(r"^\| (`[^|]*) \|", table, flags=re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`([a-z-]+)", row)}
     assert named == typer.main.get_command(app).commands.keys()  # type: ignore[attr-defined]
