@@ -47,9 +47,7 @@ ROOMS = {
     "placement": "Calibration and placement",
     "exploration": "Homes and robots",
     "differentiable": "Gradients",
-    "datasets": "Data sets and training",
-    "training": "Data sets and training",
-    "evaluation": "Data sets and training",
+    "lab": "Data sets and training",
     "settings": "Settings",
 }
 """Headings of the API reference by room of the package; the names of other rooms follow under "More"."""

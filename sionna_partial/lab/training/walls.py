@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
-from sionna_partial.datasets.home_links import home_sensor, map_area, points_in
 from sionna_partial.exploration.explore import explore
+from sionna_partial.lab.datasets.home_links import home_sensor, map_area, points_in
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.map_networks import adam_w
 from sionna_partial.prediction.paper_networks import import_keras, tf

@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import Progress, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
-from sionna_partial.datasets.shards import Dataset, LinkTable, LinkTraces, open_links, require_like, stage_name
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError
 from sionna_partial.files import atomic_write, read_bytes
+from sionna_partial.lab.datasets.shards import Dataset, LinkTable, LinkTraces, open_links, require_like, stage_name
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor

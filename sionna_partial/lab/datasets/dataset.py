@@ -17,7 +17,10 @@ from distributed import Client, Future, KilledWorker, LocalCluster, wait
 from distributed.comm import parse_address, parse_host_port
 
 from sionna_partial.checks import CountProgress, require, require_number, require_whole, settings_or_default
-from sionna_partial.datasets.home_links import (
+from sionna_partial.display import Shown, counting
+from sionna_partial.errors import BackendError, OutputError, SettingsError
+from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
+from sionna_partial.lab.datasets.home_links import (
     Home,
     HomeResult,
     HomeSource,
@@ -29,10 +32,7 @@ from sionna_partial.datasets.home_links import (
     settings_record,
     stop_homes,
 )
-from sionna_partial.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
-from sionna_partial.display import Shown, counting
-from sionna_partial.errors import BackendError, OutputError, SettingsError
-from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
+from sionna_partial.lab.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
 from sionna_partial.settings import DatasetSettings
 

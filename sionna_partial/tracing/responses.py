@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import xarray as xr
@@ -16,12 +16,10 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import float_array, real_array, require, require_bool, require_number, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.settings import TraceSettings
 from sionna_partial.tracing.antennas import Antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, REFLECTION
-from sionna_partial.tracing.links import path_gain_db
-
-if TYPE_CHECKING:
-    from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db
 
 _log = logging.getLogger(__name__)
 
@@ -48,9 +46,12 @@ MAX_WEIGHT = 1e6
 
 @dataclass(frozen=True)
 class ArrayPaths:
-    """Paths of all links between antenna arrays."""
+    """Paths of all links between antenna arrays at `tx_m` (T, 3) and `rx_m` (N, 3)."""
 
-    paths: "TracedLinks"
+    paths: SolvedPaths
+    tx_m: Floats
+    rx_m: Floats
+    trace_settings: TraceSettings
     tx: Antennas
     rx: Antennas
     synthetic_array: bool
@@ -59,7 +60,10 @@ class ArrayPaths:
     @classmethod
     def of(
         cls,
-        paths: "TracedLinks",
+        paths: SolvedPaths,
+        tx_m: Floats,
+        rx_m: Floats,
+        trace_settings: TraceSettings,
         *,
         tx_array: Any = None,
         rx_array: Any = None,
@@ -70,23 +74,22 @@ class ArrayPaths:
     ) -> "ArrayPaths":
         for name, value in (("synthetic_array", synthetic_array), ("normalize_delays", normalize_delays)):
             require_bool(name, value)
-        if paths.trace_settings.power_tolerance_db:
-            _log_tolerance(paths.trace_settings.power_tolerance_db)
+        if trace_settings.power_tolerance_db:
+            _log_tolerance(trace_settings.power_tolerance_db)
         require(
             paths.transfer.shape[1:] == (2, 2),
             "transfer",
             paths.transfer.shape,
             "these paths were traced for one polarisation; trace the links with trace_links.",
         )
-        frequency_hz = paths.trace_settings.frequency_hz
-        tx_count, rx_count = len(paths.tx.reshape(-1, 3)), len(paths.rx)
-        tx = Antennas.of("tx", tx_array, tx_orientation_rad, count=tx_count, frequency_hz=frequency_hz)
-        rx = Antennas.of("rx", rx_array, rx_orientation_rad, count=rx_count, frequency_hz=frequency_hz)
-        return cls(paths, tx, rx, synthetic_array, normalize_delays)
+        frequency_hz = trace_settings.frequency_hz
+        tx = Antennas.of("tx", tx_array, tx_orientation_rad, count=len(tx_m), frequency_hz=frequency_hz)
+        rx = Antennas.of("rx", rx_array, rx_orientation_rad, count=len(rx_m), frequency_hz=frequency_hz)
+        return cls(paths, tx_m, rx_m, trace_settings, tx, rx, synthetic_array, normalize_delays)
 
     @property
     def links(self) -> int:
-        return len(self.paths.tx.reshape(-1, 3)) * len(self.paths.rx)
+        return len(self.tx_m) * len(self.rx_m)
 
     @property
     def antennas(self) -> str:
@@ -95,7 +98,7 @@ class ArrayPaths:
     @cached_property
     def first(self) -> Indices:
         """Return the first path of each link, and the number of paths: (links + 1,)."""
-        return np.searchsorted(self.paths.path_link, np.arange(self.links + 1))
+        return np.searchsorted(self.paths.link(len(self.rx_m)), np.arange(self.links + 1))
 
     @property
     def most(self) -> int:
@@ -149,12 +152,12 @@ class ArrayPaths:
 
     def _carrier(self, delay_s: NDArray[np.floating[Any]]) -> NDArray[np.complex64]:
         """Return exp(-j 2 pi f delay); single precision is rounded as in Sionna RT."""
-        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.paths.trace_settings.frequency_hz)
+        per_second = delay_s.dtype.type(-2.0 * np.pi) * delay_s.dtype.type(self.trace_settings.frequency_hz)
         return phasors(per_second * delay_s)
 
     def plane_waves(self, rows: slice) -> tuple[NDArray[np.complex64], NDArray[np.complex64], NDArray[np.complex64]]:
         """Return gains between patterns (P, K_rx, K_tx), and phases at the antennas of both arrays."""
-        radians = 2.0 * np.pi * self.paths.trace_settings.frequency_hz / SPEED_OF_LIGHT_M_S
+        radians = 2.0 * np.pi * self.trace_settings.frequency_hz / SPEED_OF_LIGHT_M_S
         at_rx, at_tx = (phasors(radians * each) for each in self._advances_m(rows))
         return self._gains(rows), at_rx, at_tx
 
@@ -176,7 +179,7 @@ class ArrayPaths:
         Reflected paths are straight from the image of the transmitter, paths over vertical edges in the unfolded half
         planes. Other edges and diffuse reflections keep their points.
         """
-        unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self.paths, rows), self._advances_m(rows)
+        unfolded, (at_rx_m, at_tx_m) = Unfolded.of(self, rows), self._advances_m(rows)
         rotations = self.rx.rotations(self.paths.path_rx[rows]), self.tx.rotations(self.paths.path_tx[rows])
         length_m = SPEED_OF_LIGHT_M_S * np.asarray(self.paths.delay_s[rows])[:, None, None]
         between = rotations[0].transpose(0, 2, 1) @ unfolded.before @ rotations[1]
@@ -196,7 +199,7 @@ class ArrayPaths:
 
 @cache
 def _log_tolerance(tolerance_db: float) -> None:
-    message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: links.with_every_path(scene)"
+    message = "channels lack paths that change powers by up to power_tolerance_db = %g dB: Simulation.with_every_path"
     _log.info("%s has all", message % tolerance_db)
 
 
@@ -254,10 +257,11 @@ class Unfolded:
     upright: Bools
 
     @classmethod
-    def of(cls, paths: "TracedLinks", rows: slice) -> "Unfolded":
+    def of(cls, arrays: ArrayPaths, rows: slice) -> "Unfolded":
+        paths = arrays.paths
         types, vertices_m = np.asarray(paths.interactions[rows]), np.asarray(paths.vertices_m[rows])
-        rx_m = paths.rx[paths.path_rx[rows]]
-        here_m, (count, depth) = paths.tx.reshape(-1, 3)[paths.path_tx[rows]], types.shape
+        rx_m = arrays.rx_m[paths.path_rx[rows]]
+        here_m, (count, depth) = arrays.tx_m[paths.path_tx[rows]], types.shape
         points_m = np.concatenate([vertices_m, rx_m[:, None]], axis=1)
         points_m = np.where(np.isnan(points_m), rx_m[:, None], points_m)
         mirrored, length_m = np.tile(np.eye(3), (count, 1, 1)), np.zeros(count)
@@ -303,9 +307,8 @@ class Unfolded:
         return length_m(rx_moved_m, tx_moved_m) - length_m(still, still)
 
 
-def cir(paths: "TracedLinks", *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
+def cir(arrays: ArrayPaths, memory_gb: float = MEMORY_GB) -> xr.Dataset:
     """See `TracedLinks.cir`."""
-    arrays = ArrayPaths.of(paths, **options)
     pairs = len(arrays.rx) * len(arrays.tx)
     path_bytes = 8 * pairs + 8 * (1 if arrays.synthetic_array else pairs)
     what = f"{arrays.antennas} x {arrays.most} paths"
@@ -327,12 +330,11 @@ _A = {"long_name": "complex baseband gain of the path", "units": "1"}
 _DELAY = {"long_name": "propagation delay, NaN where there is no path", "units": "s"}
 
 
-def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **options: Any) -> xr.Dataset:
+def cfr(arrays: ArrayPaths, frequencies_hz: ArrayLike, memory_gb: float = MEMORY_GB) -> xr.Dataset:
     """See `TracedLinks.cfr`."""
-    arrays = ArrayPaths.of(paths, **options)
     remedy = "give frequencies relative to the carrier [Hz], such as those of subcarriers: (F,) numbers."
     offsets_hz = float_array("frequencies_hz", frequencies_hz, SettingsError, remedy)
-    carrier_hz = paths.trace_settings.frequency_hz
+    carrier_hz = arrays.trace_settings.frequency_hz
     inside = offsets_hz.ndim == 1 and offsets_hz.size > 0 and bool((np.abs(offsets_hz) < carrier_hz).all())
     require(inside, "frequencies_hz", frequencies_hz, f"{remedy[:-1]} below the carrier of {carrier_hz:g} Hz.")
 
@@ -346,17 +348,14 @@ def cfr(paths: "TracedLinks", frequencies_hz: ArrayLike, *, memory_gb: float = M
 
 
 def taps(
-    paths: "TracedLinks",
+    arrays: ArrayPaths,
     bandwidth_hz: float,
     l_min: int = FIRST_TAP,
     l_max: int | None = None,
-    *,
     memory_gb: float = MEMORY_GB,
-    **options: Any,
 ) -> xr.Dataset:
     """See `TracedLinks.taps`."""
     require_number("bandwidth_hz", bandwidth_hz, 0.0, 1e12, open_low=True)
-    arrays = ArrayPaths.of(paths, **options)
     if l_max is None:
         delay_s = np.asarray(arrays.paths.delay_s)[:, None, None]
         counted_s = _after_shortest(delay_s, arrays.first) if arrays.normalize_delays else delay_s
@@ -402,15 +401,14 @@ def _filtered(
 
 
 def labelled(arrays: ArrayPaths, variables: dict[str, Any]) -> xr.Dataset:
-    each, count = arrays.paths, len(arrays.paths.rx)
+    count, tx_m, metre = len(arrays.rx_m), arrays.tx_m, {"units": "m"}
     tx, rx = np.divmod(np.arange(arrays.links), max(1, count))
-    tx_m, metre = each.tx.reshape(-1, 3), {"units": "m"}
-    positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), each.rx[rx], metre)}
+    positions = {"tx_m": (("link", "axis"), tx_m[tx], metre), "rx_m": (("link", "axis"), arrays.rx_m[rx], metre)}
     if any("tx_ant" in dims for dims, *_ in variables.values()):
         positions |= arrays.antenna_positions()
     attributes = {
-        **{"frequency_hz": each.trace_settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
-        "power_tolerance_db": each.trace_settings.power_tolerance_db,
+        **{"frequency_hz": arrays.trace_settings.frequency_hz, "transmitters": len(tx_m), "receivers": count},
+        "power_tolerance_db": arrays.trace_settings.power_tolerance_db,
         **{"synthetic_array": int(arrays.synthetic_array), "normalize_delays": int(arrays.normalize_delays)},
     }
     coordinates = {"tx": ("link", tx), "rx": ("link", rx), "axis": ["x", "y", "z"]}
@@ -427,18 +425,18 @@ def require_memory(arrays: ArrayPaths, link_bytes: int, what: str, memory_gb: fl
         )
 
 
-def spreads(links: "TracedLinks") -> xr.Dataset:
+def spreads(paths: SolvedPaths, gain_db: Floats) -> xr.Dataset:
     """See `TracedLinks.spreads`."""
-    link, power = links.path_link, np.abs(links.a) ** 2
+    link, power = paths.link(gain_db.shape[-1]), paths.power
 
     def total(values: Floats) -> Floats:
-        return np.bincount(link, values, links.gain_db.size).astype(np.float64)
+        return np.bincount(link, values, gain_db.size).astype(np.float64)
 
     with np.errstate(divide="ignore", invalid="ignore"):
         all_power = total(power)
-        mean_s = total(power * links.delay_s) / all_power
-        delay_s = np.sqrt(total(power * (links.delay_s - mean_s[link]) ** 2) / all_power)
-        direct = total(power * (links.interactions == 0).all(axis=1))
+        mean_s = total(power * paths.delay_s) / all_power
+        delay_s = np.sqrt(total(power * (paths.delay_s - mean_s[link]) ** 2) / all_power)
+        direct = total(power * paths.is_direct)
         k_factor_db = np.where(direct > 0.0, 10.0 * np.log10(direct / (all_power - direct).clip(0.0)), np.nan)
 
         def angular_rad(angle: Floats) -> Floats:
@@ -447,33 +445,27 @@ def spreads(links: "TracedLinks") -> xr.Dataset:
 
         angles = {
             f"{name}_{end}_spread_rad": angular_rad(values[:, column])
-            for end, values in (("departure", links.departure_rad), ("arrival", links.arrival_rad))
+            for end, values in (("departure", paths.departure_rad), ("arrival", paths.arrival_rad))
             for column, name in enumerate(("zenith", "azimuth"))
         }
     values: dict[str, NDArray[Any]] = {
-        "path_loss_db": np.where(all_power > 0.0, -links.gain_db.ravel(), np.nan),
+        "path_loss_db": np.where(all_power > 0.0, -gain_db.ravel(), np.nan),
         "k_factor_db": k_factor_db,
         "delay_spread_s": delay_s,
         **angles,
     }
     units = {name: name.rpartition("_")[2].replace("db", "dB") for name in values}
     table = {
-        name: (("tx", "rx")[2 - links.gain_db.ndim :], each.reshape(links.gain_db.shape), {"units": units[name]})
+        name: (("tx", "rx")[2 - gain_db.ndim :], each.reshape(gain_db.shape), {"units": units[name]})
         for name, each in values.items()
     }
     return xr.Dataset(table, attrs={"source": "3GPP TR 38.901, sections 7.5 and A.1"})
 
 
 def beam_gains(
-    paths: "TracedLinks",
-    codebook: ArrayLike,
-    rx_codebook: ArrayLike | None = None,
-    *,
-    memory_gb: float = MEMORY_GB,
-    **antennas: Any,
+    arrays: ArrayPaths, codebook: ArrayLike, rx_codebook: ArrayLike | None, memory_gb: float = MEMORY_GB
 ) -> xr.Dataset:
     """See `TracedLinks.beam_gains`."""
-    arrays = ArrayPaths.of(paths, **antennas)
     at_tx = _weights("codebook", codebook, arrays.tx)
     at_rx = _weights("rx_codebook", np.eye(len(arrays.rx)) if rx_codebook is None else rx_codebook, arrays.rx).conj()
     pairs = len(at_rx) * len(at_tx)

@@ -19,7 +19,8 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
-from sionna_partial.maps.drawing_lines import (
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
+from sionna_partial.maps.importers.drawing_lines import (
     HIDDEN,
     LINE_TYPES,
     NO_WALL,
@@ -33,7 +34,6 @@ from sionna_partial.maps.drawing_lines import (
     unit_of,
     wall_thickness,
 )
-from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_RESOLUTION_M,
     crossed_cells,

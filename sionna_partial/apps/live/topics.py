@@ -17,11 +17,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from sionna_partial.apps.live.answers import LiveAnswer, LiveTransmitter, LiveViews
+from sionna_partial.apps.live.coverage import LiveCoverage
 from sionna_partial.checks import Checked, require, require_whole, shown
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.live.answers import LiveAnswer, LiveTransmitter, LiveViews
-from sionna_partial.live.coverage import LiveCoverage
-from sionna_partial.maps.bags import GRID, MAX_MESSAGE_BYTES, open_recording
+from sionna_partial.maps.importers.bags import GRID, MAX_MESSAGE_BYTES, open_recording
 from sionna_partial.resources import optional_packages
 
 MOST_FRAMES = 1000

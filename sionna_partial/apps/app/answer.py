@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sionna_partial.app.radio import MOST_TRANSMITTERS, RadioSettings
+from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Checked, require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState

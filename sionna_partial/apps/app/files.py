@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sionna_partial.app.jobs import logged_warnings
-from sionna_partial.app.radio import MOST_TRANSMITTERS, RadioSettings, Transmitter, require_name
+from sionna_partial.apps.app.jobs import logged_warnings
+from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings, Transmitter, require_name
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import require, shown
 from sionna_partial.constants import (

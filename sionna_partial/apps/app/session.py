@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sionna_partial.app.answer import NETWORK_LAYERS, Answer, View, answer_png
-from sionna_partial.app.drawing import LENGTH, STROKES, Plan, Source, Stroke, drawn, read_again, uploaded_source
-from sionna_partial.app.files import (
+from sionna_partial.apps.app.answer import NETWORK_LAYERS, Answer, View, answer_png
+from sionna_partial.apps.app.drawing import LENGTH, STROKES, Plan, Source, Stroke, drawn, read_again, uploaded_source
+from sionna_partial.apps.app.files import (
     FILES,
     Project,
     coverage_file,
@@ -24,8 +24,8 @@ from sionna_partial.app.files import (
     uploaded_map,
     uploaded_project,
 )
-from sionna_partial.app.jobs import Status, WindowJobs, collected_warnings
-from sionna_partial.app.radio import (
+from sionna_partial.apps.app.jobs import Status, WindowJobs, collected_warnings
+from sionna_partial.apps.app.radio import (
     MOST_TRANSMITTERS,
     PRESETS,
     RadioSettings,
@@ -38,6 +38,7 @@ from sionna_partial.app.radio import (
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, require, require_choice
 from sionna_partial.constants import COARSER, GAIN_FLOOR_DB, CellState
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.coverage.network import network_map
 from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError
@@ -419,7 +420,7 @@ class Session(WindowJobs):
 
         def coverage(of: str, where: PartialMap, spacing_m: float, report: Progress, **given: Any) -> xr.Dataset:
             model = self._model(of, where, settings)
-            return model.coverage(tx_m, spacing_m=spacing_m, progress=report, **of_links, **given)
+            return predict_map(model, tx_m, spacing_m=spacing_m, progress=report, **of_links, **given)
 
         def steps(report: Progress) -> Iterator[Callable[[], None]]:
             coarse_m = COARSER * settings.spacing_m

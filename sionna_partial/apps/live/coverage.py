@@ -15,6 +15,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter
 
+from sionna_partial.apps.live.answers import LiveAnswer, LiveGrid, LiveTransmitter, LiveViews, MapMessage
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import (
     Checked,
@@ -30,12 +31,11 @@ from sionna_partial.checks import (
 )
 from sionna_partial.constants import COARSER, COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
-from sionna_partial.coverage.job import grid_axes
+from sionna_partial.coverage.job import grid_axes, predict_map
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
-from sionna_partial.live.answers import LiveAnswer, LiveGrid, LiveTransmitter, LiveViews, MapMessage
-from sionna_partial.maps.bags import map_of_percent, occupancy_parts
+from sionna_partial.maps.importers.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
@@ -306,7 +306,7 @@ class LiveCoverage:
     def _warm_up(self) -> None:
         """Load libraries, networks and kernels before the first map comes."""
         room = PartialMap(np.array([[1, 1, 1, 1], [1, 0, 0, 2], [1, 1, 1, 1]], dtype=np.uint8), 1.0)
-        LinkModel(room, **self._model_settings).coverage((1.5, 1.5, 1.5), spacing_m=0.5, progress=False)
+        predict_map(LinkModel(room, **self._model_settings), (1.5, 1.5, 1.5), spacing_m=0.5, progress=False)
 
     def start(self) -> threading.Thread:
         """Call `run` in a thread."""
@@ -439,7 +439,8 @@ class LiveCoverage:
         if beyond_m > FARTHEST_M:
             remedy = f"more than {FARTHEST_M:g} m: check its unit and its frame."
             raise PositionError(f"tx {name} is {beyond_m:.0f} m outside the map, {remedy}")
-        coverage = self._model.coverage(
+        coverage = predict_map(
+            self._model,
             tx_m,
             spacing_m=self.settings.spacing_m * (1 if is_final else COARSER),
             rx_height_m=self.settings.rx_height_m,

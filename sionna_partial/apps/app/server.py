@@ -8,10 +8,10 @@ import socket
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from sionna_partial.app.drawing import Source
-from sionna_partial.app.files import FILES, MOST_BYTES, UPLOADED_SUFFIXES
-from sionna_partial.app.page import TEMPLATE, Page
-from sionna_partial.app.session import Session
+from sionna_partial.apps.app.drawing import Source
+from sionna_partial.apps.app.files import FILES, MOST_BYTES, UPLOADED_SUFFIXES
+from sionna_partial.apps.app.page import TEMPLATE, Page
+from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 

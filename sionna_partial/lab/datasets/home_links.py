@@ -32,10 +32,10 @@ from scipy import ndimage
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import is_whole, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.shards import CIR, INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.files import SCENE_FILES, temporary_folder
+from sionna_partial.lab.datasets.shards import CIR, INDEX_FILE, LinkTable, shard_metadata, shard_path, write_shard
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
@@ -482,7 +482,7 @@ class _HomeProcess:
         own = {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": str(scratch)}
         with far_end:
             descriptor = far_end.fileno()
-            code = f"from sionna_partial.datasets.home_links import serve; serve({descriptor})"
+            code = f"from sionna_partial.lab.datasets.home_links import serve; serve({descriptor})"
             self._process = subprocess.Popen(
                 [sys.executable, "-P", "-c", code],
                 stdin=subprocess.PIPE,

@@ -9,9 +9,9 @@ from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.app.answer import LAYERS, LEVELS, Answer, View
-from sionna_partial.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
-from sionna_partial.app.radio import MOST_TRANSMITTERS
+from sionna_partial.apps.app.answer import LAYERS, LEVELS, Answer, View
+from sionna_partial.apps.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
+from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap

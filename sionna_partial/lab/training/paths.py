@@ -17,7 +17,8 @@ from sionna_partial.prediction.features import traced_unobserved_m
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.path_model import STATES, LinkGeometry, PathModel, survival_inputs, wrapped
 from sionna_partial.tracing.antennas import directions
-from sionna_partial.tracing.links import TracedLinks, path_gain_db
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import path_gain_db
 from sionna_partial.tracing.simulation import trace_links
 from sionna_partial.worlds.homes import make_home
 

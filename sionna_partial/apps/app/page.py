@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.app.answer import LAYERS, LIKELY, NETWORK_LAYERS, OUTLINES, Answer
-from sionna_partial.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
-from sionna_partial.app.files import FILES
-from sionna_partial.app.picture import Picture
-from sionna_partial.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, PRESETS
-from sionna_partial.app.session import MORE_STEPS, ROUNDING_M, Session
+from sionna_partial.apps.app.answer import LAYERS, LIKELY, NETWORK_LAYERS, OUTLINES, Answer
+from sionna_partial.apps.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
+from sionna_partial.apps.app.files import FILES
+from sionna_partial.apps.app.picture import Picture
+from sionna_partial.apps.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, PRESETS
+from sionna_partial.apps.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_viewer import server_codes

@@ -7,9 +7,9 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from sionna_partial.datasets.shards import stage_name
-from sionna_partial.evaluation import DEFINITIONS, Difference, Evaluation, Row
 from sionna_partial.files import atomic_files
+from sionna_partial.lab.datasets.shards import stage_name
+from sionna_partial.lab.evaluation import DEFINITIONS, Difference, Evaluation, Row
 
 REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
 

@@ -8,14 +8,14 @@ from typing import Any, TypeAlias
 
 import shapely
 
-from sionna_partial.app.files import Project, stored_map
-from sionna_partial.app.jobs import logged_warnings
+from sionna_partial.apps.app.files import Project, stored_map
+from sionna_partial.apps.app.jobs import logged_warnings
 from sionna_partial.arrays import States
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import DRAWING_SUFFIXES, IFC_SUFFIXES, PICTURE_SUFFIXES, WALL_THICKNESS_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding
-from sionna_partial.maps.drawings import read_picture, wall_shades
+from sionna_partial.maps.importers.drawings import read_picture, wall_shades
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 
