@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.tracing.power import reflection_loss_db
 
@@ -48,7 +49,7 @@ class Trial:
     undetermined: tuple[str, ...]
     used: int
     seconds: float
-    result: sp.MaterialCalibration
+    result: MaterialCalibration
 
 
 def main() -> None:
@@ -126,7 +127,7 @@ def trial(
     )
 
 
-def loss_errors(result: sp.MaterialCalibration, hidden: sp.Material) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def loss_errors(result: MaterialCalibration, hidden: sp.Material) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Errors of the loss of a reflection and stated deviations (2, 5) [dB]; NaN where nearly nothing is reflected."""
     errors, deviations = [], []
     for polarisation in ("te", "tm"):
