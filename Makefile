@@ -7,6 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 BIN := .venv/bin
 READY := .venv/.ready
+KERNELS := .venv/.kernels
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
 CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
@@ -16,12 +17,12 @@ FRACTIONS := --mixed-sensors --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --sta
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
-.PHONY: help demo test check core kernels kernels-plan kernels-mesh suite docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test check core kernels kernels-plan kernels-mesh kernels-beams kernels-paths suite docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
-demo: $(READY) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
+demo: $(KERNELS) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
 	@$(BIN)/sionna-partial demo --out demo-output
 
 test: kernels ## Check style and types, and run the tests (PAGES=1: and all pages; builds the site)
@@ -39,7 +40,7 @@ check: $(READY) ## Check style and types, and run the tests of the core, in two 
 core: $(READY)
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -q $(CORE)
 
-kernels-plan kernels-mesh: kernels-%: $(READY)
+kernels-plan kernels-mesh kernels-beams kernels-paths: kernels-%: $(READY)
 	@$(ONE_THREAD) $(if $(filter mesh,$*),nice) $(BIN)/python tests/compile_kernels.py $*
 
 docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
@@ -113,4 +114,9 @@ $(READY): requirements.lock pyproject.toml install_locked.py
 	"$$python" -m venv --clear .venv
 	@$(BIN)/python install_locked.py
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(KERNELS): $(READY)
+	@echo "compiling, once (half a minute)"
+	@$(MAKE) --no-print-directory -j 2 kernels-beams kernels-paths
 	@touch $@
