@@ -41,6 +41,10 @@ _FILE_NAMES = {
     "project": "Save the project",
 }
 
+_FIXED = {"sizing_mode": "fixed"}
+_NARROW = {"width": 128, **_FIXED}
+"""Widths [pixels] of fields beside longer texts, which may be cut off on a phone."""
+
 _AREA_HINT = "Drag around the area, or click on its corners and double-click on the last one."
 _UPLOAD = "document.getElementById(id).click()"
 _COPY = """
@@ -90,7 +94,7 @@ class Page:
             Select(title="Layer", name="layer", value="p_above", options=self._options(1)),
             lambda name: session.look(layer=name),
         )
-        self.which = self._on(Select(title="Shown for", value=""), transmitter)
+        self.which = self._on(Select(title="Shown for", value="", **_NARROW), transmitter)
         self.truth = self._on(
             Select(title="Computed for", value="", options=list[Any](_COMPUTED_FOR.items())),
             lambda value: session.look(truth=bool(value)),
@@ -100,7 +104,13 @@ class Page:
             lambda value: session.set(threshold_dbm=float(value)),
         )
         self.outline = self._on(
-            Select(title="Line at the threshold", name="outline", value="p_above", options=list[Any](OUTLINES.items())),
+            Select(
+                title="Line at the threshold",
+                name="outline",
+                value="p_above",
+                options=list[Any](OUTLINES.items()),
+                **_NARROW,
+            ),
             lambda name: session.look(outline=name),
         )
         presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
@@ -167,7 +177,7 @@ class Page:
         models: list[Any] = [(name, name or "own power") for name in MODELS]
         self.model = self._on(Select(title="Kind", name="model", options=models), lambda name: self._change(model=name))
         self.channel = self._on(
-            Select(title="Channel", name="channel", value=""), lambda name: self._change(channel=name)
+            Select(title="Channel", name="channel", value="", **_NARROW), lambda name: self._change(channel=name)
         )
         self.goal = Spinner(title="Covered floor [%]", name="goal", low=1, high=100, step=1, value=95)
         self.most = Spinner(title="At most", name="most", low=1, high=MOST_TRANSMITTERS, step=1, value=4)
@@ -178,7 +188,7 @@ class Page:
         )
         self.aims = {
             name: self._on(
-                Spinner(title=title, name=name, step=5, low=low, high=high, format="0.[0]"),
+                Spinner(title=title, name=name, step=5, low=low, high=high, format="0.[0]", width=85, **_FIXED),
                 functools.partial(self._change_antenna, name),
                 "value_throttled",
             )
@@ -545,7 +555,8 @@ class Page:
         self.links.text = " ".join(links) if partial is not None else ""
         title = "Map" if answer is None else answer.title(view, threshold_dbm)
         settings = session.settings if answer is None else answer.settings
-        self.picture.plot.title.text = title if partial is None else f"{title}\n{settings.text(partial)}"
+        text = " " if partial is None else settings.text(partial)
+        self.picture.plot.title.text = f"{title}\n{text}"  # two lines always: their space is found once
 
     def _show_values(self) -> None:
         answer, threshold_dbm = self.session.answer, self.session.settings.threshold_dbm
@@ -565,7 +576,8 @@ def _pair(*models: Any) -> Any:
     from bokeh.layouts import row
 
     for model in models:
-        model.sizing_mode, model.width = "stretch_width", None
+        if model.sizing_mode != "fixed":
+            model.sizing_mode, model.width = "stretch_width", None
     return row(*models, sizing_mode="stretch_width")
 
 

@@ -94,6 +94,7 @@ class Picture:
             sizing_mode="stretch_both",
             x_axis_label="x [m]",
             y_axis_label="y [m]",
+            title="Map\n ",
             tools="pan,wheel_zoom,box_zoom,reset",
             active_drag=None,
             active_scroll=None,
@@ -143,6 +144,7 @@ class Picture:
             "unseen": LegendItem(label={"value": "not observed"}, renderers=[unseen]),
         }
         look: dict[str, Any] = {"orientation": "horizontal", "border_line_color": None, "padding": 0, "margin": 2}
+        look["spacing"] = 10
         plot.add_layout(Legend(items=[*self.keys.values()], label_text_font_size="12px", **look), "above")
 
     def _add_marks(self) -> None:

@@ -14,7 +14,7 @@ from sionna_partial.maps.partial_map import PartialMap, nearest_free_m
 from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings, material_name
 from sionna_partial.tracing.antennas import Antenna
 
-MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS, _LONGEST_CHANNEL = 10, 1000, 30_000, 8
+MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS, _LONGEST_CHANNEL = 10, 1000, 10_000, 8
 
 FINEST_M = 0.15
 """Default spacing of receivers [m]."""

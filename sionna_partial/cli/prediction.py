@@ -75,7 +75,10 @@ def predict(
     pixel: opt.Pixel = None,
     receivers: Annotated[
         str,
-        typer.Option(metavar="indoor|anywhere|inside", help="Receivers; outdoors in outage, or omitted (inside)."),
+        typer.Option(
+            metavar="indoor|anywhere|inside|near",
+            help="Receivers; outdoors in outage or omitted (inside), or within 1 m of free cells (near).",
+        ),
     ] = "indoor",
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
