@@ -1,5 +1,7 @@
 """Public names and the modules that define them: `__init__.py` loads a module when a name of it is first used."""
 
+from sionna_partial.apps.live.coverage import LiveCoverage as LiveCoverage
+from sionna_partial.apps.live.coverage import LiveSettings as LiveSettings
 from sionna_partial.calibration.calibration import MaterialCalibration as MaterialCalibration
 from sionna_partial.calibration.calibration import calibrate_materials as calibrate_materials
 from sionna_partial.channels.files import load_channels as load_channels
@@ -10,11 +12,8 @@ from sionna_partial.constants import CellState as CellState
 from sionna_partial.constants import LinkState as LinkState
 from sionna_partial.coverage.job import predict_map as predict_map
 from sionna_partial.coverage.network import network_map as network_map
-from sionna_partial.datasets.dataset import build_dataset as build_dataset
-from sionna_partial.datasets.shards import read_dataset as read_dataset
 from sionna_partial.differentiable import DifferentiableScene as DifferentiableScene
 from sionna_partial.errors import SionnaPartialError as SionnaPartialError
-from sionna_partial.evaluation import evaluate as evaluate
 from sionna_partial.exploration.explore import Exploration as Exploration
 from sionna_partial.exploration.explore import explore as explore
 from sionna_partial.exploration.explore import explore_trajectory as explore_trajectory
@@ -24,18 +23,20 @@ from sionna_partial.exploration.next_views import next_views as next_views
 from sionna_partial.export import load_coverage as load_coverage
 from sionna_partial.export import save_coverage as save_coverage
 from sionna_partial.export import save_network as save_network
+from sionna_partial.lab.datasets.dataset import build_dataset as build_dataset
+from sionna_partial.lab.datasets.shards import read_dataset as read_dataset
+from sionna_partial.lab.evaluation import evaluate as evaluate
+from sionna_partial.lab.training.predictor import train as train
 from sionna_partial.link_model import LinkModel as LinkModel
-from sionna_partial.live.coverage import LiveCoverage as LiveCoverage
-from sionna_partial.live.coverage import LiveSettings as LiveSettings
-from sionna_partial.maps.bags import map_from_bag as map_from_bag
-from sionna_partial.maps.bags import map_from_occupancy as map_from_occupancy
-from sionna_partial.maps.drawings import map_from_drawing as map_from_drawing
+from sionna_partial.maps.importers.bags import map_from_bag as map_from_bag
+from sionna_partial.maps.importers.bags import map_from_occupancy as map_from_occupancy
+from sionna_partial.maps.importers.drawings import map_from_drawing as map_from_drawing
+from sionna_partial.maps.importers.points import map_from_points as map_from_points
+from sionna_partial.maps.importers.simulators import map_from_habitat as map_from_habitat
+from sionna_partial.maps.importers.simulators import map_from_slam as map_from_slam
 from sionna_partial.maps.map_files import load_map as load_map
 from sionna_partial.maps.map_files import map_from_array as map_from_array
-from sionna_partial.maps.map_files import map_from_habitat as map_from_habitat
-from sionna_partial.maps.map_files import map_from_slam as map_from_slam
 from sionna_partial.maps.map_files import save_map as save_map
-from sionna_partial.maps.mesh.points import map_from_points as map_from_points
 from sionna_partial.maps.partial_map import PartialMap as PartialMap
 from sionna_partial.measurements.assimilation import Assimilation as Assimilation
 from sionna_partial.measurements.measurements import Measurements as Measurements
@@ -76,7 +77,6 @@ from sionna_partial.tracing.gradients import gain_gradients as gain_gradients
 from sionna_partial.tracing.links import TracedLinks as TracedLinks
 from sionna_partial.tracing.simulation import Simulation as Simulation
 from sionna_partial.tracing.simulation import trace_links as trace_links
-from sionna_partial.training.predictor import train as train
 from sionna_partial.worlds.homes import make_home as make_home
 
 __version__: str

@@ -107,7 +107,7 @@ def test_no_gain_exceeds_its_bound() -> None:
 
 def test_a_warm_model_keeps_antennas_apart() -> None:
     model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=1, diffraction=False))
-    first, other, again = (model.coverage(TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
+    first, other, again = (sp.predict_map(model, TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
     xr.testing.assert_identical(first, again)
     assert float(abs(other["gain_mean_db"] - first["gain_mean_db"]).max()) > 5.0
 

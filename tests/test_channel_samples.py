@@ -6,9 +6,9 @@ from coverage_cases import shipped
 
 import sionna_partial as sp
 from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.lab.training.paths import example, fit_path_model
 from sionna_partial.resources import scenes_folder
 from sionna_partial.tracing.antennas import planar_array
-from sionna_partial.training.paths import example, fit_path_model
 
 TX = (7.0, 9.8, 1.5)
 

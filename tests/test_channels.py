@@ -14,10 +14,10 @@ from test_trace import _room
 from traced import made_links
 
 import sionna_partial as sp
-from sionna_partial.channels import responses
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
 from sionna_partial.scene.scene import export_scene
+from sionna_partial.tracing import responses
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 
@@ -206,8 +206,8 @@ def test_channels_have_the_paths_of_their_links() -> None:
     """Channels are sums of fields: weak paths count, which links have by request."""
     settings = [sp.TraceSettings(max_depth=3, power_tolerance_db=tolerance_db) for tolerance_db in (None, 0.0, 0.1)]
     links, every, written = (sp.trace_links(_room(), TX, RX[:2], trace_settings=each) for each in settings)
-    assert every.with_every_path(_room()) is every
-    completed = links.with_every_path(_room())
+    assert sp.Simulation(_room()).with_every_path(every) is every
+    completed = sp.Simulation(_room()).with_every_path(links)
     assert len(links.a) == len(written.a) < len(every.a)
     for name, arguments in (("cfr", ([-1e8, 1e8],)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
         found = [getattr(each, name)(*arguments) for each in (links, written, completed, every)]

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
-from sionna_partial.app.files import stored_map
+from sionna_partial.apps.app.files import stored_map
 from sionna_partial.channels.files import load_channels
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import load_coverage

@@ -11,7 +11,7 @@ from predictor_links import QUIET, quick_predictor
 
 from sionna_partial.cli.learning import DEFAULT_HOMES, FIRST_SEED
 from sionna_partial.constants import CellState
-from sionna_partial.datasets.home_links import home_sources
+from sionna_partial.lab.datasets.home_links import home_sources
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor

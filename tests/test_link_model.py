@@ -43,18 +43,18 @@ def half_open(cell):
 
 def test_updated_as_new_to_the_byte(maps, tx):
     model = sp.LinkModel(maps[0])
-    first = model.coverage(tx, spacing_m=0.5)
+    first = sp.predict_map(model, tx, spacing_m=0.5)
     xr.testing.assert_identical(first, sp.predict_map(maps[0], tx, spacing_m=0.5))
     for partial in (maps[1], maps[0]):
         model.update(partial)
-        fresh = sp.LinkModel(partial).coverage(tx, spacing_m=0.5)
-        for warm in (model.coverage(tx, spacing_m=0.5), sp.predict_map(model, tx, spacing_m=0.5)):
-            xr.testing.assert_identical(warm, fresh)
+        fresh = sp.predict_map(sp.LinkModel(partial), tx, spacing_m=0.5)
+        warm = sp.predict_map(model, tx, spacing_m=0.5)
+        xr.testing.assert_identical(warm, fresh)
 
 
 def test_coverage_is_predict(maps, tx):
     model = sp.LinkModel(maps[0], "paper")
-    coverage = model.coverage(tx, spacing_m=1.0)
+    coverage = sp.predict_map(model, tx, spacing_m=1.0)
     y, x = np.nonzero(coverage["valid"].to_numpy())
     rx = np.column_stack([coverage.x[x], coverage.y[y], np.full(len(x), 1.5)])
     prediction = model.predict([tx, tx], rx)
@@ -153,7 +153,7 @@ def test_any_chain_of_updates_is_a_new_model(first, start, tmp_path):
 def test_positions_are_float64_in_any_form():
     model = sp.LinkModel(two_rooms("plan"))
     forms = [(1, 1), np.float32([1, 1]), np.array([1, 1], np.uint8), (1.0, 1.0, 1.5)]
-    found = [model.coverage({"a": form, "b": form}, spacing_m=1.0) for form in forms]
+    found = [sp.predict_map(model, {"a": form, "b": form}, spacing_m=1.0) for form in forms]
     for coverage in found:
         assert np.all(coverage["tx_z"] == 1.5)
         np.testing.assert_array_equal(coverage["gain_mean_db"], found[0]["gain_mean_db"])

@@ -11,10 +11,10 @@ import pytest
 from PIL import Image
 
 import sionna_partial as sp
+from sionna_partial.apps.live import topics
+from sionna_partial.apps.live.answers import LiveGrid, LiveTransmitter, LiveViews
+from sionna_partial.apps.live.topics import Listener, Topics
 from sionna_partial.errors import SettingsError
-from sionna_partial.live import topics
-from sionna_partial.live.answers import LiveGrid, LiveTransmitter, LiveViews
-from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
 TX = (1.5, 1.5, 1.5)

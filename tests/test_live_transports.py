@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 import sionna_partial as sp
 from sionna_partial import cli
-from sionna_partial.live import topics as topics_module
-from sionna_partial.live.topics import (
+from sionna_partial.apps.live import topics as topics_module
+from sionna_partial.apps.live.topics import (
     CONNECTION_TYPE,
     FILTER_TYPE,
     GRID_TYPE,
@@ -53,7 +53,7 @@ LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25", "--frequency", "28GHz"
 ROBOT = """
 import sys, time
 from test_live_transports import GRID, GRID_TYPE
-from sionna_partial.live.topics import Dds, Topics, filled
+from sionna_partial.apps.live.topics import Dds, Topics, filled
 robot = Dds(Topics(map="/unused"), {})
 writer = robot._writer("/map", GRID_TYPE)
 writer.write(filled(GRID_TYPE, GRID))

@@ -28,13 +28,13 @@ def model(half_seen: sp.PartialMap) -> sp.LinkModel:
 
 @pytest.fixture(scope="module")
 def coverage(model: sp.LinkModel) -> xr.Dataset:
-    return model.coverage(TX, spacing_m=0.4)
+    return sp.predict_map(model, TX, spacing_m=0.4)
 
 
 def test_the_map_of_each_transmitter_is_that_of_a_call_of_its_own(
     model: sp.LinkModel, coverage: xr.Dataset, tmp_path: Path
 ) -> None:
-    alone = model.coverage(TX["east"], spacing_m=0.4)
+    alone = sp.predict_map(model, TX["east"], spacing_m=0.4)
     for name, values in alone.data_vars.items():
         np.testing.assert_array_equal(coverage.sel(tx="east")[name], values)
     assert repr(coverage.sel(tx="east").radio) == repr(alone.radio)
@@ -114,7 +114,7 @@ def test_channels_divide_the_interference() -> None:
 
 def test_any_transmitter_covers_at_least_as_much_as_each(half_seen: sp.PartialMap, model: sp.LinkModel) -> None:
     tx = {"on a receiver": (1.0, 1.0, 1.5), "in the unseen": (4.6, 2.6, 1.5)}
-    coverage = model.coverage(tx, spacing_m=0.4)
+    coverage = sp.predict_map(model, tx, spacing_m=0.4)
     assert (coverage["valid"].any("tx") & ~coverage["valid"].all("tx")).sum() == 2
     for threshold_dbm in (-90.0, -60.0, -40.0):
         each, together = (coverage.radio.area(threshold_dbm, any_transmitter=every) for every in (False, True))

@@ -11,7 +11,7 @@ from predictor_links import QUIET, quick_predictor
 import sionna_partial as sp
 from sionna_partial.calibration.material_fit import Posterior
 from sionna_partial.errors import SettingsError
-from sionna_partial.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
+from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
 from sionna_partial.plots.result_plots import (
     ANGLES_DEG,
     plot_calibration,

@@ -32,8 +32,8 @@ from sionna_partial.prediction.path_model import LinkGeometry, PathModel, surviv
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.links import TracedLinks, path_gain_db, unnamed_counts
-from sionna_partial.tracing.paths import SolvedPaths, path_order
+from sionna_partial.tracing.links import TracedLinks, unnamed_counts
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db, path_order
 from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:

@@ -128,8 +128,8 @@ def train(
     the homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.datasets.shards import open_links, settings_for
-        from sionna_partial.reports import summary
+        from sionna_partial.lab.datasets.shards import open_links, settings_for
+        from sionna_partial.lab.reports import summary
 
         links, traces = open_links(folders)
         settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
@@ -153,7 +153,7 @@ def evaluate(
     set that the predictor was not trained on are test homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.reports import REPORT_FILES, save_report, summary
+        from sionna_partial.lab.reports import REPORT_FILES, save_report, summary
 
         result = sp.evaluate(predictor, folders, progress=report)
         save_report(result, out)

@@ -210,7 +210,7 @@ def _topics(
         bool, typer.Option("--publish-unknown", help="Publish predictions for unknown cells, at PREFIX/NAME/unknown.")
     ] = False,
 ) -> Any:
-    from sionna_partial.live.topics import Topics
+    from sionna_partial.apps.live.topics import Topics
 
     parsed = []
     for option, texts in (("--power", power), ("--connection", connection)):
@@ -277,11 +277,11 @@ def live(
     robot: Any = None
     settings = replace(settings, every_unknown=topics.unknown)
     if bag is None and rosbridge:
-        from sionna_partial.live.topics import Rosbridge
+        from sionna_partial.apps.live.topics import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.live.topics import Dds
+        from sionna_partial.apps.live.topics import Dds
 
         robot = Dds(topics, positions, domain)
 
@@ -323,7 +323,7 @@ def _live_positions(tx: list[str], names: list[str], topics: Any) -> dict[str, A
 
 
 def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
-    from sionna_partial.live.topics import Listener, replay
+    from sionna_partial.apps.live.topics import Listener, replay
 
     thread = coverage.start() if rate else None
     replay(Listener(coverage, topics), bag, rate)
@@ -354,9 +354,9 @@ def open_app(
     browser: Annotated[bool, typer.Option(help="Whether the page is opened in a browser.")] = True,
 ) -> None:
     """Serve a page on which transmitters are dragged over a map, and the coverage follows, until Ctrl-C."""
-    from sionna_partial.app.drawing import uploaded_source
-    from sionna_partial.app.jobs import collected_warnings, logged_warnings
-    from sionna_partial.app.server import AppServer
+    from sionna_partial.apps.app.drawing import uploaded_source
+    from sionna_partial.apps.app.jobs import collected_warnings, logged_warnings
+    from sionna_partial.apps.app.server import AppServer
 
     partial, source = None, None
     with collected_warnings() as warnings, logged_warnings():

@@ -93,7 +93,10 @@ class Kind(NamedTuple):
         return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=covariance)
 
     def _learnt(self, others: Sequence[tuple[Floats, Floats]], within: Floats) -> tuple[float, Floats, Floats]:
-        """Return the log-evidence of a covariance (2, 2) between transmitters, and the new mean and covariance."""
+        """Update the prior by other transmitters, whose offset and factor vary with the covariance `within` (2, 2).
+
+        Return the log-evidence of this covariance, and the new mean and covariance.
+        """
         precision, shift, log_p = np.zeros((2, 2)), np.zeros(2), 0.0
         for own_precision, own_shift in others:
             scattered = np.linalg.inv(np.eye(2) + own_precision @ within)

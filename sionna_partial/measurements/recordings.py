@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M
 from sionna_partial.errors import MeasurementError
-from sionna_partial.maps.bags import GRID, Message, Recording, open_recording
+from sionna_partial.maps.importers.bags import GRID, Message, Recording, open_recording
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.measurements.measurements import Measurements
 

@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
-from sionna_partial.datasets.shards import stage_name
-from sionna_partial.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration
+from sionna_partial.lab.datasets.shards import stage_name
+from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.placement.several import NetworkPlacement
 from sionna_partial.plots.style import (
@@ -36,7 +36,7 @@ from sionna_partial.settings import Material
 from sionna_partial.tracing.power import reflection_loss_db
 
 if TYPE_CHECKING:
-    from sionna_partial.evaluation import Evaluation, Row  # reads data sets with pyarrow, which is optional
+    from sionna_partial.lab.evaluation import Evaluation, Row  # reads data sets with pyarrow, which is optional
 
 _WIDTH_IN, _DPI = 9.0, 130
 _STAR: dict[str, Any] = STAR | {"markersize": 15}

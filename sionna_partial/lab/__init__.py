@@ -1,0 +1,1 @@
+"""Data sets of links, training of networks, their evaluation, and reports of it."""
