@@ -39,7 +39,7 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, require, require_choice
 from sionna_partial.constants import COARSER, GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.job import predict_map
-from sionna_partial.coverage.network import network_map
+from sionna_partial.coverage.network import predict_network
 from sionna_partial.display import part_of
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError
 from sionna_partial.exploration.explore import explore_trajectory
@@ -438,7 +438,7 @@ class Session(WindowJobs):
             answer = replace(answer, coverage=found, is_final=True)
             if len(tx_m) > 1:
                 report(0.7, "SINR of the network")
-                network = network_map(
+                network = predict_network(
                     found,
                     tx_power_dbm=eirp_dbm,
                     bandwidth_hz=settings.bandwidth_hz,
@@ -537,7 +537,7 @@ class Session(WindowJobs):
             report(0.2, "planning channels")
             powers_dbm = network.attrs["tx_power_dbm"]
             given = {"bandwidth_hz": settings.bandwidth_hz, "standard": settings.schemes[0] or None}
-            found = network_map(answer.coverage, tx_power_dbm=powers_dbm, channels=channels, **given)
+            found = predict_network(answer.coverage, tx_power_dbm=powers_dbm, channels=channels, **given)
             yield functools.partial(take, found)
 
         self.begin(work)

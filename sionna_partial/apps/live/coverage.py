@@ -100,8 +100,8 @@ class LiveSettings(Checked):
 
     Examples
     --------
-    >>> import sionna_partial as sp
-    >>> sp.LiveSettings(threshold_db=-95.0).spacing_m
+    >>> from sionna_partial.apps.live.coverage import LiveSettings
+    >>> LiveSettings(threshold_db=-95.0).spacing_m
     0.15
     """
 
@@ -164,10 +164,10 @@ class LiveCoverage:
 
     Examples
     --------
-    >>> import sionna_partial as sp
     >>> from types import SimpleNamespace as Message
+    >>> from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
     >>> grids = []
-    >>> live = sp.LiveCoverage((1.5, 1.5, 1.5), grids.append, sp.LiveSettings(spacing_m=0.5))
+    >>> live = LiveCoverage((1.5, 1.5, 1.5), grids.append, LiveSettings(spacing_m=0.5))
     >>> origin = Message(position=Message(x=0.0, y=0.0), orientation=Message(x=0.0, y=0.0, z=0.0, w=1.0))
     >>> info = Message(resolution=1.0, width=4, height=3, origin=origin)
     >>> live.on_map(Message(info=info, data=[100, 100, 100, 100, 100, 0, 0, 100, 100, 100, 100, 100]))
