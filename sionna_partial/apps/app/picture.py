@@ -71,8 +71,7 @@ _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
 
 class Picture:
     def __init__(self) -> None:
-        from bokeh.models import ColumnDataSource, DataRange1d, FixedTicker, LinearColorMapper
-        from bokeh.plotting import figure
+        from bokeh.models import ColumnDataSource, FixedTicker, LinearColorMapper
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
         of_values = ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)
@@ -88,22 +87,7 @@ class Picture:
         self.routes = ColumnDataSource({"xs": [], "ys": []})
         self.measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
         self.poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
-        plot: Any = figure(
-            x_range=DataRange1d(range_padding=0.02),
-            y_range=DataRange1d(range_padding=0.02),
-            match_aspect=True,
-            sizing_mode="stretch_both",
-            x_axis_label="x [m]",
-            y_axis_label="y [m]",
-            title="Map\n ",
-            tools="pan,wheel_zoom,box_zoom,reset",
-            active_drag=None,
-            active_scroll=None,
-            min_border_bottom=_BELOW_PIXELS,
-            background_fill_color="#d9dce0",
-        )
-        self.plot = plot
-        plot.toolbar.logo, plot.grid.visible, plot.title.text_font_size = None, False, "12px"
+        plot = self.plot = _empty_plot()
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         self._mappers = LinearColorMapper(palette=[*_GROUND], low=-0.5), LinearColorMapper(palette=[*_WALLS], low=-0.5)
         greys = [f"#{shade:02x}{shade:02x}{shade:02x}" for shade in range(256)]
@@ -279,6 +263,28 @@ class Picture:
             "angle": [math.radians(view.heading_deg - 90.0) for view in shown],
             "rank": [str(number) for number in range(1, len(shown) + 1)],
         }
+
+
+def _empty_plot() -> Any:
+    from bokeh.models import DataRange1d
+    from bokeh.plotting import figure
+
+    plot: Any = figure(
+        x_range=DataRange1d(range_padding=0.02),
+        y_range=DataRange1d(range_padding=0.02),
+        match_aspect=True,
+        sizing_mode="stretch_both",
+        x_axis_label="x [m]",
+        y_axis_label="y [m]",
+        title="Map\n ",
+        tools="pan,wheel_zoom,box_zoom,reset",
+        active_drag=None,
+        active_scroll=None,
+        min_border_bottom=_BELOW_PIXELS,
+        background_fill_color="#d9dce0",
+    )
+    plot.toolbar.logo, plot.grid.visible, plot.title.text_font_size = None, False, "12px"
+    return plot
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:
