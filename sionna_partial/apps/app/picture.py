@@ -24,12 +24,15 @@ _UNSELECT = "points.selection_manager.clear()"
 
 _STROKE = """
 const is_area = mode.value == encloses
-if (mode.value == "" || name == "doubletap" && !is_area) return
-const {x, y} = cb_obj, data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
+if (mode.value == "" || name == "doubletap" && !(is_area && live.data.x.length)) return
+const {x, y} = cb_obj, near_m = (range.end - range.start) / 100
+const again = is_area && name == "tap" && live.data.x.length > 2 &&
+    Math.hypot(live.data.x.at(-1) - x, live.data.y.at(-1) - y) < near_m // a slow double click is two of them
+const data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
 const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
 xs.push(x); ys.push(y)
 const drawn = {x: xs, y: ys, r: xs.map(() => wide.includes(mode.value) ? brush.value / 2 : 0)}
-const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
+const is_done = name == "panend" || again || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
@@ -169,7 +172,7 @@ class Picture:
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
-        given |= {"straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
+        given |= {"range": self.plot.x_range, "straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
         for name in ("panstart", "pan", "panend", "tap", "doubletap"):
             self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
         code = f"area.visible = mode.value == '{AREA}'; live.data = {{x: [], y: [], r: []}}"
