@@ -99,6 +99,10 @@ def write_api() -> None:
         lines += [heading, "-" * len(heading), "", ".. autosummary::", "   :toctree: .", ""]
         lines += [*(f"   {name}" for name in members), ""]
     API.mkdir(parents=True, exist_ok=True)
+    listed = {f"sionna_partial.{name}" for members in names.values() for name in members}
+    for page in API.glob("sionna_partial.*.rst"):  # of an earlier build, with other names
+        if page.stem not in listed:
+            page.unlink()
     text = "\n".join(lines)
     page = API / "index.rst"
     if not page.exists() or page.read_text(encoding="utf-8") != text:
