@@ -12,8 +12,10 @@ KERNELS := .venv/.kernels
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
 CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
 	network outlines partial_map predictor ros_map scene settings slab trace unobserved)
-LEARNED_FROM := build/predictor/{camera,mixed,large}
-FRACTIONS := --mixed-sensors --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
+DATASET = $(BIN)/sionna-partial dataset build/predictor
+LEARNED_FROM := build/predictor/{camera,mixed,lidar,large,large_lidar}
+STAGES := --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
+LARGE := --kind hall --kind warehouse --kind floor --short-links 0.5
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
@@ -74,15 +76,16 @@ lock: $(READY) ## Lock the newest allowed dependencies from PyPI in requirements
 scenes: $(READY) ## Make the demo scenes again (scenes/)
 	@$(BIN)/python scenes/make_scenes.py
 
-predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
+predictor: $(READY) ## Train predictors like the shipped ones, and put them there (sionna_partial/predictors/)
 	@rm -rf build/predictor
-	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 135 --first-seed 330000 --links 160
-	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 94 --first-seed 320000 $(FRACTIONS)
-	@$(BIN)/sionna-partial dataset build/predictor/large --homes 54 --first-seed 350000 $(FRACTIONS) \
-		--kind hall --kind warehouse --kind floor --short-links 0.5
+	@$(DATASET)/camera --homes 300 --first-seed 330000 --links 160
+	@$(DATASET)/mixed --homes 184 --first-seed 320000 --mixed-sensors $(STAGES)
+	@$(DATASET)/lidar --homes 30 --first-seed 340000 --field-of-view 360 --range 12 $(STAGES)
+	@$(DATASET)/large --homes 54 --first-seed 350000 --mixed-sensors $(STAGES) $(LARGE)
+	@$(DATASET)/large_lidar --homes 65 --first-seed 360000 --field-of-view 360 --range 20 $(STAGES) $(LARGE)
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --passes 22 --test-fraction 0.1 --out build/predictor/$$networks; \
+			--networks $$networks --passes 12 --test-fraction 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
+from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.tracing.power import reflection_loss_db
 
@@ -51,7 +52,7 @@ class Trial:
     undetermined: tuple[str, ...]
     used: int
     seconds: float
-    result: sp.MaterialCalibration
+    result: MaterialCalibration
 
 
 def main() -> None:
@@ -135,7 +136,7 @@ def random_material(rng: np.random.Generator) -> sp.Material:
     return sp.Material(float(permittivity), float(conductivity_s_m))
 
 
-def loss_errors(result: sp.MaterialCalibration, hidden: sp.Material) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def loss_errors(result: MaterialCalibration, hidden: sp.Material) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Errors of the loss of a reflection (2, 5) [dB], and truth in its interval; NaN where hardly any is reflected."""
     errors, held, posterior = [], [], result.posteriors[0]
     for polarisation in ("te", "tm"):

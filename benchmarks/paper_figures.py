@@ -183,7 +183,7 @@ def split(homes: Homes, train: list[str], test: list[str]) -> tuple[Homes, Homes
 
 def all_links(homes: Homes, count: int, repetition: int) -> LinkTable:
     """Trace links of all homes at all stages, with receivers indoors."""
-    settings = sp.DatasetSettings(links_per_home=count, seed=repetition)
+    settings = sp.lab.DatasetSettings(links_per_home=count, seed=repetition)
     links = LinkTable.concatenate(home_links(home, name, settings) for name, home in homes.items())
     return links.take(~links.anywhere)
 

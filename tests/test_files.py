@@ -293,8 +293,8 @@ def test_file_size_limit_leaves_whole_files(tmp_path: Path) -> None:
     calls: dict[str, Callable[[Path], object]] = {
         "npz": lambda path: sp.save_map(partial, path),
         "yaml": lambda path: sp.save_map(partial, path),
-        "nc": lambda path: sp.save_channels(links, path, progress=False),
-        "zarr": lambda path: sp.save_channels(links.cir(), path, progress=False),
+        "nc": lambda path: sp.channels.save_channels(links, path, progress=False),
+        "zarr": lambda path: sp.channels.save_channels(links.cir(), path, progress=False),
         "scene": lambda path: sp.export_scene(partial, path),
     }
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

@@ -2,6 +2,7 @@
 
 import ast
 import json
+import operator
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 import pytest
+from public_names import EVERY, GROUPS, TOP
 
 import sionna_partial
 from sionna_partial.display import _COMPILING
@@ -166,6 +168,21 @@ NOT_IMPORTED = {
 
 COME_WITH = {"contourpy": "matplotlib", "drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
 """Imported packages that a declared one cannot do without, and which it therefore installs in a version that fits."""
+
+
+NAMES_OF_0_1 = """
+    Assimilation CellState ChannelSamples DatasetSettings DifferentiableScene Exploration GainGradients LinkFeatures
+    LinkPrediction LinkState Material MaterialCalibration Measurements NetworkPlacement NextView NextViews
+    PartialMap PlacementSettings Predictor PredictorSettings SceneSettings SensorSettings SionnaPartialError
+    TraceSettings TracedLinks TransmitterPlacement animate_exploration build_dataset calibrate_materials
+    dft_codebook evaluate explore explore_trajectory export_scene gain_gradients link_features load_channels
+    load_coverage load_map make_home map_from_array map_from_bag map_from_drawing map_from_habitat
+    map_from_occupancy map_from_points map_from_slam measurements_from_bag network_map next_views place_transmitter
+    place_transmitters plot_calibration plot_coverage plot_exploration plot_map plot_network plot_network_placement
+    plot_next_views plot_placement poses_from_bag predict_map read_dataset sample_channels save_channels
+    save_coverage save_map save_network trace_links train
+"""
+"""Public names of version 0.1.0."""
 
 
 @cache
@@ -341,11 +358,24 @@ class TestPublicNames:
     def test_names_resolve_to_what_they_say(self) -> None:
         for module in MODULES:
             import_module(f"sionna_partial.{module}")
-        for name in sionna_partial.__all__:
-            value = getattr(sionna_partial, name)
+        for name, value in EVERY.items():
             assert not isinstance(value, ModuleType)
-            assert getattr(value, "__name__", name) == name
+            assert getattr(value, "__name__", name) == name.rpartition(".")[2]
         assert dir(sionna_partial) == sorted(sionna_partial.__all__)
+
+    def test_there_are_few(self) -> None:
+        assert len(TOP) <= 40
+        assert {*sionna_partial.__all__} == {*TOP, *GROUPS, "__version__"}
+
+    def test_names_of_version_0_1_warn_and_are_the_same_objects(self) -> None:
+        for name in sorted({*NAMES_OF_0_1.split()} - {*TOP}):
+            message = rf"^sionna_partial\.{name} is deprecated: use sionna_partial\.[\w.]*\w\.$"
+            with pytest.warns(DeprecationWarning, match=message) as warned:
+                found = getattr(sionna_partial, name)
+            there = str(warned[0].message).rpartition(" sionna_partial.")[2].removesuffix(".")
+            assert operator.attrgetter(there)(sionna_partial) is found
+            assert warned[0].filename == __file__
+            assert found.__name__ in (name, "predict_network")
 
     def test_unknown_name(self) -> None:
         with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):

@@ -53,7 +53,7 @@ class TestDataset:
 
 
 def test_defaults_of_train(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = arguments_of(monkeypatch, "train", "train", dataset, "--out", tmp_path / "run")
+    found = arguments_of(monkeypatch, "lab.train", "train", dataset, "--out", tmp_path / "run")
     assert (found["test_fraction"], found["settings"]) == (0.3, PredictorSettings("map"))
 
 

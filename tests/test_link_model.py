@@ -12,6 +12,7 @@ from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction import predictor as predictors
 
 pytestmark = QUIET
@@ -75,7 +76,7 @@ def test_complete_is_decided_per_link():
 
 def test_is_taken_in_place_of_a_map():
     model = sp.LinkModel(half_open(sp.CellState.UNKNOWN))
-    assert sp.sample_channels(model, TX, RX, n=4).gain_db.shape == (4, 2)
+    assert sp.channels.sample_channels(model, TX, RX, n=4).gain_db.shape == (4, 2)
     assert sp.trace_links(model, TX, RX).gain_db.shape == (2,)
     assert sp.place_transmitter(model).partial is model.partial
     assert sp.next_views(model, goal="area").partial is model.partial
@@ -176,7 +177,7 @@ def test_unknown_cells_around_a_map_change_no_prediction(maps, tx, frequency_hz)
         model = sp.LinkModel(partial, trace_settings=settings)
         prediction = model.predict(tx, rx)
         measured = sp.Measurements(tx, rx[:10], prediction.gain_mean_db[:10] - 6.0)
-        posterior = sp.Assimilation.fit(partial, tx, measured, prediction.take(slice(10)), frequency_hz=frequency_hz)
+        posterior = Assimilation.fit(partial, tx, measured, prediction.take(slice(10)), frequency_hz=frequency_hz)
         found.append((prediction.gain_mean_db, posterior.update(rx, prediction).gain_mean_db))
     assert len(rx) > 15
     np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=0, atol=0.005)

@@ -278,7 +278,7 @@ def test_slam_channels() -> None:
 )
 def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, float], message: str) -> None:
     with pytest.raises(MapError, match=re.escape(message)):
-        getattr(sp, f"map_from_{kind}")(*arrays, 0.05, **options)
+        getattr(sp if kind == "array" else sp.importers, f"map_from_{kind}")(*arrays, 0.05, **options)
 
 
 def test_map_of_a_robot_comes_back(tmp_path: Path) -> None:

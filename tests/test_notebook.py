@@ -12,11 +12,11 @@ import sionna_partial as sp
 CELLS = {
     "map": "import sionna_partial as sp\nfrom sionna_partial.resources import scenes_folder\n"
     "partial = sp.load_map(scenes_folder() / 'apartment' / 'step100')\npartial",
-    "plot-map": "tx = (7.0, 9.8, 1.5)\nsp.plot_map(partial, tx=tx)",
+    "plot-map": "tx = (7.0, 9.8, 1.5)\nsp.plots.plot_map(partial, tx=tx)",
     "pyplot": "import sys\n'matplotlib.pyplot' in sys.modules",
     "coverage": "coverage = sp.load_coverage('coverage.nc')\ncoverage.radio",
-    "plot-coverage": "sp.plot_coverage(coverage)",
-    "inline": "%matplotlib inline\nimport matplotlib.pyplot as plt\nfigure = sp.plot_map(partial)",
+    "plot-coverage": "sp.plots.plot_coverage(coverage)",
+    "inline": "%matplotlib inline\nimport matplotlib.pyplot as plt\nfigure = sp.plots.plot_map(partial)",
     "again": "figure",
     "open": "plt.get_fignums()",
     "short": "from sionna_partial import display\nwith display.reporting(None) as report:\n    report(0.5, 'half')",

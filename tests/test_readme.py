@@ -138,12 +138,15 @@ def test_only_the_repository_is_installed_from() -> None:
         )
 
 
-def test_pages_named_in_code_exist() -> None:
+def test_pages_and_sections_named_in_code_exist() -> None:
     for folder in ("sionna_partial", "docs", "tests", "examples", "benchmarks"):
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".md", ".ipynb", ".html", ".rst"):
-                for name in re.findall(r"\bdocs/[\w/]+\.\w+", path.read_text("utf-8")):
+                text = path.read_text("utf-8")
+                for name in re.findall(r"\bdocs/[\w/]+\.\w+", text):
                     assert (ROOT / name).exists(), f"{path.name} names {name}"
+                for name, section in re.findall(r"\b(docs/\w+\.md), ([A-Z][\w ]+)", text):
+                    assert section.lower().replace(" ", "-") in anchors(ROOT / name), f"{path.name} cites {section}"
 
 
 def test_notebooks_are_stored_without_outputs_and_link_to_files_and_headings() -> None:

@@ -20,13 +20,13 @@ from sionna_partial.resources import scenes_folder
 pytestmark = QUIET
 
 HOMES = ("apartment", "house")
-SETTINGS = sp.DatasetSettings(links_per_home=200, transmitters_per_home=4, stages=(100, 200))
+SETTINGS = sp.lab.DatasetSettings(links_per_home=200, transmitters_per_home=4, stages=(100, 200))
 
 
 @pytest.fixture(scope="module")
 def evaluation() -> Evaluation:
     tables = (home_links(sp.load_map(scenes_folder() / name / "complete"), name, SETTINGS) for name in HOMES)
-    return sp.evaluate(None, LinkTable.concatenate(tables))
+    return sp.lab.evaluate(None, LinkTable.concatenate(tables))
 
 
 def test_figures_of_merit_stay_in_their_band(evaluation: Evaluation) -> None:

@@ -123,7 +123,7 @@ def test_the_default_through_walls() -> None:
 @QUIET
 def test_predictor_of_links_through_walls(caplog: pytest.LogCaptureFixture) -> None:
     """It predicts links through walls without a warning, and those on opaque walls with one."""
-    links = home_links(all_seen(), "home", sp.DatasetSettings(links_per_home=40, stages=(0, 5), trace=WIFI))
+    links = home_links(all_seen(), "home", sp.lab.DatasetSettings(links_per_home=40, stages=(0, 5), trace=WIFI))
     assert (links.context.wall_loss_db < MOST_LOSS_DB).all()
     learning = settings_for(LinkTraces(5e9, diffraction=True, through_walls=True), networks="paths", passes=4)
     predictor = sp.Predictor.fit(links.features, links.link_state, links.gain_db, settings=replace(learning, steps=20))

@@ -104,7 +104,7 @@ def save_channels(
     --------
     >>> import sionna_partial as sp
     >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
-    >>> sp.save_channels(links, "channels.nc", normalize_delays=False)
+    >>> sp.channels.save_channels(links, "channels.nc", normalize_delays=False)
     """
     target = checked_target(path, layout)
     with reporting(progress) as report, dask.config.set(scheduler="synchronous"):
@@ -169,7 +169,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> channels = sp.load_channels("channels.nc")  # that save_channels wrote
+    >>> channels = sp.channels.load_channels("channels.nc")  # that save_channels wrote
     >>> channels.a.dims
     ('rx', 'rx_ant', 'tx', 'tx_ant', 'path', 'time')
     """

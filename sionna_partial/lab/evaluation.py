@@ -428,7 +428,7 @@ def evaluate(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> evaluation = sp.evaluate("paper", "links")  # that build_dataset wrote
+    >>> evaluation = sp.lab.evaluate("paper", "links")  # that build_dataset wrote
     >>> (row,) = evaluation.select(stage=5, receivers="indoor", ends_seen="all", model="predictor")
     >>> row.metrics.links
     4

@@ -428,7 +428,8 @@ class Assimilation(Shown):
     >>> partial, tx = sp.map_from_array(cells, resolution_m=1.0), (4.5, 1.5, 1.5)  # in a cell that was not seen
     >>> model = sp.LinkModel(partial)
     >>> measured = sp.Measurements(tx, [(1.5, 1.5, 1.5), (2.5, 2.5, 1.5)], [-81.0, -78.0])
-    >>> posterior = sp.Assimilation.fit(partial, tx, measured, model.predict(tx, measured.rx))
+    >>> from sionna_partial.measurements.assimilation import Assimilation
+    >>> posterior = Assimilation.fit(partial, tx, measured, model.predict(tx, measured.rx))
     >>> rx = [(2.2, 1.8, 1.5)]
     >>> before = model.predict(tx, rx)
     >>> bool(posterior.update(rx, before).gain_mean_db < before.gain_mean_db)

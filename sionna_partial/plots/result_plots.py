@@ -85,7 +85,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
-    >>> figure = sp.plot_placement(found)
+    >>> figure = sp.plots.plot_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
@@ -127,7 +127,7 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
-    >>> figure = sp.plot_network_placement(found)
+    >>> figure = sp.plots.plot_network_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
@@ -214,7 +214,7 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
     >>> found = sp.calibrate_materials(room, measured)
-    >>> sp.plot_calibration(found).savefig("calibration.png")
+    >>> sp.plots.plot_calibration(found).savefig("calibration.png")
     """
     require_type("calibration", calibration, MaterialCalibration, "give what calibrate_materials returned.")
     count = len(calibration.materials)

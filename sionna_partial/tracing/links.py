@@ -294,7 +294,7 @@ class TracedLinks(Shown):
         >>> from sionna.rt import PlanarArray
         >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
         >>> array = PlanarArray(num_rows=4, num_cols=4, pattern="iso", polarization="V")
-        >>> beams = links.beam_gains(sp.dft_codebook(4, 4), tx_array=array)
+        >>> beams = links.beam_gains(sp.channels.dft_codebook(4, 4), tx_array=array)
         >>> beams.best_tx_beam.item()  # broadside
         0
         """

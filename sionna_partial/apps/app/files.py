@@ -244,5 +244,5 @@ def script(project: Project, python_map: Sequence[str]) -> str:
     plan = {name: each.channel for name, each in project.transmitters.items()}
     if any(plan.values()):
         bandwidth = f"bandwidth_hz={settings.bandwidth_hz!r}"
-        lines.append(f"network = sp.network_map(coverage, tx_power_dbm={powers!r}, {bandwidth}, channels={plan!r})")
+        lines.append(f"network = sp.predict_network(coverage, tx_power_dbm={powers!r}, {bandwidth}, channels={plan!r})")
     return "\n".join(lines) + "\n"

@@ -265,7 +265,7 @@ def read_dataset(folder: str | os.PathLike[str], homes: Iterable[str] | None = N
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> links = sp.read_dataset("links")  # that build_dataset wrote
+    >>> links = sp.lab.read_dataset("links")  # that build_dataset wrote
     >>> links.gain_db.shape
     (16,)
     """

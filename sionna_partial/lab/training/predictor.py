@@ -111,7 +111,8 @@ def train(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> run = sp.train("links", test_fraction=0.0, settings=sp.PredictorSettings("paper"))  # that build_dataset wrote
+    >>> settings = sp.lab.PredictorSettings("paper")
+    >>> run = sp.lab.train("links", test_fraction=0.0, settings=settings)  # that build_dataset wrote
     >>> run.train_homes
     ('make_home(7)',)
     """

@@ -167,7 +167,7 @@ def map_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, time
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.map_from_bag("drive.bag").bounds_m  # of a recording of yours
+    >>> sp.importers.map_from_bag("drive.bag").bounds_m  # of a recording of yours
     (1.0, 2.0, 3.0, 3.5)
     """
     limit = math.inf if time_s is None else number_of(time_s)
@@ -222,7 +222,7 @@ def map_from_occupancy(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.map_from_occupancy([[100, 100], [0, -1]], 0.05).state.tolist()
+    >>> sp.importers.map_from_occupancy([[100, 100], [0, -1]], 0.05).state.tolist()
     [[1, 1], [0, 2]]
     """
     yaw = 0.0

@@ -118,7 +118,7 @@ def map_from_drawing(
     >>> corners = [(0, 0), (5000, 0), (5000, 4000), (0, 4000)]
     >>> _ = drawing.modelspace().add_lwpolyline(corners, close=True, dxfattribs={"layer": "WALLS"})
     >>> drawing.saveas("plan.dxf")
-    >>> sp.map_from_drawing("plan.dxf").state_at([[2.0, 2.0], [5.02, 2.0], [6.0, 2.0]]).tolist()
+    >>> sp.importers.map_from_drawing("plan.dxf").state_at([[2.0, 2.0], [5.02, 2.0], [6.0, 2.0]]).tolist()
     [0, 1, 2]
     """
     source = input_path(path, "path", MapError, f"give a drawing ({', '.join(DRAWING_SUFFIXES)}).")

@@ -152,7 +152,7 @@ def map_from_points(
     >>> x, y = np.meshgrid(np.arange(0.02, 4, 0.04), np.arange(0.02, 3, 0.04))
     >>> floor = np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)])
     >>> wall = np.column_stack([x.ravel(), np.full(x.size, 2.98), y.ravel()])
-    >>> room = sp.map_from_points(np.concatenate([floor, wall]))
+    >>> room = sp.importers.map_from_points(np.concatenate([floor, wall]))
     >>> room.state_at([[2.0, 1.0], [2.0, 2.97], [2.0, 4.0]]).tolist()
     [0, 1, 2]
     """

@@ -53,7 +53,7 @@ def map_from_habitat(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.map_from_habitat([[0, 1, 1, 1]], [[1, 1, 1, 0]], resolution_m=0.05).state.tolist()
+    >>> sp.importers.map_from_habitat([[0, 1, 1, 1]], [[1, 1, 1, 0]], resolution_m=0.05).state.tolist()
     [[1, 0, 0, 2]]
     """
     value, seen = grid_array("top_down", top_down, "iu"), grid_array("fog_of_war", fog_of_war, "iub") != 0
@@ -96,7 +96,7 @@ def map_from_slam(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.map_from_slam([[1.0, 0.0, 0.0]], [[1.0, 1.0, 0.0]], resolution_m=0.05).state.tolist()
+    >>> sp.importers.map_from_slam([[1.0, 0.0, 0.0]], [[1.0, 1.0, 0.0]], resolution_m=0.05).state.tolist()
     [[1, 0, 2]]
     """
     channels = {
