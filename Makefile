@@ -86,8 +86,8 @@ predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predic
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
 	@$(CHECKSUMS)
-	@$(BIN)/python -m sionna_partial.training.paths sionna_partial/predictors/paths.npz
-	@$(BIN)/python -m sionna_partial.training.walls sionna_partial/predictors/unseen_walls.npz
+	@$(BIN)/python -m sionna_partial.lab.training.paths sionna_partial/predictors/paths.npz
+	@$(BIN)/python -m sionna_partial.lab.training.walls sionna_partial/predictors/unseen_walls.npz
 	@$(CHECKSUMS)
 	@$(BIN)/sionna-partial evaluate $(LEARNED_FROM) --out build/predictor/report > /dev/null
 	@echo "the report is in build/predictor/report/, the predictors are in sionna_partial/predictors/"

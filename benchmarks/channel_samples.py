@@ -23,7 +23,8 @@ from measurements import FIRST_SEED, points
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.evaluation import indoor_gain_db
+from sionna_partial.channels.samples import ChannelSamples
+from sionna_partial.lab.evaluation import indoor_gain_db
 from sionna_partial.tracing.antennas import planar_array
 
 STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15
@@ -82,7 +83,7 @@ def score_map(
 ) -> Floats:
     """Score the links of one partial map; return its joint scores."""
     true, known = (sp.trace_links(each, tx_m, rx_m, progress=False) for each in (home, partial))
-    samples = sp.sample_channels(partial, tx_m, rx_m, DRAWS, seed, progress=False)
+    samples = sp.channels.sample_channels(partial, tx_m, rx_m, DRAWS, seed, progress=False)
     truth, trace = values(true)[0], values(known)[0]
     drawn = values(samples.drawn, DRAWS)
     distance_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
@@ -140,7 +141,7 @@ def indoor_office(distance_m: Floats, states: NDArray[np.uint8], rng: np.random.
     return drawn
 
 
-def indoor_office_paths(samples: sp.ChannelSamples, drawn: Floats, rng: np.random.Generator) -> sp.TracedLinks:
+def indoor_office_paths(samples: ChannelSamples, drawn: Floats, rng: np.random.Generator) -> sp.TracedLinks:
     """Make paths of these draws (n, L, 4): 20 clusters about the direct line, and a K-factor in LOS."""
     links, clusters = samples.drawn, 20
     states = links.link_state.ravel()
@@ -177,7 +178,7 @@ def indoor_office_paths(samples: sp.ChannelSamples, drawn: Floats, rng: np.rando
 def beams(links: sp.TracedLinks) -> Floats:
     """Gain (L, 16 x 64) of all pairs of beams."""
     arrays = {"tx_array": planar_array(8, 8), "rx_array": planar_array(4, 4)}
-    found = links.beam_gains(sp.dft_codebook(8, 8), sp.dft_codebook(4, 4), memory_gb=8.0, **arrays)
+    found = links.beam_gains(sp.channels.dft_codebook(8, 8), sp.channels.dft_codebook(4, 4), memory_gb=8.0, **arrays)
     return found.gain_db.to_numpy().reshape(links.gain_db.size, -1)
 
 

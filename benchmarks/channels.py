@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from stock import isolated, limit_cores, peak_memory_gb
 
 import sionna_partial as sp
+from sionna_partial.channels.samples import ChannelSamples
 from sionna_partial.resources import demo_homes, scenes_folder
 from sionna_partial.tracing.antennas import planar_array
 
@@ -62,7 +63,7 @@ def times(receivers: int, runs: int) -> dict[str, float]:
     limit_cores(1)
     partial, tx, rx = _scene(receivers)
     links, arrays = sp.trace_links(partial, tx, rx), _arrays()
-    codebooks = sp.dft_codebook(8, 8), sp.dft_codebook(4, 4)
+    codebooks = sp.channels.dft_codebook(8, 8), sp.channels.dft_codebook(4, 4)
     wide = {**arrays, "rx_array": planar_array(4, 4)}
     subcarriers_hz = np.arange(-32, 32) * 960e3
     steps: dict[str, Callable[[], object]] = {
@@ -83,8 +84,8 @@ def partial_times(receivers: int, runs: int) -> dict[str, float]:
     rx = rx[partial.radios_can_stand(rx)]
     model, three = sp.Predictor.load(), tx + np.array([[0.0, 0.0, 0.0], [0.3, 0.2, 0.0], [-0.2, 0.3, 0.0]])
 
-    def sample() -> sp.ChannelSamples:
-        return sp.sample_channels(partial, tx, rx, n=100, predictor=model)
+    def sample() -> ChannelSamples:
+        return sp.channels.sample_channels(partial, tx, rx, n=100, predictor=model)
 
     def sample_paths() -> None:
         samples = sample()
@@ -108,10 +109,10 @@ def stream(receivers: int, suffix: str) -> dict[str, float]:
     try:
         links = sp.trace_links(*_scene(receivers))
         path = folder / f"channels{suffix}"
-        seconds = _seconds(lambda: sp.save_channels(links, path, progress=False, **_arrays()))
+        seconds = _seconds(lambda: sp.channels.save_channels(links, path, progress=False, **_arrays()))
         files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
         size = sum(each.stat().st_size for each in files)
-        array_gb = sp.load_channels(path).a.nbytes / 1e9
+        array_gb = sp.channels.load_channels(path).a.nbytes / 1e9
         return {
             **{"seconds": seconds, "array_gb": array_gb, "file_gb": size / 1e9},
             "memory_gb": peak_memory_gb(),

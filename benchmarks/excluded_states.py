@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 import sionna_partial as sp
-from sionna_partial.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.shards import LinkTable
 
 
 def main() -> None:
@@ -23,7 +23,7 @@ def main() -> None:
         "| data set | links where a rule applies | state correct | no LOS | LOS | outage |\n|---|---|---|---|---|---|"
     )
     for folder in parser.parse_args().datasets:
-        print(f"| {folder} | " + " | ".join(row(sp.read_dataset(folder))) + " |")
+        print(f"| {folder} | " + " | ".join(row(sp.lab.read_dataset(folder))) + " |")
 
 
 def row(links: LinkTable) -> list[str]:

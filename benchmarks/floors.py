@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.datasets.shards import LinkTable
-from sionna_partial.evaluation import Metrics, measure
+from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.evaluation import Metrics, measure
 
 SHORT_M, WRONG_DB = 25.0, 0.5
 """Length of short links [m], and by how much a certain gain may be off [dB]."""
@@ -29,7 +29,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("predictors", nargs="*", help="in addition to the shipped ones")
     arguments = parser.parse_args()
-    links = sp.read_dataset(arguments.dataset)
+    links = sp.lab.read_dataset(arguments.dataset)
     links = links.take(~links.anywhere)
     found = {name: sp.Predictor.load(name).predict(links.phi) for name in ("map", "paper", *arguments.predictors)}
     groups = {"all links": np.ones(len(links.home), dtype=bool)}

@@ -20,6 +20,7 @@ import numpy as np
 from stock import peak_memory_gb
 
 import sionna_partial as sp
+from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
 from sionna_partial.constants import CellState
 
 APARTMENT = Path(__file__).resolve().parents[1] / "scenes/apartment"
@@ -59,9 +60,7 @@ def latencies(maps: list[sp.PartialMap], rounds: int, spacing_m: float) -> tuple
     """Return the median times to the coarse and the final grid [s], of a warm process."""
     ages: dict[bool, list[float]] = {False: [], True: []}
     tx = free_position(maps[0])
-    live = sp.LiveCoverage(
-        tx, lambda grid: ages[grid.is_final].append(grid.age_s), sp.LiveSettings(spacing_m=spacing_m)
-    )
+    live = LiveCoverage(tx, lambda grid: ages[grid.is_final].append(grid.age_s), LiveSettings(spacing_m=spacing_m))
     for number in range(rounds * len(maps)):
         live.on_map(message(maps[number % len(maps)]))
         live.step()
@@ -76,7 +75,7 @@ def memory_mb() -> float:
 
 def growth_mb(maps: list[sp.PartialMap], updates: int) -> tuple[float, float]:
     """Return the memory after a fifth of the updates, and after all of them [MB]."""
-    live = sp.LiveCoverage(free_position(maps[0]), lambda _: None, sp.LiveSettings(spacing_m=0.6))
+    live = LiveCoverage(free_position(maps[0]), lambda _: None, LiveSettings(spacing_m=0.6))
     early = 0.0
     for number in range(updates):
         live.on_map(message(maps[number % len(maps)]))
@@ -97,7 +96,7 @@ def depot_maps(path: Path, steps: range) -> list[sp.PartialMap]:
 def drive(maps: list[sp.PartialMap], spacing_m: float) -> None:
     """Print time and memory of every update of a robot that maps a building."""
     grids: list[sp.LiveGrid] = []
-    live = sp.LiveCoverage(free_position(maps[0]), grids.append, sp.LiveSettings(spacing_m=spacing_m))
+    live = LiveCoverage(free_position(maps[0]), grids.append, LiveSettings(spacing_m=spacing_m))
     print("\n| map | observed cells | first grid [s] | final grid [s] | processor [s] | memory [GB] |")
     print("|---|---|---|---|---|---|")
     for number, partial in enumerate(maps):

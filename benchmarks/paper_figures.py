@@ -27,11 +27,11 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.datasets.home_links import closed_home, home_links, home_sources, map_area
-from sionna_partial.datasets.shards import LinkTable
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH, comparison_table
-from sionna_partial.evaluation import measure
 from sionna_partial.files import atomic_files
+from sionna_partial.lab.datasets.home_links import closed_home, home_links, home_sources, map_area
+from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.evaluation import measure
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.style import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings
@@ -183,7 +183,7 @@ def split(homes: Homes, train: list[str], test: list[str]) -> tuple[Homes, Homes
 
 def all_links(homes: Homes, count: int, repetition: int) -> LinkTable:
     """Trace links of all homes at all stages, with receivers indoors."""
-    settings = sp.DatasetSettings(links_per_home=count, seed=repetition)
+    settings = sp.lab.DatasetSettings(links_per_home=count, seed=repetition)
     links = LinkTable.concatenate(home_links(home, name, settings) for name, home in homes.items())
     return links.take(~links.anywhere)
 

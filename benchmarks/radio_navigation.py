@@ -191,7 +191,7 @@ def by_radio_map(home: Home) -> Probability:
         if not models:
             models.append(sp.LinkModel(partial))
         models[0].update(partial)
-        coverage = models[0].coverage(home.tx_m, spacing_m=SPACING_M, progress=False)
+        coverage = sp.predict_map(models[0], home.tx_m, spacing_m=SPACING_M, progress=False)
         above = coverage.radio.probability_above(THRESHOLD_DB).to_numpy()
         nearest = ndimage.distance_transform_edt(np.isnan(above), return_distances=False, return_indices=True)
         y, x = (((np.arange(size) + 0.5) * partial.resolution_m / SPACING_M).astype(int) for size in partial.shape)

@@ -159,7 +159,7 @@ def print_times(name: str, model: sp.LinkModel, rows: Floats) -> None:
     measured = [sp.Measurements(nowhere, rows[:count, 3:6], rows[:count, 6]) for count in (20, len(rows))]
     for tx, measurements in ((tx_m + 0.01, None), (tx_m, None), *((None, each) for each in measured)):
         began_s = time.process_time()
-        model.coverage(tx, measurements=measurements)
+        sp.predict_map(model, tx, measurements=measurements)
         spent_s.append(time.process_time() - began_s)
     numbers = ", ".join(f"{each_s / spent_s[1]:.1f}" for each_s in spent_s[2:])
     print(f"{name}: {numbers} predictions of {spent_s[1]:.1f} s from 20 and {len(rows)} powers", flush=True)

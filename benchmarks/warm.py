@@ -43,19 +43,21 @@ def main():
     partial = sp.load_map(path)
     grown = sp.explore(sp.load_map("scenes/apartment/complete"), steps=(100, 120), seed=0)
     model = sp.LinkModel(partial)
-    model.coverage(TX, progress=False)
+    sp.predict_map(model, TX, progress=False)
     offsets_m = np.linspace(0.0, 0.5, runs)
     times = {
         "the first predict_map of a process": [first],
-        "the same transmitter": [seconds(model.coverage, TX) for _ in range(runs)],
-        "another transmitter": [seconds(model.coverage, np.add(OTHER_TX, (each, 0.0, 0.0))) for each in offsets_m],
+        "the same transmitter": [seconds(sp.predict_map, model, TX) for _ in range(runs)],
+        "another transmitter": [
+            seconds(sp.predict_map, model, np.add(OTHER_TX, (each, 0.0, 0.0))) for each in offsets_m
+        ],
         "predict_map of the map, no model kept": [seconds(sp.predict_map, partial, TX) for _ in range(runs)],
     }
     updated = []
     for _ in range(runs):
         model.update(grown[0])
-        model.coverage(TX)
-        updated.append(seconds(lambda: (model.update(grown[1]), model.coverage(TX))))
+        sp.predict_map(model, TX)
+        updated.append(seconds(lambda: (model.update(grown[1]), sp.predict_map(model, TX))))
     times["update with 20 more steps of exploration"] = updated
     print(f"first predict_map: {first:.2f} s")
     for name, each in times.items():

@@ -18,7 +18,7 @@ release = version = __version__
 
 root_doc = "README"
 highlight_language = "none"  # of blocks that name no language: commands of a shell
-include_patterns = ["*.md", "docs/**", "build/api/**", "build/gallery/**"]
+include_patterns = ["*.md", "benchmarks/*.md", "docs/**", "build/api/**", "build/gallery/**"]
 exclude_patterns = [
     *(".*", "sionna_partial", "tests", "scenes", "dist", "build/docs", "build/doctrees", "build/notebooks"),
     *(

@@ -19,18 +19,16 @@ API = ROOT / "build" / "api"
 NOTEBOOKS = sorted((ROOT / "docs" / "notebooks").glob("*.ipynb"))
 
 SECTIONS = {
-    "Get started": [
-        *("docs/install", "docs/five_minutes", "docs/researchers", "docs/robots", "docs/vacuum", "docs/planners"),
-    ],
+    "Get started": ["docs/install", "docs/start", "docs/vacuum"],
     "Guides": [
         *("docs/maps", "docs/predict", "docs/walls", "docs/measured_powers", "docs/transmitters", "docs/channels"),
-        *("docs/live", "docs/app", "docs/calibration", "docs/training"),
+        *("docs/live", "docs/app", "docs/calibration", "docs/training", "docs/worlds", "docs/sionna_rt"),
         *(f"docs/notebooks/{path.stem}" for path in NOTEBOOKS),
         "build/gallery/index",
     ],
     "Reference": [
-        *("docs/method", "docs/results", "docs/model_card", "build/api/index"),
-        *("docs/development", "docs/experiments", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
+        *("docs/method", "docs/physics", "docs/results", "docs/model_card", "build/api/index"),
+        *("docs/development", "benchmarks/README", "docs/experiments", "CONTRIBUTING", "SECURITY", "CHANGELOG"),
     ],
 }
 """Pages of the sidebar, if they exist; other pages of `docs/` follow under "More"."""
@@ -49,9 +47,7 @@ ROOMS = {
     "placement": "Calibration and placement",
     "exploration": "Homes and robots",
     "differentiable": "Gradients",
-    "datasets": "Data sets and training",
-    "training": "Data sets and training",
-    "evaluation": "Data sets and training",
+    "lab": "Data sets and training",
     "settings": "Settings",
 }
 """Headings of the API reference by room of the package; the names of other rooms follow under "More"."""

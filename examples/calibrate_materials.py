@@ -51,4 +51,4 @@ truth_db = reflection_loss_db(
 for angle, loss, std, truth in zip(ANGLES_DEG, loss_db, std_db, truth_db, strict=True):
     print(f"a reflection at {angle:g} degrees loses {loss:.2f} +- {std:.2f} dB; in truth {truth:.2f} dB")
 assert np.all(np.abs(loss_db - truth_db) <= np.maximum(0.6, 2.5 * std_db))
-figure = sp.plot_calibration(result)
+figure = sp.plots.plot_calibration(result)

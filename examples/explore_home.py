@@ -14,7 +14,7 @@ from sionna_partial.resources import scenes_folder
 
 home = sp.load_map(scenes_folder() / "apartment" / "complete")
 trajectory = sp.explore_trajectory(home, steps=(0, 25, 50, 100, 150, 200), seed=3)
-maps = sp.plot_exploration(trajectory.at((50, 100, 200)))
+maps = sp.plots.plot_exploration(trajectory.at((50, 100, 200)))
 
 # %%
 # What does the robot gain from each step? At each stage the link from a transmitter to a room at the other end of the

@@ -68,7 +68,7 @@ right.set(xlabel="transmitted power [dBm]", ylabel="bit error rate", ylim=(1e-5,
 # rates of the second link over 100 draws, for a robot that wants to know how much power will do.
 
 partial = sp.load_map(scenes_folder() / "apartment" / "step100" / "map.yaml")
-samples = sp.sample_channels(partial, (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)], n=100)
+samples = sp.channels.sample_channels(partial, (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)], n=100)
 drawn = np.abs(samples.cfr(SUBCARRIERS_HZ).h.to_numpy()[:, 1, 0, 0]) ** 2
 power = 10 ** (TX_POWER_DBM / 10) / len(SUBCARRIERS_HZ) / 10 ** (NOISE_DBM / 10)
 of_draws = erfc(np.sqrt(power[:, None, None] * drawn / 2)).mean(axis=2) / 2

@@ -18,7 +18,7 @@ partial = sp.load_map(scenes_folder() / "apartment" / "step100")
 found = sp.place_transmitter(partial, objective="coverage", threshold_db=THRESHOLD_DB, seed=0)
 x, y, z = found.position_m
 print(f"position ({x:.2f}, {y:.2f}, {z:.2f}) m: predicted coverage {found.score:.1%}")
-figure = sp.plot_placement(found)
+figure = sp.plots.plot_placement(found)
 
 # %%
 # The rest of this home is known, too, so that the position can be compared with the truth: the fraction of the home

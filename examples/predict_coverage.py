@@ -16,7 +16,7 @@ print(f"observed: {partial.observed_fraction:.0%} of the home")
 # The result is an :class:`xarray.Dataset` on (y, x), in metres. Black is wall; the hatched area was not observed.
 
 coverage = sp.predict_map(partial, tx=(7.0, 9.8, 1.5), spacing_m=0.3)
-figure = sp.plot_coverage(coverage)
+figure = sp.plots.plot_coverage(coverage)
 
 # %%
 # One receiver, 5 m away in a room that was not observed: probabilities of the link states, and mean and standard

@@ -11,14 +11,14 @@ floor = sp.make_home(220001, kind="floor")
 partial = sp.explore(floor, (0.5,), sensor=sp.SensorSettings(field_of_view_deg=360.0, range_m=12.0))[0]
 placed = sp.place_transmitters(partial, count=3, threshold_db=-90.0, tx_height_m=2.2)
 print(f"observed {partial.observed_fraction:.0%}, predicted coverage with three access points {placed.score:.0%}")
-placement_figure = sp.plot_network_placement(placed)
+placement_figure = sp.plots.plot_network_placement(placed)
 
 # %%
 # All three in one call; links are drawn together, as one unseen wall may block more than one access point.
 
 access_points = {f"AP {number + 1}": position for number, position in enumerate(placed.positions_m)}
 coverage = sp.predict_map(partial, access_points, spacing_m=1.0)
-network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6, load=0.5, sinr_threshold_db=10.0)
+network = sp.predict_network(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6, load=0.5, sinr_threshold_db=10.0)
 for name, share in network.p_best.mean(("x", "y")).to_series().items():
     print(f"{name}: strongest at {share:.0%} of the receivers")
 alone = coverage.p_outage.prod("tx", skipna=False).mean().item()
@@ -29,9 +29,9 @@ assert 0.0 < alone < together
 # %%
 # Best server, SINR, the probability of 10 dB, and the rate.
 
-figure = sp.plot_network(network)
+figure = sp.plots.plot_network(network)
 
 # %%
 # The coverage of each. ``sp.save_coverage(coverage, "coverage.html")`` writes a page with a choice of the transmitter.
 
-coverage_figure = sp.plot_coverage(coverage, layers=("gain_mean_db", "p_outage"))
+coverage_figure = sp.plots.plot_coverage(coverage, layers=("gain_mean_db", "p_outage"))

@@ -62,4 +62,4 @@ bsdfs = "".join(f'<bsdf type="radio-material" id="{name}">{values}</bsdf>\n' for
 
 with_cabinet = sp.load_map(changed / "scene.xml", observed=partial)
 coverage = sp.predict_map(with_cabinet, tx=(7.0, 9.8, 1.5), spacing_m=0.3)
-sp.plot_coverage(coverage)
+sp.plots.plot_coverage(coverage)

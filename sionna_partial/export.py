@@ -150,7 +150,7 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str], *, scene: Pa
     Parameters
     ----------
     network : xarray.Dataset
-        From `network_map`.
+        From `predict_network`.
     path : path-like
         Path of the file.
     scene : PartialMap, optional
@@ -168,7 +168,7 @@ def save_network(network: xr.Dataset, path: str | os.PathLike[str], *, scene: Pa
     >>> import sionna_partial as sp
     >>> home = sp.make_home(7)
     >>> coverage = sp.predict_map(home, [(3.0, 4.0, 2.2), (6.0, 3.0, 1.0)], spacing_m=0.5)
-    >>> sp.save_network(sp.network_map(coverage), "network.nc")
+    >>> sp.save_network(sp.predict_network(coverage), "network.nc")
     """
     require_network(network)
     names = [name for name in VARIABLES if network[name].dims == ("y", "x")]

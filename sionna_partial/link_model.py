@@ -5,20 +5,19 @@ from __future__ import annotations
 import functools
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import xarray as xr
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.display import later, part_of
+from sionna_partial.display import part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths, in_observed_space
 from sionna_partial.prediction.map_networks import feature_values
@@ -101,7 +100,7 @@ class LinkModel:
     [1.0]
     >>> cells[1][4] = cells[2][4] = 1  # the robot has seen the wall
     >>> model.update(sp.map_from_array(cells, resolution_m=1.0))
-    >>> model.coverage((1.5, 1.5, 1.5), spacing_m=0.5).attrs["map_complete"]
+    >>> sp.predict_map(model, (1.5, 1.5, 1.5), spacing_m=0.5).attrs["map_complete"]
     1
     """
 
@@ -298,11 +297,6 @@ class LinkModel:
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         known = self.partial.state_at(rx_m) != CellState.UNKNOWN
         return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor), complete, antenna_db)
-
-    def coverage(self, tx: ArrayLike | Mapping[str, ArrayLike] | None = None, **options: Any) -> xr.Dataset:
-        """Predict links everywhere on the map, with the options of `predict_map`."""
-        found: xr.Dataset = later("coverage.job:predict_map")(self, tx, **options)
-        return found
 
 
 def _drop_oldest(kept: dict[Any, Any]) -> None:

@@ -1,12 +1,16 @@
-"""Files that ship with the package, and optional libraries."""
+"""Files that ship with the package, optional libraries, and names that load theirs on first use."""
 
+import ast
 import json
-from collections.abc import Iterator
+import sys
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 from sionna_partial.errors import BackendError, SceneError, SionnaPartialError
+from sionna_partial.process import signals_held
 
 EXTRAS = {
     "app": ("bokeh", "tornado"),
@@ -39,6 +43,27 @@ def optional_packages(error: type[SionnaPartialError] = BackendError) -> Iterato
             raise
         remedy = " or ".join(f"pip install '.[{extra}]'" for extra in extras)
         raise error(f"{package} is not installed: {remedy} in the repository, or '.[all]'.") from cause
+
+
+def lazy_names(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
+    """Return `__getattr__`, `__dir__` and `__all__` of a package whose stub `__init__.pyi` lists its public names."""
+    this = sys.modules[package]
+    stub = ast.parse(Path(str(this.__file__)).with_suffix(".pyi").read_text(encoding="utf-8"))
+    imports = [node for node in stub.body if isinstance(node, ast.ImportFrom)]
+    module_of = {alias.name: str(node.module) for node in imports for alias in node.names}
+
+    def load(name: str) -> Any:
+        if name not in module_of:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        with signals_held(), optional_packages():
+            module = import_module(module_of[name])
+            is_module = hasattr(module, "__path__")  # packages offer their modules, modules what they define
+            value = import_module(f"{module.__name__}.{name}") if is_module else getattr(module, name)
+        setattr(this, name, value)
+        return value
+
+    names = sorted(module_of)
+    return load, lambda: names, names
 
 
 def scenes_folder() -> Path:

@@ -405,7 +405,7 @@ class DatasetSettings(Checked):
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> settings = sp.DatasetSettings(links_per_home=100, stages=(0, 0.25, 0.5), sensor="mixed")
+    >>> settings = sp.lab.DatasetSettings(links_per_home=100, stages=(0, 0.25, 0.5), sensor="mixed")
     >>> settings.trace.frequency_hz
     28000000000.0
     """
@@ -473,7 +473,7 @@ class PredictorSettings(Checked):
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.PredictorSettings(networks="paper").passes >= 1
+    >>> sp.lab.PredictorSettings(networks="paper").passes >= 1
     True
     """
 
@@ -513,8 +513,8 @@ class PlacementSettings(Checked):
 
     Examples
     --------
-    >>> import sionna_partial as sp
-    >>> sp.PlacementSettings(threshold_db=-90.0).objective
+    >>> from sionna_partial.settings import PlacementSettings
+    >>> PlacementSettings(threshold_db=-90.0).objective
     'coverage'
     """
 

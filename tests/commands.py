@@ -1,6 +1,7 @@
 """Commands run in this process, and the arguments with which they call a function of the package."""
 
 import inspect
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -24,15 +25,15 @@ def run(*words: object, exit_code: int = 0) -> Result:
 def arguments_of(monkeypatch: pytest.MonkeyPatch, functions: str, *words: object) -> dict[str, Any]:
     """Run a command up to the last of some functions; those before return None."""
     *before, last = functions.split()
-    signature = inspect.signature(getattr(sp, last))
+    signature = inspect.signature(attrgetter(last)(sp))
 
     def record(*arguments: Any, **options: Any) -> None:
         raise Called(dict(signature.bind(*arguments, **options).arguments))
 
     with monkeypatch.context() as patch:
         for name in before:
-            patch.setattr(sp, name, lambda *_, **__: None)
-        patch.setattr(sp, last, record)
+            patch.setattr(f"sionna_partial.{name}", lambda *_, **__: None)
+        patch.setattr(f"sionna_partial.{last}", record)
         result = run(*words, exit_code=1)
     assert isinstance(result.exception, Called), result.output
     found: dict[str, Any] = result.exception.args[0]

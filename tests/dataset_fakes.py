@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 from link_tables import make_table
 
-from sionna_partial.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.shards import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import DatasetSettings
 
@@ -41,7 +41,7 @@ if "home_links import serve" in " ".join(sys.orig_argv):
 
 
 def install() -> None:
-    from sionna_partial.datasets import home_links
+    from sionna_partial.lab.datasets import home_links
 
     home_links.make_home = make_home  # type: ignore[assignment]
     home_links.home_links = fake_links  # type: ignore[assignment]

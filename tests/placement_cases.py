@@ -6,6 +6,7 @@ from typing import Any
 from coverage_cases import map_of
 
 import sionna_partial as sp
+from sionna_partial.placement.placement import TransmitterPlacement
 
 TWO_ROOMS = """
 ##########
@@ -25,6 +26,6 @@ def home(picture: str) -> sp.PartialMap:
 
 
 @cache
-def placed(picture: str = HALF_SEEN, **options: Any) -> sp.TransmitterPlacement:
+def placed(picture: str = HALF_SEEN, **options: Any) -> TransmitterPlacement:
     settings = sp.TraceSettings(max_depth=0, diffraction=False)
     return sp.place_transmitter(home(picture), predictor="paper", trace_settings=settings, **options)

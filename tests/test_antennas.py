@@ -40,7 +40,7 @@ def stock_gain_db(antenna: sp.Antenna, rx_m: np.ndarray, folder: Path) -> np.nda
     scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
     turned = [float(angle) for angle in np.radians([antenna.azimuth_deg, antenna.downtilt_deg, 0.0])]
     scene.add(rt.Transmitter("tx", position=[*TX], orientation=turned))
-    gains_db, weights = [], sp.dft_codebook(antenna.rows, antenna.columns)[antenna.beam]
+    gains_db, weights = [], sp.channels.dft_codebook(antenna.rows, antenna.columns)[antenna.beam]
     for position in rx_m:
         scene.remove("rx")
         scene.add(rt.Receiver("rx", position=position.tolist()))
@@ -107,7 +107,7 @@ def test_no_gain_exceeds_its_bound() -> None:
 
 def test_a_warm_model_keeps_antennas_apart() -> None:
     model = sp.LinkModel(_room(), trace_settings=sp.TraceSettings(max_depth=1, diffraction=False))
-    first, other, again = (model.coverage(TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
+    first, other, again = (sp.predict_map(model, TX, spacing_m=1.0, tx_antenna=each) for each in ("iso", SECTOR, "iso"))
     xr.testing.assert_identical(first, again)
     assert float(abs(other["gain_mean_db"] - first["gain_mean_db"]).max()) > 5.0
 
@@ -127,7 +127,7 @@ def test_one_antenna_for_each_transmitter(tmp_path: Path) -> None:
     tx = {"a": TX, "b": (4.5, 1.0, 1.4)}
     found = sp.predict_map(_room(), tx, tx_antenna={"a": SECTOR, "b": None}, spacing_m=1.0)
     sp.save_coverage(found, tmp_path / "coverage.nc")
-    for each in (sp.load_coverage(tmp_path / "coverage.nc"), sp.network_map(found, n=2)):
+    for each in (sp.load_coverage(tmp_path / "coverage.nc"), sp.predict_network(found, n=2)):
         assert each["tx_antenna"].to_numpy().tolist() == [str(SECTOR), "iso"]
     alone = sp.predict_map(_room(), TX, tx_antenna=SECTOR, spacing_m=1.0)
     np.testing.assert_array_equal(found["gain_mean_db"].sel(tx="a"), alone["gain_mean_db"])

@@ -31,17 +31,17 @@ from websockets.sync.client import connect
 from websockets.typing import Origin
 
 import sionna_partial as sp
-from sionna_partial.app import answer as answer_module
-from sionna_partial.app import session as app_session
-from sionna_partial.app.answer import LEVELS, Answer, View
-from sionna_partial.app.drawing import Stroke
-from sionna_partial.app.files import FILES, stored_map
-from sionna_partial.app.jobs import Status
-from sionna_partial.app.page import Page
-from sionna_partial.app.picture import Picture
-from sionna_partial.app.radio import OTHER_CHANNELS, Transmitter
-from sionna_partial.app.server import AppServer
-from sionna_partial.app.session import Session
+from sionna_partial.apps.app import answer as answer_module
+from sionna_partial.apps.app import session as app_session
+from sionna_partial.apps.app.answer import LEVELS, Answer, View
+from sionna_partial.apps.app.drawing import Stroke
+from sionna_partial.apps.app.files import FILES, stored_map
+from sionna_partial.apps.app.jobs import Status
+from sionna_partial.apps.app.page import Page
+from sionna_partial.apps.app.picture import Picture
+from sionna_partial.apps.app.radio import OTHER_CHANNELS, Transmitter
+from sionna_partial.apps.app.server import AppServer
+from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.partial_map import cell_centres_m

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from extruded import drawn
+from public_names import EVERY
 
 import sionna_partial as sp
 
@@ -18,7 +19,7 @@ def array_fields(public: type) -> list[str]:
     return [name for name, text in types.items() if any(word in text for word in ARRAY_TYPES)]
 
 
-DATACLASSES = [public for public in (getattr(sp, name) for name in sp.__all__) if is_dataclass(public)]
+DATACLASSES = [public for public in EVERY.values() if is_dataclass(public)]
 WITH_ARRAYS = [public for public in DATACLASSES if array_fields(public)]
 
 CHECKED: dict[type, dict[str, Any]] = {

@@ -120,7 +120,7 @@ def test_what_measurements_have_in_common_is_an_offset():
 def test_gains_that_are_low_everywhere_are_logged_by_the_error_of_their_offset(caplog, low_db, is_logged):
     gain_db = wifi().predict(TX, LEFT).gain_mean_db - low_db
     with caplog.at_level(logging.WARNING):
-        coverage = wifi().coverage(TX, spacing_m=1.6, measurements=sp.Measurements(TX, LEFT, gain_db))
+        coverage = sp.predict_map(wifi(), TX, spacing_m=1.6, measurements=sp.Measurements(TX, LEFT, gain_db))
     assert ("dB below the predicted ones: taken for an offset" in caplog.text) == is_logged
     assert coverage.attrs["measured_offset_db"] == pytest.approx(-low_db, abs=3.0)
 
@@ -212,7 +212,7 @@ class TestPredictMap:
         one = {name: values[:30] for name, values in table.items()}
         both = {name: values[:60] for name, values in table.items()}
         scales = [
-            wifi().coverage(TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
+            sp.predict_map(wifi(), TX, measurements=each, **OPTIONS).attrs["measured_shadow_scale"]
             for each in (one, both, table)
         ]
         assert scales[1] == scales[2] != scales[0]
@@ -279,10 +279,10 @@ def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind):
     tx = SOURCES if kind == "several" else TX
     if kind == "unknown position":
         tx, measured = None, {name: values[:8] for name, values in measured.items() if name != "tx"}
-    before = house().coverage(tx, spacing_m=1.6, measurements=measured)
+    before = sp.predict_map(house(), tx, spacing_m=1.6, measurements=measured)
     flat = sp.AntennaPattern("flat", gain_db, np.zeros(360), np.zeros(360))
     louder = {name: values + gain_db if name.endswith("_db") else values for name, values in measured.items()}
-    after = house().coverage(tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
+    after = sp.predict_map(house(), tx, spacing_m=1.6, tx_antenna=flat, measurements=louder)
     for name in ("p_los", "p_nlos", "p_outage", "p_indoor"):
         np.testing.assert_allclose(after[name], before[name], atol=1e-6)
     for name in ("gain_los_mean_db", "gain_nlos_mean_db"):
@@ -294,8 +294,8 @@ def test_the_gain_of_a_flat_antenna_is_added_to_predictions(house, kind):
 
 def test_the_antenna_of_another_transmitter_changes_nothing():
     flat = sp.AntennaPattern("flat", 15.0, np.zeros(360), np.zeros(360))
-    alone = wifi().coverage(SOURCES, spacing_m=1.6, measurements=measured_links())
+    alone = sp.predict_map(wifi(), SOURCES, spacing_m=1.6, measurements=measured_links())
     table = measured_links()
     table["gain_db"][len(LEFT) : 2 * len(LEFT)] += 15.0
-    other = wifi().coverage(SOURCES, spacing_m=1.6, measurements=table, tx_antenna={"a": None, "b": flat})
+    other = sp.predict_map(wifi(), SOURCES, spacing_m=1.6, measurements=table, tx_antenna={"a": None, "b": flat})
     np.testing.assert_allclose(other.sel(tx="a")["gain_mean_db"], alone.sel(tx="a")["gain_mean_db"], atol=2e-5)

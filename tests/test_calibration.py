@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.calibration import material_fit
+from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.errors import MeasurementError, SionnaPartialError
 from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
@@ -57,7 +58,7 @@ def measured(hidden: sp.Material = HIDDEN, noise_db: float = 1.0) -> dict:
     return {"tx": tx, "rx": rx, "gain_db": traced_db(hidden) + noise_db * noise}
 
 
-def calibrate(measurements: object, **arguments: object) -> sp.MaterialCalibration:
+def calibrate(measurements: object, **arguments: object) -> MaterialCalibration:
     return sp.calibrate_materials(FLAT, measurements, **{"start": START, "trace_settings": SETTINGS, **arguments})  # type: ignore[arg-type]
 
 
@@ -66,12 +67,12 @@ pytestmark = pytest.mark.usefixtures("short_search")
 
 
 @pytest.fixture(scope="module")
-def result(short_search: None) -> sp.MaterialCalibration:
+def result(short_search: None) -> MaterialCalibration:
     return calibrate(measured())
 
 
 class TestHiddenMaterial:
-    def test_losses_and_parameters_within_their_spread(self, result: sp.MaterialCalibration) -> None:
+    def test_losses_and_parameters_within_their_spread(self, result: MaterialCalibration) -> None:
         for polarisation in ("te", "tm"):
             found_db, std_db = result.reflection_loss_db(ANGLES_DEG, polarisation)
             hidden_db = reflection_loss_db(4.4, 2.0, THIN_M, 28e9, ANGLES_DEG, polarisation)
@@ -83,7 +84,7 @@ class TestHiddenMaterial:
         assert result.noise_db == pytest.approx(1.0, abs=0.3)
 
     def test_an_offset_of_powers_is_subtracted(
-        self, result: sp.MaterialCalibration, caplog: pytest.LogCaptureFixture
+        self, result: MaterialCalibration, caplog: pytest.LogCaptureFixture
     ) -> None:
         powers = measured()
         powers["gain_db"] = powers["gain_db"] - 30.0
@@ -92,7 +93,7 @@ class TestHiddenMaterial:
         assert found.offset_db == pytest.approx(-30.0, abs=1.5)
         assert result.offset_db == 0.0
 
-    def test_links_fit_better(self, result: sp.MaterialCalibration) -> None:
+    def test_links_fit_better(self, result: MaterialCalibration) -> None:
         record = json.loads(json.dumps(result.record()))
         assert record["rmse_db"]["after"] < 1.3 < record["rmse_db"]["before"]
         assert (record["permittivity"], record["materials"][0]["thickness_m"]) == (result.permittivity, THIN_M)
@@ -106,7 +107,7 @@ class TestHiddenMaterial:
 
 
 class TestSameAnswer:
-    def test_for_identical_repetitions(self, result: sp.MaterialCalibration) -> None:
+    def test_for_identical_repetitions(self, result: MaterialCalibration) -> None:
         """Gains that repeat exactly are no news: their errors are those of the links."""
         repeated = calibrate({name: np.repeat(values, 3, axis=0) for name, values in measured().items()})
         assert repeated.permittivity == pytest.approx(result.permittivity)
@@ -114,7 +115,7 @@ class TestSameAnswer:
         np.testing.assert_allclose(repeated.gain_after_db, np.repeat(result.gain_after_db, 3), atol=1e-3)
         assert repeated.used.sum() == 3 * result.used.sum()
 
-    def test_from_a_poor_start(self, result: sp.MaterialCalibration) -> None:
+    def test_from_a_poor_start(self, result: MaterialCalibration) -> None:
         poor = calibrate(measured(), start=sp.Material(30.0, 20.0, THIN_M))
         assert poor.loss[0] > result.loss[0]
         assert poor.materials == result.materials
@@ -150,7 +151,7 @@ class TestPartialMap:
         assert found.left_out["runs through unobserved space"] > 5
         assert (~found.used).sum() == sum(found.left_out.values())
 
-    def test_uncertainty_is_larger_where_paths_may_be_missing(self, result: sp.MaterialCalibration) -> None:
+    def test_uncertainty_is_larger_where_paths_may_be_missing(self, result: MaterialCalibration) -> None:
         """One unknown corner changes no link, but makes the map incomplete."""
         state = FLAT.state.copy()
         state[48, 78] = sp.CellState.UNKNOWN
@@ -159,7 +160,7 @@ class TestPartialMap:
         ratio = found.reflection_loss_db(ANGLES_DEG)[1] / result.reflection_loss_db(ANGLES_DEG)[1]
         assert (ratio > 1.2).all()
 
-    def test_outages_are_left_out(self, result: sp.MaterialCalibration) -> None:
+    def test_outages_are_left_out(self, result: MaterialCalibration) -> None:
         assert result.left_out == {"measured outage": 0, "no path on the map": 0, "runs through unobserved space": 0}
         measurements = measured()
         gain_db = np.array(measurements["gain_db"])

@@ -5,10 +5,12 @@ import pytest
 from coverage_cases import shipped
 
 import sionna_partial as sp
+from sionna_partial.channels import dft_codebook, sample_channels
+from sionna_partial.channels.samples import ChannelSamples
 from sionna_partial.errors import MemoryLimitError, SettingsError
+from sionna_partial.lab.training.paths import example, fit_path_model
 from sionna_partial.resources import scenes_folder
 from sionna_partial.tracing.antennas import planar_array
-from sionna_partial.training.paths import example, fit_path_model
 
 TX = (7.0, 9.8, 1.5)
 
@@ -31,13 +33,13 @@ def partial() -> sp.PartialMap:
 
 
 @pytest.fixture(scope="module")
-def samples(partial: sp.PartialMap, receivers: np.ndarray) -> sp.ChannelSamples:
-    return sp.sample_channels(partial, TX, receivers, n=100)
+def samples(partial: sp.PartialMap, receivers: np.ndarray) -> ChannelSamples:
+    return sample_channels(partial, TX, receivers, n=100)
 
 
 def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receivers: np.ndarray) -> None:
     links = sp.trace_links(home, TX, receivers)
-    samples = sp.sample_channels(home, TX, receivers, n=3)
+    samples = sample_channels(home, TX, receivers, n=3)
     assert len(links.a) > 20
     for draw in range(3):
         drawn = samples.links(draw)
@@ -46,7 +48,7 @@ def test_on_a_complete_map_every_draw_is_the_trace(home: sp.PartialMap, receiver
 
 
 def test_draws_agree_with_the_prediction_and_with_themselves(
-    partial: sp.PartialMap, receivers: np.ndarray, samples: sp.ChannelSamples
+    partial: sp.PartialMap, receivers: np.ndarray, samples: ChannelSamples
 ) -> None:
     prediction = shipped().predict(sp.link_features(partial, sp.trace_links(partial, TX, receivers)))
     for state, probability in zip(sp.LinkState, prediction.by_state[0], strict=True):
@@ -80,7 +82,7 @@ def test_mean_and_spread_of_draws_are_predicted(case: str, partial: sp.PartialMa
         settings = sp.TraceSettings(5e9, max_depth=2), sp.SceneSettings(material=material)
         model, tx = sp.LinkModel(room(), None, *settings), (1.0, 2.0, 1.5)
         rx = np.array([(5.0, 2.3, 1.2), (2.5, 1.0, 1.0), (2.2, 3.5, 1.5), (4.0, 1.0, 1.5), (5.5, 3.7, 1.5)])
-    drawn, expected = sp.sample_channels(model, tx, rx, n=3000), model.predict(tx, rx)
+    drawn, expected = sample_channels(model, tx, rx, n=3000), model.predict(tx, rx)
     clear = expected.gain_nlos_mean_db - 3.0 * expected.gain_nlos_std_db > -150.0  # no gain is below the floor
     assert clear.sum() >= 4
     assert np.abs(drawn.gain_db.mean(axis=0) - expected.gain_mean_db)[clear].max() < 0.15
@@ -96,7 +98,7 @@ def test_what_was_seen_is_in_every_draw(partial: sp.PartialMap) -> None:
     seen = sp.link_features(partial, sp.trace_links(partial, TX, rx_m)).context.indirect_gain_db[0, -1]
     assert seen > -90.0
     direct = np.abs(sp.trace_links(partial, TX, rx_m).a[0]) ** 2
-    samples = sp.sample_channels(partial, TX, rx_m, n=100)
+    samples = sample_channels(partial, TX, rx_m, n=100)
     for drawn in map(samples.links, range(100)):
         indirect = np.abs(drawn.a[(drawn.interactions > 0).any(axis=1)]) ** 2
         shared = np.abs(drawn.a[(drawn.interactions == 0).all(axis=1)]).item() ** 2 / direct  # factor of all paths
@@ -108,37 +110,37 @@ def test_the_order_of_transmitters_does_not_matter(home: sp.PartialMap) -> None:
     outside = np.insert((cells + 0.5) * home.resolution_m + home.origin_m, 2, 1.5, axis=1)
     model = sp.LinkModel(home)
     for order in ([0, 1], [1, 0]):
-        drawn = sp.sample_channels(model, np.array([TX, outside[0]])[order], outside[1:], n=16)
+        drawn = sample_channels(model, np.array([TX, outside[0]])[order], outside[1:], n=16)
         np.testing.assert_allclose(drawn.gain_db[:, order[0]].std(axis=0), 0.0, atol=1e-9)
         assert drawn.gain_db[:, order[1]].std(axis=0).max() > 1.0
 
 
 def test_paths_of_draws_are_made_one_by_one(partial: sp.PartialMap, receivers: np.ndarray) -> None:
-    samples = sp.sample_channels(partial, TX, receivers, n=400, memory_gb=0.05)
+    samples = sample_channels(partial, TX, receivers, n=400, memory_gb=0.05)
     power = [np.bincount(each.path_rx, np.abs(each.a) ** 2).sum() for each in map(samples.links, (399, 0, 399))]
     assert power[0] == power[2] != power[1]
     with pytest.raises(MemoryLimitError, match=r"400 draws take up to .* Use links\(draw\)"):
         samples.cir()
     with pytest.raises(MemoryLimitError, match=r"10,000 draws of \d+ links take up to .* fewer draws"):
-        sp.sample_channels(partial, TX, receivers, n=10_000, memory_gb=0.01)
+        sample_channels(partial, TX, receivers, n=10_000, memory_gb=0.01)
     with pytest.raises(SettingsError, match="draw = 400"):
         samples.links(400)
     with pytest.raises(SettingsError, match="n = 0"):
-        sp.sample_channels(partial, TX, receivers, n=0)
+        sample_channels(partial, TX, receivers, n=0)
 
 
-def test_channels_of_draws(samples: sp.ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray) -> None:
+def test_channels_of_draws(samples: ChannelSamples, partial: sp.PartialMap, receivers: np.ndarray) -> None:
     arrays = {"tx_array": planar_array(2, 2)}
     cfr = samples.cfr(np.arange(4) * 1e6, **arrays)
     assert cfr.h.sizes == {"draw": 100, "link": len(receivers), "rx_ant": 1, "tx_ant": 4, "frequency": 4}
     np.testing.assert_allclose(cfr.h[7], samples.links(7).cfr(np.arange(4) * 1e6, **arrays).h, atol=1e-8)
-    assert samples.beam_gains(sp.dft_codebook(2, 2), **arrays).gain_db.sizes["draw"] == 100
+    assert samples.beam_gains(dft_codebook(2, 2), **arrays).gain_db.sizes["draw"] == 100
     two, again, other = (
-        sp.sample_channels(partial, [TX, (7.0, 10.5, 1.5)], receivers[:5], n=4, seed=seed) for seed in (0, 0, 1)
+        sample_channels(partial, [TX, (7.0, 10.5, 1.5)], receivers[:5], n=4, seed=seed) for seed in (0, 0, 1)
     )
     np.testing.assert_array_equal(again.drawn.transfer, two.drawn.transfer)
     assert not np.array_equal(other.gain_db, two.gain_db)
-    assert len(sp.sample_channels(partial, TX, np.zeros((0, 3)), n=5).drawn.a) == 0
+    assert len(sample_channels(partial, TX, np.zeros((0, 3)), n=5).drawn.a) == 0
     assert two.spreads().delay_spread_s.sizes == {"draw": 4, "tx": 2, "rx": 5}
     assert two.cir(tx_orientation_rad=np.zeros((2, 3))).sizes["draw"] == 4
     np.testing.assert_array_equal(two.links(3).gain_db, two.gain_db[3])

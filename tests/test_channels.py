@@ -14,10 +14,11 @@ from test_trace import _room
 from traced import made_links
 
 import sionna_partial as sp
-from sionna_partial.channels import responses
+from sionna_partial.channels import dft_codebook, load_channels, save_channels
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
 from sionna_partial.scene.scene import export_scene
+from sionna_partial.tracing import responses
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 
@@ -206,8 +207,8 @@ def test_channels_have_the_paths_of_their_links() -> None:
     """Channels are sums of fields: weak paths count, which links have by request."""
     settings = [sp.TraceSettings(max_depth=3, power_tolerance_db=tolerance_db) for tolerance_db in (None, 0.0, 0.1)]
     links, every, written = (sp.trace_links(_room(), TX, RX[:2], trace_settings=each) for each in settings)
-    assert every.with_every_path(_room()) is every
-    completed = links.with_every_path(_room())
+    assert sp.Simulation(_room()).with_every_path(every) is every
+    completed = sp.Simulation(_room()).with_every_path(links)
     assert len(links.a) == len(written.a) < len(every.a)
     for name, arguments in (("cfr", ([-1e8, 1e8],)), ("cir", ()), ("taps", (1e8,)), ("beam_gains", ([[1.0]],))):
         found = [getattr(each, name)(*arguments) for each in (links, written, completed, every)]
@@ -286,7 +287,10 @@ class TestResponses:
             (lambda links: links.cfr([28e9]), "frequencies_hz = .* below the carrier of 2.8e.10 Hz"),
             (lambda links: links.taps(1e6, 5, 4), r"l_max = 4 is not allowed: give a whole number in \[5"),
             (lambda links: links.beam_gains(np.ones((2, 3))), r"codebook = .*\(2, 3\).* give \(beams, 1\) weights"),
-            (lambda links: sp.dft_codebook(80, 80), r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas"),
+            (
+                lambda links: dft_codebook(80, 80),
+                r"rows, columns = \(80, 80\) is not allowed: give 4096 antennas",
+            ),
             (lambda links: replace(links, transfer=links.transfer[:, :1, :1]).cir(), "transfer = .* one polarisation"),
         ],
     )
@@ -299,7 +303,7 @@ class TestBeams:
     def test_gain_is_that_of_all_antennas(self, several: sp.TracedLinks) -> None:
         arrays = {"tx_array": array_of(4, 2, "tr38901", "VH"), "rx_array": array_of(1, 2, "dipole", "VH")}
         options = {**arrays, "tx_orientation_rad": (0.3, 0.1, 0.0), "rx_orientation_rad": np.ones((3, 3))}
-        rng, at_tx = np.random.default_rng(0), sp.dft_codebook(4, 2, 2)
+        rng, at_tx = np.random.default_rng(0), dft_codebook(4, 2, 2)
         at_rx = rng.normal(size=(3, 4)) + 1j * rng.normal(size=(3, 4))
         beams = several.beam_gains(at_tx, at_rx, **options)
         a = several.cir(**options).a.values
@@ -314,13 +318,13 @@ class TestBeams:
         assert np.isnan(beams.margin_db[[2, 5]]).all()
 
     def test_codebook_is_orthonormal_and_points(self) -> None:
-        beams = sp.dft_codebook(4, 8, 2)
+        beams = dft_codebook(4, 8, 2)
         np.testing.assert_allclose(beams @ beams.conj().T, np.eye(64), atol=1e-12)
         field = sp.PartialMap(np.zeros((60, 60), dtype=np.uint8), 0.1)
         y = 4.0 * np.tan(np.arcsin(2 * np.arange(4) / 8))  # sin(azimuth) = 2 k / columns: the k-th beam across
         rx = np.column_stack([np.full(4, 5.0), 1.0 + y, np.full(4, 1.5)])[:3]
         links = sp.trace_links(field, (1.0, 1.0, 1.5), rx, scene_settings=sp.SceneSettings(floor_extent="none"))
-        found = links.beam_gains(sp.dft_codebook(4, 8), tx_array=array_of(4, 8))
+        found = links.beam_gains(dft_codebook(4, 8), tx_array=array_of(4, 8))
         assert found.best_tx_beam.values.tolist() == [0, 4, 8]
         gain_db = found.gain_db.max(["rx_beam", "tx_beam"]).values - links.gain_db
         np.testing.assert_allclose(gain_db, 10 * np.log10(32), atol=1e-2)
@@ -375,8 +379,8 @@ class TestFiles:
     ) -> None:
         options["synthetic_array"] = synthetic_array
         whole, path = several.cir(**options), tmp_path / f"channels{suffix}"
-        sp.save_channels(several, path, **options)
-        found = sp.load_channels(path)
+        save_channels(several, path, **options)
+        found = load_channels(path)
         assert found.a.dims == ("rx", "rx_ant", "tx", "tx_ant", "path", "time")
         assert found.a.dtype == np.complex64
         assert found.a.shape == (3, 2, 2, 8, whole.sizes["path"], 1)
@@ -390,34 +394,34 @@ class TestFiles:
 
     def test_computed_channels(self, several: sp.TracedLinks, tmp_path: Path, options: dict[str, Any]) -> None:
         channels, response = several.cir(**options), several.cfr([0.0, 1e6], **options)
-        sp.save_channels(channels.isel(link=[5, 3, 4]).transpose("path", ...), tmp_path / "some.nc")
-        sp.save_channels(several, tmp_path / "links.nc", **options)
-        found, every = (sp.load_channels(tmp_path / name) for name in ("some.nc", "links.nc"))
+        save_channels(channels.isel(link=[5, 3, 4]).transpose("path", ...), tmp_path / "some.nc")
+        save_channels(several, tmp_path / "links.nc", **options)
+        found, every = (load_channels(tmp_path / name) for name in ("some.nc", "links.nc"))
         xr.testing.assert_equal(found, every.isel(tx=[1]))
-        sp.save_channels(response, tmp_path / "h.nc")
-        found = sp.load_channels(tmp_path / "h.nc")
+        save_channels(response, tmp_path / "h.nc")
+        found = load_channels(tmp_path / "h.nc")
         assert found.h.dims == ("rx", "rx_ant", "tx", "tx_ant", "time", "frequency")
         np.testing.assert_array_equal(found.h[1, :, 1, :, 0], response.h[4])
         assert found.frequency.values.tolist() == [0.0, 1e6]
 
     def test_as_deepmimo_has_them(self, tmp_path: Path) -> None:
         links = links_of(1)
-        sp.save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
-        found, whole = sp.load_channels(tmp_path / "one.h5"), links.cir(tx_array=array_of(2, 2))
+        save_channels(links, tmp_path / "one.h5", layout="deepmimo", tx_array=array_of(2, 2))
+        found, whole = load_channels(tmp_path / "one.h5"), links.cir(tx_array=array_of(2, 2))
         assert found.channel.dims == ("rx", "rx_ant", "tx_ant", "path")
         assert found.channel.sizes["path"] == whole.a.sizes["path"] > 1
         np.testing.assert_array_equal(found.delay, whole.delay_s)
-        sp.save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
-        assert sp.load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
+        save_channels(links.cfr([0.0, 1e6]), tmp_path / "h.h5", layout="deepmimo")
+        assert load_channels(tmp_path / "h.h5").channel.dims == ("rx", "rx_ant", "tx_ant", "frequency")
 
     @pytest.mark.parametrize("polarization", ["V", "VH"])
     def test_antennas_in_the_order_of_deepmimo(self, polarization: str, tmp_path: Path) -> None:
         """Antenna m of a panel of H x V has the indices (0, m mod H, m div H): its phase is pi times their advance."""
         (vertical, horizontal), links = (2, 4), links_of(1)
         options = {"tx_array": array_of(vertical, horizontal, polarization=polarization), "normalize_delays": False}
-        sp.save_channels(links, tmp_path / "direct.h5", layout="deepmimo", **options)
-        sp.save_channels(links.cir(**options), tmp_path / "computed.h5", layout="deepmimo")
-        found, again = (sp.load_channels(tmp_path / name) for name in ("direct.h5", "computed.h5"))
+        save_channels(links, tmp_path / "direct.h5", layout="deepmimo", **options)
+        save_channels(links.cir(**options), tmp_path / "computed.h5", layout="deepmimo")
+        found, again = (load_channels(tmp_path / name) for name in ("direct.h5", "computed.h5"))
         np.testing.assert_array_equal(found.channel, again.channel)
         number = np.arange(vertical * horizontal)
         indices = np.stack([0 * number, number % horizontal, number // horizontal], axis=1)
@@ -431,27 +435,48 @@ class TestFiles:
         self, several: sp.TracedLinks, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         fractions: list[float] = []
-        sp.save_channels(several, tmp_path / "whole.nc")
+        save_channels(several, tmp_path / "whole.nc")
         with h5py.File(tmp_path / "whole.nc") as file:  # HDF5 would write seconds down
             assert not file["a"].id.get_create_plist().get_obj_track_times()
         monkeypatch.setattr("sionna_partial.channels.files.CHUNK_BYTES", 1)
-        sp.save_channels(several, tmp_path / "parts.nc", progress=lambda fraction, _: fractions.append(fraction))
-        xr.testing.assert_equal(sp.load_channels(tmp_path / "whole.nc"), sp.load_channels(tmp_path / "parts.nc"))
+        save_channels(several, tmp_path / "parts.nc", progress=lambda fraction, _: fractions.append(fraction))
+        xr.testing.assert_equal(load_channels(tmp_path / "whole.nc"), load_channels(tmp_path / "parts.nc"))
         assert fractions[-1] == 1.0
         assert len({*fractions}) == 7
-        sp.save_channels(several, tmp_path / "again.nc")
+        save_channels(several, tmp_path / "again.nc")
         assert (tmp_path / "again.nc").read_bytes() == (tmp_path / "parts.nc").read_bytes()
 
     @pytest.mark.parametrize(
         ("call", "message"),
         [
-            (lambda path, links: sp.save_channels(links, path, layout="matlab"), "layout = 'matlab' is not allowed"),  # type: ignore[arg-type]
-            (lambda path, links: sp.save_channels(links, path, layout="deepmimo"), "transmitters = 2 is not allowed"),
-            (lambda path, links: sp.save_channels(xr.Dataset(), path), "channels.tx = 'missing' .* or what their cir"),
-            (lambda path, links: sp.save_channels(links.cfr([0])[{"frequency": 0}], path), "channels.h = .*give links"),
-            (lambda path, links: sp.save_channels(one_link(), path), "channels = '1 links' .* none has a path"),
-            (lambda path, links: sp.save_channels(links, path.parent / "x.zarr"), "is there already: remove it, or"),
-            (lambda path, links: sp.load_channels(path.with_name("other.nc")), "it holds no channels; give a file of"),
+            (
+                lambda path, links: save_channels(links, path, layout="matlab"),
+                "layout = 'matlab' is not allowed",
+            ),  # type: ignore[arg-type]
+            (
+                lambda path, links: save_channels(links, path, layout="deepmimo"),
+                "transmitters = 2 is not allowed",
+            ),
+            (
+                lambda path, links: save_channels(xr.Dataset(), path),
+                "channels.tx = 'missing' .* or what their cir",
+            ),
+            (
+                lambda path, links: save_channels(links.cfr([0])[{"frequency": 0}], path),
+                "channels.h = .*give links",
+            ),
+            (
+                lambda path, links: save_channels(one_link(), path),
+                "channels = '1 links' .* none has a path",
+            ),
+            (
+                lambda path, links: save_channels(links, path.parent / "x.zarr"),
+                "is there already: remove it, or",
+            ),
+            (
+                lambda path, links: load_channels(path.with_name("other.nc")),
+                "it holds no channels; give a file of",
+            ),
         ],
     )
     def test_refused(self, several: sp.TracedLinks, tmp_path: Path, call: Callable[..., object], message: str) -> None:

@@ -24,7 +24,7 @@ def test_receivers_of_a_file(map_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "out" / "channels.h5"
     options = ["--orientation", -0.5, 0.1, 0, "--max-depth", 1, "--frequency", 5e9, "--no-diffraction"]
     result = run("channels", map_path, "--tx", 1, 1, 1.4, "--rx", tmp_path / "rx.csv", "--out", out, *arrays, *options)
-    found = sp.load_channels(out)
+    found = sp.channels.load_channels(out)
     assert found.a.shape[:4] == (2, 4, 1, 16)
     assert found.rx_m.values.tolist() == [[2.0, 1.0, 1.5], [5.0, 3.0, 1.2]]
     assert result.stdout.splitlines() == [f"2 receivers, {found.paths.sum().item()} paths", f"wrote {out}"]
@@ -45,7 +45,7 @@ def test_grid(map_path: Path, tmp_path: Path) -> None:
     out = tmp_path / "channels.zarr"
     options = ("--spacing", 0.8, "--max-depth", 0, "--layout", "deepmimo")
     run("channels", map_path, "--tx", 1, 1, "--out", out, *options)
-    found = sp.load_channels(out)
+    found = sp.channels.load_channels(out)
     assert found.channel.dims == ("rx", "rx_ant", "tx_ant", "path")
     assert (_room().state_at(found.rx_m.values) == sp.CellState.FREE).all()
     assert 20 < found.sizes["rx"] < 45

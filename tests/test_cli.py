@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -78,7 +79,7 @@ ARGUMENTS = [
     (
         "network --tx 1,2 --tx 2,2 --tx-power 10 --tx-power 20 --noise-figure 5 --bandwidth 2e7 --load 0.5 "
         "--sinr-threshold 3",
-        "predict_map network_map",
+        "predict_map predict_network",
         {"tx_power_dbm": [10.0, 20.0], "noise_figure_db": 5.0, "bandwidth_hz": 2e7, "load": 0.5}
         | {"sinr_threshold_db": 3.0},
     ),
@@ -124,7 +125,7 @@ ARGUMENTS = [
         "dataset --homes 2 --first-seed 7 --links 20 --transmitters 2 --stage 50 --stage 0 --seed 3 "
         "--field-of-view 360 --range 8 --range-noise 0.02 --drift 0.01 --missed-walls 0.1 --material concrete "
         "--frequency 60e9 --workers 3 --time-limit 60",
-        "build_dataset",
+        "lab.build_dataset",
         {"homes": [7, 8], "workers": 3, "scheduler": None, "home_time_limit_s": 60.0}
         | {
             "settings": DatasetSettings(
@@ -139,7 +140,7 @@ ARGUMENTS = [
     (
         "dataset --homes 3 --first-seed 7 --stage 0.25 --stage 0 --kind floor --kind hall --mixed-sensors "
         "--short-links 0.5 --cir-paths 9 --scheduler there",
-        "build_dataset",
+        "lab.build_dataset",
         {"homes": [(7, "floor"), (8, "hall"), (9, "floor")], "scheduler": "there"}
         | {"settings": DatasetSettings(stages=(0, 0.25), sensor="mixed", short_link_fraction=0.5, cir_paths=9)},
     ),
@@ -157,7 +158,7 @@ ARGUMENTS = [
         | {"resolution_m": 0.1, "obstacle_height_m": 1.2, "wall_layers": ["A"]}
         | {"layer_materials": {"A": Material.named("brick")}},
     ),
-    ("dataset --map a.npz --map b", "build_dataset", {"homes": [Path("a.npz"), Path("b")]}),
+    ("dataset --map a.npz --map b", "lab.build_dataset", {"homes": [Path("a.npz"), Path("b")]}),
 ]
 """Command and options, functions that it calls, and arguments of the last."""
 
@@ -184,15 +185,15 @@ def test_options_arrive(
         ("place MAP --count 2 --out OUT", "place_transmitters", {}),
         ("next MAP --out OUT", "next_views", {}),
         ("export-scene MAP --out OUT", "export_scene", {}),
-        ("dataset OUT", "build_dataset", {"homes": [*range(20_000, 20_100)]}),
-        ("evaluate LINKS --out OUT", "evaluate", {"dataset": [Path("LINKS")], "predictor": "map"}),
+        ("dataset OUT", "lab.build_dataset", {"homes": [*range(20_000, 20_100)]}),
+        ("evaluate LINKS --out OUT", "lab.evaluate", {"dataset": [Path("LINKS")], "predictor": "map"}),
     ],
 )
 def test_defaults_are_the_functions(
     words: str, function: str, aside: dict[str, Any], map_path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     defaults = {
-        name: parameter.default for name, parameter in inspect.signature(getattr(sp, function)).parameters.items()
+        name: parameter.default for name, parameter in inspect.signature(attrgetter(function)(sp)).parameters.items()
     }
     empty = {"trace_settings": TraceSettings(), "scene_settings": SceneSettings(), "sensor": SensorSettings()}
     empty |= {"settings": DatasetSettings()}

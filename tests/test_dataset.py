@@ -21,12 +21,12 @@ import pytest
 from dataset_fakes import HANGS, KILLS, KILLS_ONCE, RAISES, UNWRITABLE, fake_links, processes_make_fakes
 from link_tables import assert_same
 
-from sionna_partial.datasets import dataset, home_links
-from sionna_partial.datasets.dataset import DatasetReport, build_dataset
-from sionna_partial.datasets.home_links import HomeSource, HomeTask, run_home
-from sionna_partial.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
 from sionna_partial.files import locked_folder
+from sionna_partial.lab.datasets import dataset, home_links
+from sionna_partial.lab.datasets.dataset import DatasetReport, build_dataset
+from sionna_partial.lab.datasets.home_links import HomeSource, HomeTask, run_home
+from sionna_partial.lab.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 from sionna_partial.settings import DatasetSettings
 
 SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
@@ -35,7 +35,7 @@ NAMES = tuple(f"make_home({seed})" for seed in SEEDS)
 BUILD = """
 import sys
 from sionna_partial.settings import DatasetSettings
-from sionna_partial.datasets.dataset import build_dataset
+from sionna_partial.lab.datasets.dataset import build_dataset
 build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=2)
 """
 

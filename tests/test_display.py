@@ -11,19 +11,22 @@ import pytest
 import xarray as xr
 from coverage_cases import PICTURE, TX, map_of, shipped
 from PIL import Image
+from public_names import EVERY
 
 import sionna_partial as sp
 from sionna_partial import display
+from sionna_partial.apps.live.coverage import LiveSettings
 from sionna_partial.display import LONGEST, THUMBNAIL_PX, counting, reporting
 from sionna_partial.errors import SettingsError
 from sionna_partial.process import njit
+from sionna_partial.settings import PlacementSettings
 
 LINKS = sp.LinkFeatures(np.ones(50), np.zeros(50), np.full(50, 3.0), np.full(50, -71.0))
 PARTIAL = map_of(PICTURE)
 EXPLORATION = sp.explore_trajectory(PARTIAL, (0, 4), 0)
 SETTINGS = (
-    *(sp.SceneSettings, sp.TraceSettings, sp.SensorSettings, sp.DatasetSettings, sp.Material),
-    *(sp.PredictorSettings, sp.PlacementSettings, sp.LiveSettings, sp.Antenna),
+    *(sp.SceneSettings, sp.TraceSettings, sp.SensorSettings, sp.lab.DatasetSettings, sp.Material),
+    *(sp.lab.PredictorSettings, PlacementSettings, LiveSettings, sp.Antenna),
 )
 
 
@@ -46,11 +49,11 @@ def test_one_line(value: Any, start: str) -> None:
 
 
 def test_every_public_class_is_shown_in_one_line() -> None:
-    classes = {name for name in sp.__all__ if isinstance(getattr(sp, name), type)}
-    own = {name for name in classes if getattr(getattr(sp, name).__repr__, "__module__", "").endswith(".display")}
+    classes = {public for public in EVERY.values() if isinstance(public, type)}
+    own = {public for public in classes if getattr(public.__repr__, "__module__", "").endswith(".display")}
     others = {"CellState", "LinkState", "SionnaPartialError"}
     others |= {"Simulation", "LinkModel", "DifferentiableScene", "LiveCoverage"}
-    assert classes - own == others | ({kind.__name__ for kind in SETTINGS} & classes)
+    assert {public.__name__ for public in classes - own - {*SETTINGS}} == others
 
 
 def picture(html: str) -> Image.Image:
@@ -73,7 +76,7 @@ def test_coverage(coverage: xr.Dataset) -> None:
 
 class TestPlotMap:
     def test_positions_beyond_the_map_are_drawn(self) -> None:
-        figure = sp.plot_map(PARTIAL, tx=TX, rx=[(20.0, 3.0, 1.5), (1.0, 3.0, 1.5)])
+        figure = sp.plots.plot_map(PARTIAL, tx=TX, rx=[(20.0, 3.0, 1.5), (1.0, 3.0, 1.5)])
         (axis,) = figure.axes
         assert axis.get_xlim()[0] < -1.0
         assert axis.get_xlim()[1] > 20.0
@@ -81,7 +84,7 @@ class TestPlotMap:
         assert texts == ["transmitter", "receiver", "wall", "not observed"]
 
     def test_row_0_is_at_the_bottom(self) -> None:
-        figure = sp.plot_map(sp.PartialMap([[0, 1], [0, 0]], 1.0))
+        figure = sp.plots.plot_map(sp.PartialMap([[0, 1], [0, 0]], 1.0))
         walls = figure.axes[0].get_images()[1]
         assert walls.origin == "lower"
         assert walls.get_extent() == [0.0, 2.0, 0.0, 2.0]
@@ -89,11 +92,11 @@ class TestPlotMap:
 
     def test_other_values_are_refused(self) -> None:
         with pytest.raises(sp.SionnaPartialError, match=r"tx has shape \(1,\): give x and y"):
-            sp.plot_map(PARTIAL, tx=[1.0])
+            sp.plots.plot_map(PARTIAL, tx=[1.0])
         with pytest.raises(sp.SionnaPartialError, match="tx has values that are not finite"):
-            sp.plot_map(PARTIAL, tx=(np.nan, 1.0))
+            sp.plots.plot_map(PARTIAL, tx=(np.nan, 1.0))
         with pytest.raises(sp.SionnaPartialError, match="partial is of type str: give a PartialMap"):
-            sp.plot_map("map.yaml")  # type: ignore[arg-type]
+            sp.plots.plot_map("map.yaml")  # type: ignore[arg-type]
 
 
 class Terminal(io.StringIO):

@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from dataset_fakes import processes_make_fakes
 from predictor_links import QUIET
+from public_names import EVERY
 from rosbag_files import write_drive
 
 import sionna_partial as sp
@@ -17,13 +18,13 @@ import sionna_partial as sp
 pytestmark = [QUIET, pytest.mark.usefixtures("short_search")]
 
 CHAINS = (
-    ("build_dataset", "read_dataset", "train", "evaluate"),
-    ("save_coverage", "load_coverage", "plot_coverage"),
-    ("save_channels", "load_channels"),
+    ("lab.build_dataset", "lab.read_dataset", "lab.train", "lab.evaluate"),
+    ("save_coverage", "load_coverage", "plots.plot_coverage"),
+    ("channels.save_channels", "channels.load_channels"),
 )
 """Names whose examples read the files that the first of them wrote."""
 
-ALONE = tuple((name,) for name in sp.__all__ if name not in {*sum(CHAINS, ()), "__version__"})
+ALONE = tuple((name,) for name in EVERY if name not in sum(CHAINS, ()))
 
 
 SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters", "trace_links")
@@ -57,7 +58,7 @@ def test_examples(names: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.Mo
     write_drive(tmp_path / "drive.bag")
     finder, report = doctest.DocTestFinder(exclude_empty=True), list[str]()
     for name in names:
-        found = finder.find(getattr(sp, name), name, globs={})
+        found = finder.find(EVERY[name], name, globs={})
         assert any(each.examples for each in found), f"{name} has no example"
         for example in found:
             runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)

@@ -16,9 +16,9 @@ from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps import drawing_lines
-from sionna_partial.maps.drawing_lines import skip_reason
-from sionna_partial.maps.drawings import map_from_drawing
+from sionna_partial.maps.importers import drawing_lines
+from sionna_partial.maps.importers.drawing_lines import skip_reason
+from sionna_partial.maps.importers.drawings import map_from_drawing
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 

@@ -8,7 +8,7 @@ from predictor_links import LOS, NLOS, OUTAGE, QUICK, QUIET, assert_valid, make_
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.evaluation import (
+from sionna_partial.lab.evaluation import (
     WITH_INDOOR,
     WITHOUT_INDOOR,
     Baselines,

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from sionna_partial import cli
 from sionna_partial.constants import CellState
-from sionna_partial.coverage.network import network_map
+from sionna_partial.coverage.network import predict_network
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import TABLE_VARIABLES, save_coverage, save_network
 from sionna_partial.maps.map_files import load_map, save_map
@@ -149,7 +149,7 @@ class TestSeveralTransmitters:
         assert xr.load_dataset(tmp_path / "out" / "network.nc").attrs["tx_power_dbm"].tolist() == [23.0, 20.0]
 
     def test_the_ros_map_of_a_network_holds_the_outage_of_all(self, several, tmp_path):
-        network = network_map(several, n=50)
+        network = predict_network(several, n=50)
         save_network(network, tmp_path / "outage.yaml", scene=map_of(PICTURE))
         _, cost = occupancy_of(tmp_path / "outage.yaml")
         assert ((cost >= 0) == (map_of(PICTURE).state == CellState.FREE)).all()

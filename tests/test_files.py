@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 import sionna_partial as sp
-from sionna_partial.app.files import stored_map
+from sionna_partial.apps.app.files import stored_map
 from sionna_partial.channels.files import load_channels
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.export import load_coverage
@@ -293,8 +293,8 @@ def test_file_size_limit_leaves_whole_files(tmp_path: Path) -> None:
     calls: dict[str, Callable[[Path], object]] = {
         "npz": lambda path: sp.save_map(partial, path),
         "yaml": lambda path: sp.save_map(partial, path),
-        "nc": lambda path: sp.save_channels(links, path, progress=False),
-        "zarr": lambda path: sp.save_channels(links.cir(), path, progress=False),
+        "nc": lambda path: sp.channels.save_channels(links, path, progress=False),
+        "zarr": lambda path: sp.channels.save_channels(links.cir(), path, progress=False),
         "scene": lambda path: sp.export_scene(partial, path),
     }
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)

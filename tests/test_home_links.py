@@ -10,7 +10,8 @@ import pytest
 from link_tables import assert_same
 
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.datasets.home_links import (
+from sionna_partial.errors import MapError, PredictorError, SettingsError
+from sionna_partial.lab.datasets.home_links import (
     NEAREST_M,
     HomeSource,
     enclosed_map,
@@ -19,8 +20,7 @@ from sionna_partial.datasets.home_links import (
     home_sources,
     map_area,
 )
-from sionna_partial.datasets.shards import CIR, LinkTable, read_shard, write_shard
-from sionna_partial.errors import MapError, PredictorError, SettingsError
+from sionna_partial.lab.datasets.shards import CIR, LinkTable, read_shard, write_shard
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings

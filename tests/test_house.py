@@ -2,6 +2,7 @@
 
 import ast
 import json
+import operator
 import os
 import re
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 from types import CodeType, ModuleType
 
 import pytest
+from public_names import EVERY, GROUPS, TOP
 
 import sionna_partial
 from sionna_partial.resources import EXTRAS
@@ -48,16 +50,17 @@ ROOMS = {
             "partial_map",
             "mesh.cells",
             "mesh.upright",
-            "mesh.points",
             "mesh.files",
             "ros_map",
+            "map_files",
         ),
-        *("drawing_lines", "drawings", "ifc_layers", "ifc", "bags", "vacuum", "map_files"),
     ),
+    "maps.importers": (*("drawing_lines", "drawings", "ifc_layers", "ifc", "bags", "vacuum", "points", "simulators"),),
     "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "scene"),
     "tracing": (
-        *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls", "links", "engine", "antennas"),
+        *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls", "engine", "antennas"),
+        *("responses", "links"),
         *(
             "plan.room",
             "plan.obstacles",
@@ -78,25 +81,26 @@ ROOMS = {
     ),
     "measurements": ("surveys", "measurements", "recordings", "walks", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
-    "channels": ("responses", "files", "joint", "samples"),
+    "channels": ("files", "joint", "samples"),
     "networks": ("coverage.network",),
     "differentiable": ("differentiable",),
     "calibration": ("material_fit", "calibration"),
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
-    "live": ("answers", "coverage", "topics"),
-    "datasets": ("shards", "home_links", "dataset"),
-    "evaluation": ("evaluation",),
-    "training": ("predictor", "paths", "walls"),
+    "lab": (
+        *("datasets.shards", "datasets.home_links", "datasets.dataset", "evaluation"),
+        *("training.predictor", "training.paths", "training.walls"),
+    ),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
-    "results": ("export", "demo", "info", "reports"),
-    "app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
+    "results": ("export", "demo", "info", "lab.reports"),
+    "apps.live": ("answers", "coverage", "topics"),
+    "apps.app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }
 """Rooms in reading order, and the modules of each: a module imports only from those before it."""
 
-FILES = {"foundations", "coverage", "networks", "differentiable", "evaluation", "results", "command"}
+FILES = {"foundations", "coverage", "networks", "differentiable", "results", "command"}
 """Rooms whose modules are given by their full names."""
 
 MODULES = tuple(
@@ -115,29 +119,42 @@ HEAVY = IN_FUNCTIONS | {
 
 HOMES = {
     **dict.fromkeys(["drjit", "mitsuba", "sionna"], ("tracing.", "llvm")),
-    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable", "training.")),
+    **dict.fromkeys(["tensorflow", "keras"], ("prediction.", "differentiable", "lab.training.")),
     "matplotlib": ("plots.",),
-    "bokeh": ("plots.", "app."),
+    "bokeh": ("plots.", "apps.app."),
 }
 """Beginnings of the modules that may import these libraries."""
 
 STRAYS = {
     ("scene.scene", "sionna"): "the table of ITU materials",
-    ("datasets.home_links", "drjit"): "the threads of a worker",
+    ("lab.datasets.home_links", "drjit"): "the threads of a worker",
 }
 """Modules that import one of them all the same, and what for."""
 
-PLOTS_ARE_FOR = ("plots.", "app.", "cli.", "export", "demo", "reports")
+PLOTS_ARE_FOR = ("plots.", "apps.app.", "cli.", "export", "demo", "lab.reports")
 """Beginnings of the modules that may import plots: they are a leaf."""
 
-LATER = {
-    "export:save_coverage": "`coverage.radio.save`",
-    "coverage.job:predict_map": "`LinkModel.coverage`",
-    **dict.fromkeys([f"channels.responses:{name}" for name in ("cir", "cfr", "taps", "spreads")], "`TracedLinks`"),
-    "channels.responses:beam_gains": "`TracedLinks.beam_gains`",
-    "tracing.simulation:with_every_path": "`TracedLinks.with_every_path`",
+IMPORTERS = {
+    f"maps.importers.{reader}"
+    for reader in (
+        *("bags:map_from_bag", "drawings:map_from_drawing", "drawings:read_picture", "ifc:map_from_ifc"),
+        *("points:is_cloud", "points:map_from_points", "vacuum:read_vacuum_map"),
+    )
 }
-"""What `later` imports from later rooms, besides plots, and the method that it is for."""
+"""What `load_map` imports when it meets a file of that kind."""
+
+LATER = {"export:save_coverage"} | IMPORTERS
+"""What strings name in later rooms, besides plots; the first is for `coverage.radio.save`."""
+
+CLIENTS = ("maps.importers.", "apps.", "lab.", "cli.", "__main__")
+"""Beginnings of the modules that the core does without."""
+
+CLIENTS_ARE_FOR = {
+    "measurements.recordings": "recordings of robots",
+    "measurements.surveys": "surveys of vacuum robots",
+    "plots.result_plots": "pictures of evaluations",
+}
+"""Other modules that import them, and what for."""
 
 NOT_IMPORTED = {
     "dask": "what distributed is the scheduler of; the cluster's commands are `dask scheduler` and `dask worker`",
@@ -149,6 +166,21 @@ NOT_IMPORTED = {
 
 COME_WITH = {"contourpy": "matplotlib", "drjit": "sionna-rt", "mitsuba": "sionna-rt", "rich": "typer"}
 """Imported packages that a declared one cannot do without, and which it therefore installs in a version that fits."""
+
+
+NAMES_OF_0_1 = """
+    Assimilation CellState ChannelSamples DatasetSettings DifferentiableScene Exploration GainGradients LinkFeatures
+    LinkPrediction LinkState Material MaterialCalibration Measurements NetworkPlacement NextView NextViews
+    PartialMap PlacementSettings Predictor PredictorSettings SceneSettings SensorSettings SionnaPartialError
+    TraceSettings TracedLinks TransmitterPlacement animate_exploration build_dataset calibrate_materials
+    dft_codebook evaluate explore explore_trajectory export_scene gain_gradients link_features load_channels
+    load_coverage load_map make_home map_from_array map_from_bag map_from_drawing map_from_habitat
+    map_from_occupancy map_from_points map_from_slam measurements_from_bag network_map next_views place_transmitter
+    place_transmitters plot_calibration plot_coverage plot_exploration plot_map plot_network plot_network_placement
+    plot_next_views plot_placement poses_from_bag predict_map read_dataset sample_channels save_channels
+    save_coverage save_map save_network trace_links train
+"""
+"""Public names of version 0.1.0."""
 
 
 @cache
@@ -177,6 +209,16 @@ def imported_at_the_top(tree: ast.Module) -> set[str]:
 def own_imports(module: str) -> set[str]:
     prefix = "sionna_partial."
     return {name.removeprefix(prefix) for name in imported(tree_of(module)) if name.startswith(prefix)}
+
+
+@cache
+def own_strings(module: str) -> set[str]:
+    """Return what strings name in modules of the package, such as "plots.style:plot_map"."""
+    constants = (node.value for node in ast.walk(tree_of(module)) if isinstance(node, ast.Constant))
+    texts = [text for text in constants if isinstance(text, str)]
+    named = {name for text in texts for name in re.findall(r"sionna_partial\.([\w.]*\w)", text)}
+    named |= {text for text in texts if re.fullmatch(r"[\w.]+:\w+", text)}
+    return {name for name in named if name.partition(":")[0] in MODULES}
 
 
 def declared(kind: str) -> set[str]:
@@ -208,14 +250,21 @@ class TestOneDirection:
         late = {module: own_imports(module) - set(MODULES[:number]) for number, module in enumerate(MODULES)}
         assert {module: names for module, names in late.items() if names} == {}
 
+    def test_strings_name_only_modules_before_them_plots_and_what_is_listed(self) -> None:
+        named = {(number, name) for number, module in enumerate(MODULES) for name in own_strings(module)}
+        late = {name for number, name in named if name.partition(":")[0] not in MODULES[: number + 1]}
+        assert {name for name in late if not name.startswith("plots.")} == LATER
+
+    def test_the_core_does_without_its_clients(self) -> None:
+        core = [module for module in MODULES if not module.startswith(CLIENTS)]
+        users = {module for module in core if any(name.startswith(CLIENTS) for name in own_imports(module))}
+        assert users == CLIENTS_ARE_FOR.keys()
+        named = {(module, name) for module in core for name in own_strings(module) if name.startswith(CLIENTS)}
+        assert named == {("maps.map_files", name) for name in IMPORTERS}
+
     def test_plots_are_a_leaf(self) -> None:
         users = [module for module in MODULES if any(name.startswith("plots.") for name in own_imports(module))]
         assert [module for module in users if not module.startswith(PLOTS_ARE_FOR)] == []
-
-    def test_only_what_is_listed_is_imported_later(self) -> None:
-        calls = [node for module in MODULES for node in ast.walk(tree_of(module)) if isinstance(node, ast.Call)]
-        found = {ast.unparse(each.args[0]).strip("'") for each in calls if ast.unparse(each.func) == "later"}
-        assert {name for name in found if ":" in name and not name.startswith("plots.")} == LATER.keys()
 
     def test_each_heavy_library_has_its_rooms(self) -> None:
         found = {(module, name.partition(".")[0]) for module in MODULES for name in imported(tree_of(module))}
@@ -253,8 +302,10 @@ for name in ("", *typer.main.get_command(app).commands):
             "import sionna_partial as sp", f"sp.load_map({str(path)!r})", "sp.predict_map"
         )
         assert not libraries(package) & (HEAVY | {"typer", "rich"})
-        others = ("bags", "drawings", "ifc_layers", "ifc", "mesh.cells", "mesh.files", "mesh.points")
-        assert not reader & {f"sionna_partial.maps.{name}" for name in others}
+        others = {f"sionna_partial.{name}" for name in ("maps.importers.", "maps.mesh.cells", "maps.mesh.files")}
+        assert not reader & others
+        clients = {f"sionna_partial.{name}" for name in CLIENTS}
+        assert not (package | reader | prediction) & clients
         assert not libraries(reader) & {"numba", "rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
         assert len(own) <= 66
@@ -285,11 +336,24 @@ class TestPublicNames:
     def test_names_resolve_to_what_they_say(self) -> None:
         for module in MODULES:
             import_module(f"sionna_partial.{module}")
-        for name in sionna_partial.__all__:
-            value = getattr(sionna_partial, name)
+        for name, value in EVERY.items():
             assert not isinstance(value, ModuleType)
-            assert getattr(value, "__name__", name) == name
+            assert getattr(value, "__name__", name) == name.rpartition(".")[2]
         assert dir(sionna_partial) == sorted(sionna_partial.__all__)
+
+    def test_there_are_few(self) -> None:
+        assert len(TOP) <= 40
+        assert {*sionna_partial.__all__} == {*TOP, *GROUPS, "__version__"}
+
+    def test_names_of_version_0_1_warn_and_are_the_same_objects(self) -> None:
+        for name in sorted({*NAMES_OF_0_1.split()} - {*TOP}):
+            message = rf"^sionna_partial\.{name} is deprecated: use sionna_partial\.[\w.]*\w\.$"
+            with pytest.warns(DeprecationWarning, match=message) as warned:
+                found = getattr(sionna_partial, name)
+            there = str(warned[0].message).rpartition(" sionna_partial.")[2].removesuffix(".")
+            assert operator.attrgetter(there)(sionna_partial) is found
+            assert warned[0].filename == __file__
+            assert found.__name__ in (name, "predict_network")
 
     def test_unknown_name(self) -> None:
         with pytest.raises(AttributeError, match="module 'sionna_partial' has no attribute 'teleport'"):

@@ -11,8 +11,8 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.ifc_layers import Layer, constants_at
-from sionna_partial.maps.ifc_layers import slab as slab_of_layers
+from sionna_partial.maps.importers.ifc_layers import Layer, constants_at
+from sionna_partial.maps.importers.ifc_layers import slab as slab_of_layers
 
 pytest.importorskip("ifcopenshell")
 from ifc_building import Building, whole_of

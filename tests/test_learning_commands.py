@@ -11,7 +11,7 @@ from predictor_links import QUIET, quick_predictor
 
 from sionna_partial.cli.learning import DEFAULT_HOMES, FIRST_SEED
 from sionna_partial.constants import CellState
-from sionna_partial.datasets.home_links import home_sources
+from sionna_partial.lab.datasets.home_links import home_sources
 from sionna_partial.maps.map_files import save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor
@@ -53,7 +53,7 @@ class TestDataset:
 
 
 def test_defaults_of_train(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    found = arguments_of(monkeypatch, "train", "train", dataset, "--out", tmp_path / "run")
+    found = arguments_of(monkeypatch, "lab.train", "train", dataset, "--out", tmp_path / "run")
     assert (found["test_fraction"], found["settings"]) == (0.3, PredictorSettings("map"))
 
 

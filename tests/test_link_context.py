@@ -13,7 +13,7 @@ from predictor_links import features
 from traced import made_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
-from sionna_partial.datasets.home_links import home_links
+from sionna_partial.lab.datasets.home_links import home_links
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
 from sionna_partial.prediction.space import MapSpace

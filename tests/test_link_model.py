@@ -12,6 +12,7 @@ from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction import predictor as predictors
 
 pytestmark = QUIET
@@ -43,18 +44,18 @@ def half_open(cell):
 
 def test_updated_as_new_to_the_byte(maps, tx):
     model = sp.LinkModel(maps[0])
-    first = model.coverage(tx, spacing_m=0.5)
+    first = sp.predict_map(model, tx, spacing_m=0.5)
     xr.testing.assert_identical(first, sp.predict_map(maps[0], tx, spacing_m=0.5))
     for partial in (maps[1], maps[0]):
         model.update(partial)
-        fresh = sp.LinkModel(partial).coverage(tx, spacing_m=0.5)
-        for warm in (model.coverage(tx, spacing_m=0.5), sp.predict_map(model, tx, spacing_m=0.5)):
-            xr.testing.assert_identical(warm, fresh)
+        fresh = sp.predict_map(sp.LinkModel(partial), tx, spacing_m=0.5)
+        warm = sp.predict_map(model, tx, spacing_m=0.5)
+        xr.testing.assert_identical(warm, fresh)
 
 
 def test_coverage_is_predict(maps, tx):
     model = sp.LinkModel(maps[0], "paper")
-    coverage = model.coverage(tx, spacing_m=1.0)
+    coverage = sp.predict_map(model, tx, spacing_m=1.0)
     y, x = np.nonzero(coverage["valid"].to_numpy())
     rx = np.column_stack([coverage.x[x], coverage.y[y], np.full(len(x), 1.5)])
     prediction = model.predict([tx, tx], rx)
@@ -75,7 +76,7 @@ def test_complete_is_decided_per_link():
 
 def test_is_taken_in_place_of_a_map():
     model = sp.LinkModel(half_open(sp.CellState.UNKNOWN))
-    assert sp.sample_channels(model, TX, RX, n=4).gain_db.shape == (4, 2)
+    assert sp.channels.sample_channels(model, TX, RX, n=4).gain_db.shape == (4, 2)
     assert sp.trace_links(model, TX, RX).gain_db.shape == (2,)
     assert sp.place_transmitter(model).partial is model.partial
     assert sp.next_views(model, goal="area").partial is model.partial
@@ -153,7 +154,7 @@ def test_any_chain_of_updates_is_a_new_model(first, start, tmp_path):
 def test_positions_are_float64_in_any_form():
     model = sp.LinkModel(two_rooms("plan"))
     forms = [(1, 1), np.float32([1, 1]), np.array([1, 1], np.uint8), (1.0, 1.0, 1.5)]
-    found = [model.coverage({"a": form, "b": form}, spacing_m=1.0) for form in forms]
+    found = [sp.predict_map(model, {"a": form, "b": form}, spacing_m=1.0) for form in forms]
     for coverage in found:
         assert np.all(coverage["tx_z"] == 1.5)
         np.testing.assert_array_equal(coverage["gain_mean_db"], found[0]["gain_mean_db"])
@@ -176,7 +177,7 @@ def test_unknown_cells_around_a_map_change_no_prediction(maps, tx, frequency_hz)
         model = sp.LinkModel(partial, trace_settings=settings)
         prediction = model.predict(tx, rx)
         measured = sp.Measurements(tx, rx[:10], prediction.gain_mean_db[:10] - 6.0)
-        posterior = sp.Assimilation.fit(partial, tx, measured, prediction.take(slice(10)), frequency_hz=frequency_hz)
+        posterior = Assimilation.fit(partial, tx, measured, prediction.take(slice(10)), frequency_hz=frequency_hz)
         found.append((prediction.gain_mean_db, posterior.update(rx, prediction).gain_mean_db))
     assert len(rx) > 15
     np.testing.assert_allclose(found, np.broadcast_to(found[0], np.shape(found)), rtol=0, atol=0.005)

@@ -11,10 +11,11 @@ import pytest
 from PIL import Image
 
 import sionna_partial as sp
+from sionna_partial.apps.live import topics
+from sionna_partial.apps.live.answers import LiveGrid, LiveTransmitter, LiveViews
+from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live.topics import Listener, Topics
 from sionna_partial.errors import SettingsError
-from sionna_partial.live import topics
-from sionna_partial.live.answers import LiveGrid, LiveTransmitter, LiveViews
-from sionna_partial.live.topics import Listener, Topics
 
 ROOM = [[100, 100, 100, 100, 100], [100, 0, 0, 0, -1], [100, 0, 0, 0, -1], [100, 100, 100, 100, 100]]
 TX = (1.5, 1.5, 1.5)
@@ -31,7 +32,7 @@ def message(cells: Any = ROOM, *, yaw: float = 0.0, at: tuple[float, float] = (0
 
 class Heard(list[Any]):
     def __init__(self, tx: Any = TX, **settings: Any) -> None:
-        self.live = sp.LiveCoverage(tx, self.append, sp.LiveSettings(**{"spacing_m": 0.2, **settings}))
+        self.live = LiveCoverage(tx, self.append, LiveSettings(**{"spacing_m": 0.2, **settings}))
 
     def step(self) -> list[tuple[int, bool]]:
         self.clear()
@@ -49,9 +50,9 @@ class TestOrder:
         heard.live.on_map(message())
         assert heard.step() == [(1, False), (1, True)]
         assert heard[0].coverage.attrs["spacing_m"] == 0.8
-        expected = sp.predict_map(sp.map_from_occupancy(message()), TX, spacing_m=0.2)
+        expected = sp.predict_map(sp.importers.map_from_occupancy(message()), TX, spacing_m=0.2)
         assert heard[-1].coverage.identical(expected)
-        sp.save_coverage(expected, tmp_path / "cost.yaml", scene=sp.map_from_occupancy(message()))
+        sp.save_coverage(expected, tmp_path / "cost.yaml", scene=sp.importers.map_from_occupancy(message()))
         percent = np.flipud(np.asarray(Image.open(tmp_path / "cost.pgm"))).astype(int)
         np.testing.assert_array_equal(np.where(percent == 255, -1, percent), heard[-1].cost)
         assert heard.step() == []
@@ -147,7 +148,9 @@ class TestTransmitters:
         heard.live.on_transmitter("tx", tx)
         assert heard.step() == [(1, False), (1, True)]
         assert heard[-1].cost.shape == np.shape(ROOM)
-        wide = sp.map_from_occupancy(message(np.pad(ROOM, ((1, 1), (1, 9)), constant_values=-1), at=(-1.0, -1.0)))
+        wide = sp.importers.map_from_occupancy(
+            message(np.pad(ROOM, ((1, 1), (1, 9)), constant_values=-1), at=(-1.0, -1.0))
+        )
         expected = sp.predict_map(wide, tx, spacing_m=0.2, area_m=(0.0, 0.0, 5.0, 4.0))
         for name in ("p_los", "gain_mean_db", "unobserved_distance_m"):
             np.testing.assert_allclose(heard[-1].coverage[name], expected[name], atol=1e-3, err_msg=name)
@@ -159,9 +162,9 @@ class TestTransmitters:
     def test_coarse_costs_are_upper_bounds(self, frequency_hz: float, threshold_db: float) -> None:
         partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
         grids: list[Any] = []
-        settings = sp.LiveSettings(spacing_m=0.3, threshold_db=threshold_db)
+        settings = LiveSettings(spacing_m=0.3, threshold_db=threshold_db)
         trace_settings = sp.TraceSettings(frequency_hz=frequency_hz)
-        live = sp.LiveCoverage((7.0, 9.8, 1.5), grids.append, settings, trace_settings=trace_settings)
+        live = LiveCoverage((7.0, 9.8, 1.5), grids.append, settings, trace_settings=trace_settings)
         sent = message(np.array([0, 100, -1])[partial.state], at=partial.origin_m)
         sent.info.resolution = partial.resolution_m
         live.on_map(sent)
@@ -181,7 +184,7 @@ class TestTransmitters:
     def test_refused(self) -> None:
         for tx in ((1.0, math.nan, 1.0), {"a b": TX}, "here"):
             with pytest.raises(sp.SionnaPartialError, match="tx"):
-                sp.LiveCoverage(tx, print)
+                LiveCoverage(tx, print)
         with pytest.raises(SettingsError, match=r"powers\['/rssi'\] = 'attic' is not allowed: name one of the"):
             Listener(Heard().live, Topics(powers={"/rssi": "attic"}))
 
@@ -368,7 +371,7 @@ class TestLocated:
         assert 0.0 < variance < 30.0
 
     def test_access_points_and_their_frequency_from_connections(self, caplog: pytest.LogCaptureFixture) -> None:
-        live = sp.LiveCoverage({}, print, await_frequency=True)
+        live = LiveCoverage({}, print, await_frequency=True)
         listener = Listener(live, Topics(connections={"/connection": None}))
         listener.take("/map", message(grown()))
         assert not live.step()  # it waits for the frequency
@@ -384,7 +387,7 @@ class TestLocated:
         assert "it has no access point or frequency" in caplog.text
 
     def test_a_named_one_is_not_mixed_with_others(self, caplog: pytest.LogCaptureFixture) -> None:
-        live = sp.LiveCoverage(None, print, await_frequency=True)
+        live = LiveCoverage(None, print, await_frequency=True)
         listener = Listener(live, Topics(connections={"/connection": None}))
         listener.take("/map", message(grown()))
         for number in (1, 2):

@@ -20,8 +20,9 @@ from typer.testing import CliRunner
 
 import sionna_partial as sp
 from sionna_partial import cli
-from sionna_partial.live import topics as topics_module
-from sionna_partial.live.topics import (
+from sionna_partial.apps.live import topics as topics_module
+from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live.topics import (
     CONNECTION_TYPE,
     FILTER_TYPE,
     GRID_TYPE,
@@ -53,7 +54,7 @@ LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25", "--frequency", "28GHz"
 ROBOT = """
 import sys, time
 from test_live_transports import GRID, GRID_TYPE
-from sionna_partial.live.topics import Dds, Topics, filled
+from sionna_partial.apps.live.topics import Dds, Topics, filled
 robot = Dds(Topics(map="/unused"), {})
 writer = robot._writer("/map", GRID_TYPE)
 writer.write(filled(GRID_TYPE, GRID))
@@ -95,7 +96,7 @@ class TestDds:
         strings = dict.fromkeys(("link_quality_raw", "essid", "bssid"), "AA:00:00:00:00:01")
         numbers = dict.fromkeys(("bitrate", "txpower", "link_quality", "signal_level", "noise_level"), -60)
         connection = filled(CONNECTION_TYPE, {**strings, **numbers, "frequency": 5.18})
-        live = sp.LiveCoverage({}, print, await_frequency=True)
+        live = LiveCoverage({}, print, await_frequency=True)
         live.on_map(struct(GRID_TYPE).deserialize(filled(GRID_TYPE, GRID).serialize()))
         live.on_pose(1.5, 1.5, 0.0)
         live.on_connection(struct(CONNECTION_TYPE).deserialize(connection.serialize()), 0.0)
@@ -128,7 +129,7 @@ class TestDds:
             def take(self, _: int) -> Any:
                 raise ValueError("cut short")
 
-        live = sp.LiveCoverage((1.5, 1.5, 1.5), print)
+        live = LiveCoverage((1.5, 1.5, 1.5), print)
         robot = Dds(Topics(), {"tx": None})
         robot._readers = [("/map", Reader())]
         robot.poll(Listener(live, Topics()))
@@ -179,7 +180,7 @@ class TestRosbridge:
     def test_server_that_starts_again(self, server: Server, caplog: pytest.LogCaptureFixture) -> None:
         topics = Topics()
         robot = Rosbridge(server.url, topics, {"tx": None})
-        live = sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish, sp.LiveSettings(spacing_m=0.25))
+        live = LiveCoverage((1.5, 1.5, 1.5), robot.publish, LiveSettings(spacing_m=0.25))
         thread = live.start()
         for _ in range(2):  # the second time it gets the last answer at once
             robot.connect(Listener(live, topics))
@@ -202,7 +203,7 @@ class TestRosbridge:
             closed = f"ws://127.0.0.1:{free.getsockname()[1]}"
         for url, line in ((server.url, "1009 (message too big)"), (closed, "Connection refused; it is tried again")):
             robot = Rosbridge(url, Topics(), {})
-            robot.connect(Listener(sp.LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
+            robot.connect(Listener(LiveCoverage((1.5, 1.5, 1.5), robot.publish), Topics()))
             assert line in caplog.text
 
     def test_refused_address(self) -> None:
@@ -223,7 +224,7 @@ class TestCommand:
             "map 1, tx: final",
             f"wrote {out / 'tx.nc'}",
         ]
-        expected = sp.predict_map(sp.map_from_bag(path), (1.5, 1.5, 1.5), spacing_m=0.25)
+        expected = sp.predict_map(sp.importers.map_from_bag(path), (1.5, 1.5, 1.5), spacing_m=0.25)
         assert sp.load_coverage(out / "tx.nc").equals(expected)
 
     def test_a_transmitter_is_located_at_the_end_of_a_recording(self, tmp_path: Path) -> None:

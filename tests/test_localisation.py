@@ -80,7 +80,7 @@ class TestCoverage:
         for suffix in (".nc", ".tif", ".csv", ".png", ".html", ".yaml"):
             sp.save_coverage(coverage, tmp_path / f"coverage{suffix}")
         assert sp.load_coverage(tmp_path / "coverage.nc").identical(coverage)
-        figure = sp.plot_coverage(coverage, layers=("link_state",))
+        figure = sp.plots.plot_coverage(coverage, layers=("link_state",))
         assert "transmitter, 90 %" in [text.get_text() for text in figure.legends[0].get_texts()]
 
     @pytest.mark.parametrize("offset_db", [-40.0, 31.0])

@@ -20,8 +20,9 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
-from sionna_partial.maps.bags import map_from_occupancy
-from sionna_partial.maps.map_files import load_map, map_from_habitat, map_from_slam, save_map
+from sionna_partial.maps.importers.bags import map_from_occupancy
+from sionna_partial.maps.importers.simulators import map_from_habitat, map_from_slam
+from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.settings import Material
 
@@ -277,7 +278,7 @@ def test_slam_channels() -> None:
 )
 def test_wrong_arrays(kind: str, arrays: tuple[object, ...], options: dict[str, float], message: str) -> None:
     with pytest.raises(MapError, match=re.escape(message)):
-        getattr(sp, f"map_from_{kind}")(*arrays, 0.05, **options)
+        getattr(sp if kind == "array" else sp.importers, f"map_from_{kind}")(*arrays, 0.05, **options)
 
 
 def test_map_of_a_robot_comes_back(tmp_path: Path) -> None:

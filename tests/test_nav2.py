@@ -15,8 +15,8 @@ from test_live import Heard, message
 from typer.testing import CliRunner
 
 from sionna_partial import cli
-from sionna_partial.live.answers import LiveGrid
-from sionna_partial.live.topics import Topics
+from sionna_partial.apps.live.answers import LiveGrid
+from sionna_partial.apps.live.topics import Topics
 
 NAV2 = Path(__file__).parents[1] / "examples" / "nav2"
 ROOM = [[100, 100, 100, 100], [100, 0, 0, -1], [100, 0, 0, -1], [100, 100, 100, 100]]

@@ -27,13 +27,13 @@ def model(half_seen: sp.PartialMap) -> sp.LinkModel:
 
 @pytest.fixture(scope="module")
 def coverage(model: sp.LinkModel) -> xr.Dataset:
-    return model.coverage(TX, spacing_m=0.4)
+    return sp.predict_map(model, TX, spacing_m=0.4)
 
 
 def test_the_map_of_each_transmitter_is_that_of_a_call_of_its_own(
     model: sp.LinkModel, coverage: xr.Dataset, tmp_path: Path
 ) -> None:
-    alone = model.coverage(TX["east"], spacing_m=0.4)
+    alone = sp.predict_map(model, TX["east"], spacing_m=0.4)
     for name, values in alone.data_vars.items():
         np.testing.assert_array_equal(coverage.sel(tx="east")[name], values)
     assert repr(coverage.sel(tx="east").radio) == repr(alone.radio)
@@ -44,7 +44,7 @@ def test_the_map_of_each_transmitter_is_that_of_a_call_of_its_own(
 def test_powers_of_a_complete_map_give_sinr_and_rate_by_hand() -> None:
     room = sp.PartialMap(np.pad(np.zeros((30, 40), np.uint8), 1, constant_values=1), 0.1)
     coverage = sp.predict_map(room, [TX["west"], (3.5, 2.5, 1.5)], spacing_m=0.5)
-    network = sp.network_map(coverage, tx_power_dbm=[10.0, 13.0], noise_figure_db=5.0, bandwidth_hz=1e8, load=0.5)
+    network = sp.predict_network(coverage, tx_power_dbm=[10.0, 13.0], noise_figure_db=5.0, bandwidth_hz=1e8, load=0.5)
     gain_db = coverage["gain_mean_db"].to_numpy()
     power_mw = 10 ** ((gain_db + np.array([10.0, 13.0])[:, None, None]) / 10)
     noise_mw = 10 ** ((-174.0 + 80.0 + 5.0) / 10)
@@ -59,7 +59,7 @@ def test_powers_of_a_complete_map_give_sinr_and_rate_by_hand() -> None:
 
 
 def test_probabilities_agree_with_the_maps(coverage: xr.Dataset) -> None:
-    network = sp.network_map(coverage, n=200)
+    network = sp.predict_network(coverage, n=200)
     outage, valid = coverage["p_outage"], coverage["valid"].all("tx")
     low, high = outage.prod("tx"), outage.min("tx")
     all_out = network["p_all_outage"]
@@ -67,20 +67,20 @@ def test_probabilities_agree_with_the_maps(coverage: xr.Dataset) -> None:
     assert bool(((all_out >= np.minimum(low, high) - 0.1) | ~valid).all())
     total = network["p_best"].sum("tx") + all_out
     np.testing.assert_allclose(total.to_numpy()[valid], 1.0, atol=1e-5)
-    assert network.identical(sp.network_map(coverage, n=200))
+    assert network.identical(sp.predict_network(coverage, n=200))
 
 
 def test_channels_divide_the_interference() -> None:
     room = sp.PartialMap(np.pad(np.zeros((30, 70), np.uint8), 1, constant_values=1), 0.1)
     tx = {"a": (1.0, 1.0, 1.5), "b": (1.6, 1.0, 1.5), "c": (6.0, 2.5, 1.5)}
     coverage = sp.predict_map(room, tx, spacing_m=0.5)
-    shared, apart = (sp.network_map(coverage, channels=plan, n=20) for plan in (None, {"a": 1, "b": 6, "c": 11}))
+    shared, apart = (sp.predict_network(coverage, channels=plan, n=20) for plan in (None, {"a": 1, "b": 6, "c": 11}))
     noise_dbm = -174.0 + 80.0 + 7.0
     valid = coverage["valid"].all("tx").to_numpy()
     snr_db = (coverage["gain_mean_db"].max("tx") + 20.0 - noise_dbm).to_numpy()
     np.testing.assert_allclose(apart["sinr_mean_db"].to_numpy()[valid], snr_db[valid], atol=1e-3)
     assert (apart["sinr_mean_db"] > shared["sinr_mean_db"]).to_numpy()[valid].all()
-    proposed = sp.network_map(coverage, channels=[36, 52], n=20)
+    proposed = sp.predict_network(coverage, channels=[36, 52], n=20)
     rates = [float(found["rate_bit_s"].mean()) for found in (shared, proposed, apart)]
     assert rates == sorted(rates)
     near, other, far = proposed["channel"].values.tolist()
@@ -91,19 +91,19 @@ def test_channels_divide_the_interference() -> None:
         ([], r"give a list, such as \[1, 6, 11\]"),
     ):
         with pytest.raises(SettingsError, match=match):
-            sp.network_map(coverage, channels=channels)
+            sp.predict_network(coverage, channels=channels)
 
 
 def test_any_transmitter_covers_at_least_as_much_as_each(half_seen: sp.PartialMap, model: sp.LinkModel) -> None:
     tx = {"on a receiver": (1.0, 1.0, 1.5), "in the unseen": (4.6, 2.6, 1.5)}
-    coverage = model.coverage(tx, spacing_m=0.4)
+    coverage = sp.predict_map(model, tx, spacing_m=0.4)
     assert (coverage["valid"].any("tx") & ~coverage["valid"].all("tx")).sum() == 2
     for threshold_dbm in (-90.0, -60.0, -40.0):
         each, together = (coverage.radio.area(threshold_dbm, any_transmitter=every) for every in (False, True))
         for name in ("fraction", "fraction_mean"):
             assert (each[name] <= together[name] + 1e-9).all()
         assert each["area_m2"].equals(together["area_m2"])
-    network = sp.network_map(coverage)
+    network = sp.predict_network(coverage)
     assert network["best_server"].sel(x=1.0, y=1.0, method="nearest").item() == 0
     assert (network["p_all_outage"] <= coverage["p_outage"].min("tx") + 1e-6).all()
 
@@ -139,7 +139,7 @@ def test_several_are_placed_greedily_and_then_swapped(half_seen: sp.PartialMap) 
     own = sp.place_transmitters(direct, 1, rx=[(1.0, 1.0, 1.5)], threshold_db=-75.0)
     assert own.score > 0.9
     assert own.rx_m.shape == (1, 3)
-    assert len(sp.plot_network_placement(placed).axes) == 2
+    assert len(sp.plots.plot_network_placement(placed).axes) == 2
 
 
 def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Dataset) -> None:
@@ -149,7 +149,7 @@ def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Da
         ({"sinr_threshold_db": float("nan")}, "sinr_threshold_db"),
     ):
         with pytest.raises(SettingsError, match=match):
-            sp.network_map(coverage, **options)
+            sp.predict_network(coverage, **options)
     for other, match in (
         (coverage.isel(tx=[]), "give each a name"),
         (coverage.assign(valid=coverage.valid & False), "no position at which a receiver"),
@@ -157,7 +157,7 @@ def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Da
         (coverage.assign_coords(tx=["a\nb", "b"]), "of printable characters"),
     ):
         with pytest.raises(SettingsError, match=match):
-            sp.network_map(other)
+            sp.predict_network(other)
     with pytest.raises(PositionError, match="at least 1 position"):
         sp.predict_map(half_seen, np.zeros((0, 3)), spacing_m=0.4)
     for names in ((1, "1"), ("\udc80", "b")):
@@ -168,8 +168,8 @@ def test_what_is_no_network_is_refused(half_seen: sp.PartialMap, coverage: xr.Da
 
 
 def test_the_order_of_dimensions_does_not_count(coverage: xr.Dataset) -> None:
-    turned = sp.network_map(coverage.transpose("y", "x", "tx"), n=10)
-    xr.testing.assert_equal(turned, sp.network_map(coverage, n=10))
+    turned = sp.predict_network(coverage.transpose("y", "x", "tx"), n=10)
+    xr.testing.assert_equal(turned, sp.predict_network(coverage, n=10))
 
 
 @pytest.mark.parametrize("value", [np.datetime64("now"), object(), 2**70])
@@ -180,7 +180,7 @@ def test_attributes_that_no_file_holds(coverage: xr.Dataset, tmp_path: Path, val
 
 
 def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
-    network = sp.network_map(coverage)
+    network = sp.predict_network(coverage)
     for suffix in (".nc", ".tif", ".csv", ".png"):
         sp.save_network(network, tmp_path / f"network{suffix}")
         assert (tmp_path / f"network{suffix}").stat().st_size > 1000
@@ -192,5 +192,5 @@ def test_files_and_pictures(coverage: xr.Dataset, tmp_path: Path) -> None:
     others = coverage, network.drop_vars("p_best"), network.isel(x=0), network.assign_attrs(load="much")
     others += (network.astype(str),)
     for other in others:
-        with pytest.raises(SettingsError, match="give what network_map returned"):
-            sp.plot_network(other)
+        with pytest.raises(SettingsError, match="give what predict_network returned"):
+            sp.plots.plot_network(other)

@@ -114,7 +114,7 @@ def test_a_complete_map_has_none():
     views = sp.next_views(drawn("#####\n#...#\n#...#\n#####", 0.5), goal="area")
     assert len(views) == 0
     assert yaml.safe_load(views.to_yaml())["poses"] == []
-    assert isinstance(sp.plot_next_views(views), Figure)
+    assert isinstance(sp.plots.plot_next_views(views), Figure)
 
 
 def test_poses_as_yaml(hall, tmp_path):
@@ -155,7 +155,7 @@ def test_maps_where_nothing_can_stand():
 
 
 def test_picture(hall):
-    figure = sp.plot_next_views(sp.next_views(hall, goal="area", count=2))
+    figure = sp.plots.plot_next_views(sp.next_views(hall, goal="area", count=2))
     assert [text.get_text() for text in figure.axes[0].texts] == ["2", "1"]
 
 
@@ -173,8 +173,8 @@ class TestCoveragePolicy:
 
 def test_animation_with_predictions(hall, tmp_path):
     exploration = sp.explore_trajectory(hall, (0, 10), 2)
-    sp.animate_exploration(exploration, tmp_path / "map.gif")
-    sp.animate_exploration(exploration, tmp_path / "all.gif", tx=at(1.0, 1.9))
+    sp.plots.animate_exploration(exploration, tmp_path / "map.gif")
+    sp.plots.animate_exploration(exploration, tmp_path / "all.gif", tx=at(1.0, 1.9))
     with Image.open(tmp_path / "map.gif") as alone, Image.open(tmp_path / "all.gif") as beside:
         assert beside.n_frames == 2
         assert beside.width > 2.9 * alone.width

@@ -13,9 +13,9 @@ from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.importers import points as points_module
+from sionna_partial.maps.importers.points import map_from_points
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.mesh import points as points_module
-from sionna_partial.maps.mesh.points import map_from_points
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

@@ -19,7 +19,8 @@ from sionna_partial.resources import scenes_folder
 
 ROOT = Path(__file__).resolve().parents[1]
 README = ROOT / "README.md"
-PAGES = (README, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", *sorted((ROOT / "docs").glob("*.md")))
+BENCHMARKS = ROOT / "benchmarks" / "README.md"
+PAGES = (README, ROOT / "CONTRIBUTING.md", ROOT / "SECURITY.md", BENCHMARKS, *sorted((ROOT / "docs").glob("*.md")))
 
 
 def blocks(page: Path, language: str) -> list[str]:
@@ -104,18 +105,18 @@ def test_every_page_and_picture_is_linked() -> None:
         reached |= new
         new = {target for page in new for target, _ in links(page) if target in PAGES} - reached
     assert reached == set(PAGES)
-    assert set((ROOT / "docs").glob("*.png")) <= linked
+    assert {picture for end in ("png", "svg") for picture in (ROOT / "docs").glob(f"*.{end}")} <= linked
     for page in PAGES[1:]:
         assert README in {target for target, _ in links(page)}, f"{page.name} does not lead back"
 
 
-def test_dates_and_commits_are_on_one_page() -> None:
-    for page in set((ROOT / "docs").glob("*.md")) - {ROOT / "docs" / "experiments.md"}:
+def test_dates_of_figures_are_in_the_table_of_benchmarks() -> None:
+    for page in (ROOT / "docs").glob("*.md"):
         assert not re.search(r"\b20\d\d-\d\d-\d\d\b|\bcommit [0-9a-f]{7}", page.read_text("utf-8")), page.name
 
 
 def test_every_command_is_in_the_table() -> None:
-    table = (ROOT / "docs" / "five_minutes.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
+    table = (ROOT / "docs" / "start.md").read_text("utf-8").partition("| `sionna-partial` command | result |")[2]
     rows = re.findall(r"^\| (`[^|]*) \|", table, flags=re.MULTILINE)
     named = {name for row in rows for name in re.findall(r"`([a-z-]+)", row)}
     assert named == typer.main.get_command(app).commands.keys()  # type: ignore[attr-defined]
@@ -149,11 +150,26 @@ def test_notebooks_are_stored_without_outputs_and_link_to_files_and_headings() -
 
 def test_files_named_in_code_exist() -> None:
     for page in PAGES:
-        if page.name == "experiments.md":  # scripts of earlier commits
-            continue
         folders = r"\b(?:benchmarks|examples|scenes|sionna_partial)"
         for name in re.findall(rf"{folders}/[\w/]+(?:\.\w+)+", page.read_text("utf-8")):
             assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+def test_every_benchmark_is_in_the_table_and_on_its_page() -> None:
+    """Scripts without a page hold functions that other scripts import."""
+    table = BENCHMARKS.read_text("utf-8")
+    scripts = {path.name: path.read_text("utf-8") for path in BENCHMARKS.parent.glob("*.py")}
+    rows = [row for row in table.splitlines() if row.startswith("| [`")]
+    named = [name for row in rows for name in re.findall(r"\[`(\w+\.py)`\]\(", row)]
+    assert sorted(named) == sorted(scripts)
+    for row in rows:
+        pages = [BENCHMARKS.parent / target for target in re.findall(r"\]\((\.\./docs/[^)]+)\)", row)]
+        for name in re.findall(r"`(\w+\.py)`", row):
+            if pages:
+                assert any(name in page.read_text("utf-8") for page in pages), f"{name}: no figure on its page"
+            else:
+                module = re.compile(rf"^from {name.removesuffix('.py')} import", flags=re.MULTILINE)
+                assert any(module.search(text) for text in scripts.values()), f"{name} has no page"
 
 
 def test_rooms_are_described() -> None:

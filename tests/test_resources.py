@@ -60,8 +60,8 @@ for name in ("plan.dxf", "house.ifc", "drive.bag", "scan.pcd", "scan.las"):
 for what, call in {
     "plan.dxf": sp.load_map, "house.ifc": sp.load_map, "drive.bag": sp.load_map, "scan.pcd": sp.load_map,
     "scan.las": sp.load_map, "coverage.tif": coverage.radio.save, "coverage.html": coverage.radio.save,
-    "make_home": lambda _: sp.make_home(3), "save_channels": lambda _: sp.save_channels,
-    "build_dataset": lambda _: sp.build_dataset,
+    "make_home": lambda _: sp.make_home(3), "save_channels": lambda _: sp.channels.save_channels,
+    "build_dataset": lambda _: sp.lab.build_dataset,
 }.items():
     try:
         call(what)

@@ -9,9 +9,10 @@ from placement_cases import placed
 from predictor_links import QUIET, quick_predictor
 
 import sionna_partial as sp
+from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.calibration.material_fit import Posterior
 from sionna_partial.errors import SettingsError
-from sionna_partial.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
+from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
 from sionna_partial.plots.result_plots import (
     ANGLES_DEG,
     plot_calibration,
@@ -48,10 +49,10 @@ CONCRETE, BRICK = sp.Material(5.24, 0.6), sp.Material(3.9, 0.04)
 
 def calibrated(
     materials: tuple[sp.Material, ...] = (CONCRETE,), undetermined: tuple[str, ...] = ()
-) -> sp.MaterialCalibration:
+) -> MaterialCalibration:
     open_now = Posterior(np.array([5.0, 5.5]), np.array([0.5, 0.7]), np.array([0.5, 0.5]))
     gain_db = np.linspace(-120.0, -60.0, 20)
-    return sp.MaterialCalibration(
+    return MaterialCalibration(
         permittivity=5.24,
         conductivity_s_m=0.6,
         permittivity_std=0.25,
@@ -140,8 +141,8 @@ class TestPlotReliability:
         ("plot", "message"),
         [
             (plot_placement, "placement = {} is not allowed: give what place_transmitter returned"),
-            (sp.plot_network_placement, "place_transmitters"),
-            (sp.plot_exploration, "exploration = {} is not allowed: give what explore_trajectory"),
+            (sp.plots.plot_network_placement, "place_transmitters"),
+            (sp.plots.plot_exploration, "exploration = {} is not allowed: give what explore_trajectory"),
             (plot_reliability, "stages = {} is not allowed: give at least one"),
         ],
     )

@@ -18,7 +18,7 @@ from scipy.ndimage import label
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.maps import ros_map
-from sionna_partial.maps.bags import map_from_occupancy
+from sionna_partial.maps.importers.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import MapWarning, PartialMap
 from sionna_partial.maps.ros_map import turn_grid, write_ros_map

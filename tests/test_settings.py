@@ -74,7 +74,7 @@ BESIDE = {
 
 
 def settings_classes(kind: type = Checked) -> dict[str, type]:
-    for module in ("app.session", "coverage.link_budget", "live.topics", "tracing.antennas"):
+    for module in ("apps.app.session", "coverage.link_budget", "apps.live.topics", "tracing.antennas"):
         import_module(f"sionna_partial.{module}")
     own = {each.__name__: each for each in kind.__subclasses__()}
     return own | {name: each for child in own.values() for name, each in settings_classes(child).items()}

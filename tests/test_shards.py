@@ -15,8 +15,9 @@ import pytest
 from dataset_fakes import fake_links
 from link_tables import assert_same, make_dataset, make_table
 
-from sionna_partial.datasets import shards
-from sionna_partial.datasets.shards import (
+from sionna_partial.errors import PredictorError
+from sionna_partial.lab.datasets import shards
+from sionna_partial.lab.datasets.shards import (
     COLUMNS,
     FORMAT,
     LinkTable,
@@ -31,7 +32,6 @@ from sionna_partial.datasets.shards import (
     shard_path,
     write_shard,
 )
-from sionna_partial.errors import PredictorError
 from sionna_partial.settings import DatasetSettings, Material, PredictorSettings
 
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}

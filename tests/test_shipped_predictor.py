@@ -10,9 +10,9 @@ from coverage_cases import shipped
 from predictor_links import QUIET, assert_symmetric
 
 import sionna_partial as sp
-from sionna_partial.datasets.home_links import home_links
-from sionna_partial.datasets.shards import LinkTable
-from sionna_partial.evaluation import WITH_INDOOR, Evaluation
+from sionna_partial.lab.datasets.home_links import home_links
+from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.evaluation import WITH_INDOOR, Evaluation
 from sionna_partial.prediction.map_networks import MapFeatures
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.resources import scenes_folder
@@ -20,13 +20,13 @@ from sionna_partial.resources import scenes_folder
 pytestmark = QUIET
 
 HOMES = ("apartment", "house")
-SETTINGS = sp.DatasetSettings(links_per_home=200, transmitters_per_home=4, stages=(100, 200))
+SETTINGS = sp.lab.DatasetSettings(links_per_home=200, transmitters_per_home=4, stages=(100, 200))
 
 
 @pytest.fixture(scope="module")
 def evaluation() -> Evaluation:
     tables = (home_links(sp.load_map(scenes_folder() / name / "complete"), name, SETTINGS) for name in HOMES)
-    return sp.evaluate(None, LinkTable.concatenate(tables))
+    return sp.lab.evaluate(None, LinkTable.concatenate(tables))
 
 
 def test_figures_of_merit_stay_in_their_band(evaluation: Evaluation) -> None:

@@ -6,6 +6,7 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
+from sionna_partial.lab.training.walls import Lines, fit_unseen_walls, lines_of
 from sionna_partial.prediction.unseen_walls import (
     CELL_M,
     DISPERSION,
@@ -18,7 +19,6 @@ from sionna_partial.prediction.unseen_walls import (
     walls_met,
     walls_per_m,
 )
-from sionna_partial.training.walls import Lines, fit_unseen_walls, lines_of
 
 WALLS_PER_M = 0.37
 WIFI = sp.TraceSettings(5e9, max_depth=1)
@@ -98,7 +98,7 @@ def test_damaged_weights(monkeypatch, tmp_path):
 
 
 def test_training_repeats_itself(unseen_home, tmp_path, monkeypatch):
-    monkeypatch.setattr("sionna_partial.training.walls.IMAGES", 2)
+    monkeypatch.setattr("sionna_partial.lab.training.walls.IMAGES", 2)
     first, second = (fit_unseen_walls(unseen_home, steps=2) for _ in range(2))
     first.save(tmp_path / "first.npz")
     start = UnseenWalls.untrained().cells.get_weights()[0]

@@ -10,9 +10,9 @@ from predictor_links import QUIET
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState, LinkState
-from sionna_partial.datasets.home_links import home_links
-from sionna_partial.datasets.shards import LinkTraces, settings_for
-from sionna_partial.evaluation import measure
+from sionna_partial.lab.datasets.home_links import home_links
+from sionna_partial.lab.datasets.shards import LinkTraces, settings_for
+from sionna_partial.lab.evaluation import measure
 from sionna_partial.prediction.features import LinkFeatures, mean_wall_loss_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unseen_walls import (
@@ -123,7 +123,7 @@ def test_the_default_through_walls() -> None:
 @QUIET
 def test_predictor_of_links_through_walls(caplog: pytest.LogCaptureFixture) -> None:
     """It predicts links through walls without a warning, and those on opaque walls with one."""
-    links = home_links(all_seen(), "home", sp.DatasetSettings(links_per_home=40, stages=(0, 5), trace=WIFI))
+    links = home_links(all_seen(), "home", sp.lab.DatasetSettings(links_per_home=40, stages=(0, 5), trace=WIFI))
     assert (links.context.wall_loss_db < MOST_LOSS_DB).all()
     learning = settings_for(LinkTraces(5e9, diffraction=True, through_walls=True), networks="paths", passes=4)
     predictor = sp.Predictor.fit(links.features, links.link_state, links.gain_db, settings=replace(learning, steps=20))

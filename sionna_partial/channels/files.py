@@ -13,7 +13,6 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
-from sionna_partial.channels.responses import ArrayPaths, require_memory
 from sionna_partial.checks import Progress, number_of, require, require_choice, require_type
 from sionna_partial.constants import MEMORY_GB
 from sionna_partial.display import reporting
@@ -30,6 +29,7 @@ from sionna_partial.files import (
 )
 from sionna_partial.resources import optional_packages
 from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.responses import ArrayPaths, require_memory
 
 Layout = Literal["sionna", "deepmimo"]
 
@@ -104,7 +104,7 @@ def save_channels(
     --------
     >>> import sionna_partial as sp
     >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5), (3.0, 3.0, 1.5)])
-    >>> sp.save_channels(links, "channels.nc", normalize_delays=False)
+    >>> sp.channels.save_channels(links, "channels.nc", normalize_delays=False)
     """
     target = checked_target(path, layout)
     with reporting(progress) as report, dask.config.set(scheduler="synchronous"):
@@ -112,7 +112,7 @@ def save_channels(
             table = _unstacked(channels, options)
         else:
             require_type("channels", channels, TracedLinks, _CHANNELS)
-            arrays = ArrayPaths.of(channels, **options)
+            arrays = channels.array_paths(**options)
             require(arrays.most > 0, "channels", f"{arrays.links} links", "none has a path: there is nothing to save.")
             what = f"{arrays.antennas} x {arrays.most} paths at a time"
             require_memory(arrays, 0, what, memory_gb, arrays.work_bytes)
@@ -169,7 +169,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> channels = sp.load_channels("channels.nc")  # that save_channels wrote
+    >>> channels = sp.channels.load_channels("channels.nc")  # that save_channels wrote
     >>> channels.a.dims
     ('rx', 'rx_ant', 'tx', 'tx_ant', 'path', 'time')
     """
@@ -196,7 +196,7 @@ def load_channels(path: str | os.PathLike[str]) -> xr.Dataset:
 
 
 def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
-    each, receivers = arrays.paths, len(arrays.paths.rx)
+    receivers = len(arrays.rx_m)
     path_bytes = 8 * len(arrays.rx) * len(arrays.tx) * (1 if arrays.synthetic_array else 2)
     at_once = max(1, CHUNK_BYTES // max(1, arrays.most * path_bytes))
 
@@ -225,10 +225,8 @@ def _computed_later(arrays: ArrayPaths, report: Progress) -> xr.Dataset:
     paths = np.diff(arrays.first).reshape(-1, receivers)
     return xr.Dataset(
         {"a": (every, da.stack(of_tx[0])), "delay_s": (delays, da.stack(of_tx[1])), "paths": (("tx", "rx"), paths)},
-        attrs={name: getattr(each.trace_settings, name) for name in ("frequency_hz", "power_tolerance_db")},
-    ).assign(
-        tx_m=(("tx", "axis"), each.tx.reshape(-1, 3)), rx_m=(("rx", "axis"), each.rx), **arrays.antenna_positions()
-    )
+        attrs={name: getattr(arrays.trace_settings, name) for name in ("frequency_hz", "power_tolerance_db")},
+    ).assign(tx_m=(("tx", "axis"), arrays.tx_m), rx_m=(("rx", "axis"), arrays.rx_m), **arrays.antenna_positions())
 
 
 def _unstacked(channels: xr.Dataset, options: dict[str, Any]) -> xr.Dataset:

@@ -26,7 +26,7 @@ KNOWN_WEIGHT = 0.1
 """Weight of a known cell; unknown cells have weight 1."""
 
 OWN_VARIANCE = 0.1
-"""Fraction of a latent's variance that is not shared (`benchmarks/joint_links.py`)."""
+"""Fraction of a latent's variance that is not shared; like the other constants, fitted to procedural homes."""
 
 _CELL_M, _MOST_CELLS = 0.35, 4096
 _POINTS = 48

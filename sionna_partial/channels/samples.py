@@ -32,8 +32,8 @@ from sionna_partial.prediction.path_model import LinkGeometry, PathModel, surviv
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.links import TracedLinks, path_gain_db, unnamed_counts
-from sionna_partial.tracing.paths import SolvedPaths, path_order
+from sionna_partial.tracing.links import TracedLinks, unnamed_counts
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db, path_order
 from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class ChannelSamples(Shown):
         Examples
         --------
         >>> import sionna_partial as sp
-        >>> samples = sp.sample_channels(sp.make_home(3), (2.0, 3.0, 1.5), [(3.0, 3.0, 1.5)], n=20)
+        >>> samples = sp.channels.sample_channels(sp.make_home(3), (2.0, 3.0, 1.5), [(3.0, 3.0, 1.5)], n=20)
         >>> samples.spreads().delay_spread_s.sizes["draw"]
         20
         """
@@ -216,7 +216,7 @@ def sample_channels(
     >>> import sionna_partial as sp
     >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
     >>> partial = sp.map_from_array(cells, resolution_m=1.0)
-    >>> samples = sp.sample_channels(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)], n=20)
+    >>> samples = sp.channels.sample_channels(partial, (1.5, 1.5, 1.5), [(3.0, 2.0, 1.5)], n=20)
     >>> len(samples), samples.gain_db.shape
     (20, (20, 1))
     """

@@ -101,7 +101,7 @@ def dataset(
     sources = [*(zip(seeds, in_turn, strict=False) if kinds else seeds), *(maps or [])]
     with counting(None, "homes", command=True) as report:
         where = {"scheduler": scheduler, "workers": workers}
-        result = sp.build_dataset(out, sources, settings, home_time_limit_s=time_limit, progress=report, **where)  # type: ignore[arg-type]
+        result = sp.lab.build_dataset(out, sources, settings, home_time_limit_s=time_limit, progress=report, **where)  # type: ignore[arg-type]
     built = f"{len(result.built)} built in {result.elapsed_s / 60.0:.1f} min"
     typer.echo(f"homes in {result.folder}: {built}, {len(result.skipped)} already there")
     for name, error in result.failed.items():
@@ -128,12 +128,12 @@ def train(
     the homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.datasets.shards import open_links, settings_for
-        from sionna_partial.reports import summary
+        from sionna_partial.lab.datasets.shards import open_links, settings_for
+        from sionna_partial.lab.reports import summary
 
         links, traces = open_links(folders)
         settings = settings_for(traces, networks=networks, passes=passes, seed=seed)
-        run = sp.train(links, test_fraction=test_fraction, settings=settings, progress=report)
+        run = sp.lab.train(links, test_fraction=test_fraction, settings=settings, progress=report)
         files = run.save(out)
     typer.echo(summary(run.evaluation) if run.evaluation else "all homes were trained on: nothing was measured")
     opt.print_files(out, [file.name for file in files])
@@ -153,9 +153,9 @@ def evaluate(
     set that the predictor was not trained on are test homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.reports import REPORT_FILES, save_report, summary
+        from sionna_partial.lab.reports import REPORT_FILES, save_report, summary
 
-        result = sp.evaluate(predictor, folders, progress=report)
+        result = sp.lab.evaluate(predictor, folders, progress=report)
         save_report(result, out)
     typer.echo(summary(result))
     opt.print_files(out, REPORT_FILES)

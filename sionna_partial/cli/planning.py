@@ -3,7 +3,7 @@
 import itertools
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -14,6 +14,11 @@ from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, MAX
 from sionna_partial.files import CALIBRATED_FILE, atomic_files, require_writable
 from sionna_partial.process import cleaned_up
 from sionna_partial.settings import Objective, SensorSettings
+
+if TYPE_CHECKING:
+    from sionna_partial.calibration.calibration import MaterialCalibration
+    from sionna_partial.placement.placement import TransmitterPlacement
+    from sionna_partial.placement.several import NetworkPlacement
 
 TABLE_ANGLES_DEG = (0.0, 30.0, 45.0, 60.0)
 """Angles of incidence of the printed losses [degrees]."""
@@ -62,7 +67,7 @@ def calibrate(
         with atomic_files(out) as folder:
             sp.save_map(result.scene, folder / CALIBRATED_FILE)
             (folder / "calibration.json").write_text(json.dumps(result.record(), indent=1) + "\n", encoding="utf-8")
-            sp.plot_calibration(result).savefig(folder / "calibration.png")
+            sp.plots.plot_calibration(result).savefig(folder / "calibration.png")
     typer.echo(_table(result))
     opt.print_files(out, [CALIBRATED_FILE, "calibration.json", "calibration.png"])
 
@@ -93,18 +98,18 @@ def place(
         raise typer.BadParameter(f"--objective {objective} is for one transmitter: leave out --count and --goal.")
     options: dict[str, Any] = {"threshold_db": threshold, "tx_height_m": height, "rx_height_m": rx_height, "seed": seed}
     options |= {"predictor": predictor or None, **settings}
-    result: sp.TransmitterPlacement | sp.NetworkPlacement
+    result: TransmitterPlacement | NetworkPlacement
     with opt.reporting_to(out, "loading the predictor") as report:
         if count == 1 and goal is None:
             result = sp.place_transmitter(partial, objective=objective, **options, progress=report)
-            positions_m, figure = [result.position_m], sp.plot_placement(result)
+            positions_m, figure = [result.position_m], sp.plots.plot_placement(result)
         else:
             result = sp.place_transmitters(partial, count, goal=goal, **options, progress=report)
-            positions_m, figure = [*result.positions_m], sp.plot_network_placement(result)
+            positions_m, figure = [*result.positions_m], sp.plots.plot_network_placement(result)
         with atomic_files(out) as folder:
             result.save(folder / "placement.json")
             figure.savefig(folder / "placement.png")
-    added: Any = result.added if isinstance(result, sp.NetworkPlacement) else []
+    added: Any = getattr(result, "added", [])
     for (x, y, z), more in itertools.zip_longest(positions_m, added):
         text = f"transmitter at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m"
         typer.echo(text + (f" adds {more:.1%}" if more is not None else ""))
@@ -162,7 +167,7 @@ def next_views(
         )
         with atomic_files(out) as folder:
             views.save(folder / "next_views.yaml")
-            sp.plot_next_views(views).savefig(folder / "next_views.png")
+            sp.plots.plot_next_views(views).savefig(folder / "next_views.png")
     unit = "m2" if goal == "area" else "bit"
     for view in views:
         x, y = view.position_m
@@ -175,7 +180,7 @@ def next_views(
     opt.print_files(out, ["next_views.yaml", "next_views.png"])
 
 
-def _table(result: "sp.MaterialCalibration") -> str:
+def _table(result: "MaterialCalibration") -> str:
     numbers = result.record()
     lines = []
     for which, (found, start) in enumerate(zip(result.materials, result.start, strict=True)):
@@ -209,7 +214,7 @@ def _topics(
         bool, typer.Option("--publish-unknown", help="Publish predictions for unknown cells, at PREFIX/NAME/unknown.")
     ] = False,
 ) -> Any:
-    from sionna_partial.live.topics import Topics
+    from sionna_partial.apps.live.topics import Topics
 
     parsed = []
     for option, texts in (("--power", power), ("--connection", connection)):
@@ -232,8 +237,10 @@ def _live_settings(
         int, typer.Option(help="Largest value of a grid [percent]; in nav2, 100 is a wall.")
     ] = MAX_COST,
 ) -> Any:
+    from sionna_partial.apps.live.coverage import LiveSettings
+
     options = {"views_every_s": views_every, "max_cost": max_cost}
-    return sp.LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]
+    return LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]
 
 
 def _live_model(
@@ -275,11 +282,11 @@ def live(
     last: dict[str, Any] = {}
     robot: Any = None
     if bag is None and rosbridge:
-        from sionna_partial.live.topics import Rosbridge
+        from sionna_partial.apps.live.topics import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.live.topics import Dds
+        from sionna_partial.apps.live.topics import Dds
 
         robot = Dds(topics, positions, domain)
 
@@ -296,7 +303,9 @@ def live(
         else:
             typer.echo(f"next views: {len(answer.views)}")
 
-    coverage = sp.LiveCoverage(positions, publish, settings, predictor=predictor or None, **model)
+    from sionna_partial.apps.live.coverage import LiveCoverage
+
+    coverage = LiveCoverage(positions, publish, settings, predictor=predictor or None, **model)
     if robot:
         with cleaned_up(getattr(robot, "close", lambda: None)):
             coverage.start()
@@ -321,7 +330,7 @@ def _live_positions(tx: list[str], names: list[str], topics: Any) -> dict[str, A
 
 
 def _replay(coverage: Any, topics: Any, bag: Path, rate: float) -> None:
-    from sionna_partial.live.topics import Listener, replay
+    from sionna_partial.apps.live.topics import Listener, replay
 
     thread = coverage.start() if rate else None
     replay(Listener(coverage, topics), bag, rate)
@@ -352,9 +361,9 @@ def open_app(
     browser: Annotated[bool, typer.Option(help="Whether the page is opened in a browser.")] = True,
 ) -> None:
     """Serve a page on which transmitters are dragged over a map, and the coverage follows, until Ctrl-C."""
-    from sionna_partial.app.drawing import uploaded_source
-    from sionna_partial.app.jobs import collected_warnings, logged_warnings
-    from sionna_partial.app.server import AppServer
+    from sionna_partial.apps.app.drawing import uploaded_source
+    from sionna_partial.apps.app.jobs import collected_warnings, logged_warnings
+    from sionna_partial.apps.app.server import AppServer
 
     partial, source = None, None
     with collected_warnings() as warnings, logged_warnings():

@@ -106,7 +106,7 @@ def predict(
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
                 if name == PICTURE and budget:
-                    figure = sp.plot_coverage(coverage, threshold_db=budget.gain_db)
+                    figure = sp.plots.plot_coverage(coverage, threshold_db=budget.gain_db)
                     (folder / name).write_bytes(figure_png(figure))
                 else:
                     threshold_db = budget.gain_db if budget else COST_THRESHOLD_DB
@@ -206,9 +206,9 @@ def explore(
             for name, partial in maps.items():
                 sp.save_map(partial, folder / name)
             report(0.6, "drawing exploration.png")
-            sp.plot_exploration(asked).savefig(folder / "exploration.png")
+            sp.plots.plot_exploration(asked).savefig(folder / "exploration.png")
             report(0.7, "drawing exploration.gif")
-            sp.animate_exploration(exploration, folder / "exploration.gif", position)
+            sp.plots.animate_exploration(exploration, folder / "exploration.gif", position)
     opt.print_files(out, [*maps, "exploration.png", "exploration.gif"])
 
 
@@ -313,13 +313,15 @@ def network(
             progress=part_of(report, 0.0, 0.8),
         )
         report(0.8, "drawing links together")
-        found = sp.network_map(coverage, tx_power_dbm=powers_dbm, channels=_parse_channels(channel), **asdict(budget))
+        found = sp.predict_network(
+            coverage, tx_power_dbm=powers_dbm, channels=_parse_channels(channel), **asdict(budget)
+        )
         with atomic_files(out) as folder:
             report(0.9, "writing")
             for name in ("coverage.nc", "coverage.html"):
                 sp.save_coverage(coverage, folder / name)
             sp.save_network(found, folder / "network.nc")
-            sp.plot_network(found).savefig(folder / "network.png")
+            sp.plots.plot_network(found).savefig(folder / "network.png")
     if channel:
         typer.echo(", ".join(f"{name}: channel {found.channel.sel(tx=name).item()}" for name in found["tx"].to_numpy()))
     opt.print_files(out, ["coverage.nc", "coverage.html", "network.nc", "network.png"])
@@ -380,7 +382,7 @@ def channels(
         links = sp.trace_links(
             partial, position, receivers_m, **settings, memory_gb=memory, progress=part_of(report, 0.0, 0.5)
         )
-        sp.save_channels(
+        sp.channels.save_channels(
             links,
             out,
             layout=layout,  # type: ignore[arg-type]

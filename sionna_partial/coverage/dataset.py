@@ -347,7 +347,7 @@ class CoverageAccessor:
         Returns
         -------
         xarray.Dataset
-            `snr_mean_db` (outage: path gain -150 dB) and `snr_std_db`. `network_map` includes interference.
+            `snr_mean_db` (outage: path gain -150 dB) and `snr_std_db`. `predict_network` includes interference.
         """
         budget = LinkBudget(noise_figure_db, bandwidth_hz)
         return self._level("snr", "dB", self._offset_db(eirp_dbm, rx_gain_db, client_dbm) - budget.noise_dbm)

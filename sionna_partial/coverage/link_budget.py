@@ -108,7 +108,7 @@ _NR_SHANNON = 0.6
 
 @dataclass(frozen=True)
 class LinkBudget(Checked):
-    """Receivers and traffic of a network; the fields are arguments of `network_map`."""
+    """Receivers and traffic of a network; the fields are arguments of `predict_network`."""
 
     noise_figure_db: Annotated[float, Within(0.0, 100.0)] = 7.0
     bandwidth_hz: Annotated[float, Within(1.0, 1e11)] = 100e6

@@ -47,7 +47,7 @@ VARIABLES = {
 _ATTRIBUTES = ("spacing_m", "bandwidth_hz", "load", "sinr_threshold_db")
 
 
-def network_map(
+def predict_network(
     coverage: xr.Dataset,
     *,
     tx_power_dbm: ArrayLike = 20.0,
@@ -103,10 +103,10 @@ def network_map(
     >>> import sionna_partial as sp
     >>> home = sp.make_home(7)
     >>> coverage = sp.predict_map(home, {"hall": (3.0, 4.0, 2.2), "desk": (6.0, 3.0, 1.0)}, spacing_m=0.5)
-    >>> network = sp.network_map(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6)
+    >>> network = sp.predict_network(coverage, tx_power_dbm=20.0, bandwidth_hz=400e6)
     >>> network["best_server"].dims, network["sinr_mean_db"].units
     (('y', 'x'), 'dB')
-    >>> sp.network_map(coverage, channels=[1, 6, 11]).channel.values.tolist()
+    >>> sp.predict_network(coverage, channels=[1, 6, 11]).channel.values.tolist()
     ['1', '6']
     """
     if not isinstance(coverage, xr.Dataset) or "tx" not in coverage.dims:
@@ -145,7 +145,7 @@ def network_map(
 
 
 def require_network(network: xr.Dataset) -> None:
-    remedy = "give what network_map returned."
+    remedy = "give what predict_network returned."
     require_type("network", network, xr.Dataset, remedy)
     wanted = {name: (("tx", "y", "x")[name != "p_best" :], "f") for name in VARIABLES}
     wanted["best_server"] = ("y", "x"), "i"

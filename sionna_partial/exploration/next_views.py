@@ -30,7 +30,7 @@ from sionna_partial.checks import (
 )
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, probability_above
-from sionna_partial.coverage.job import POSITIONS, transmitter_positions
+from sionna_partial.coverage.job import POSITIONS, predict_map, transmitter_positions
 from sionna_partial.display import Pictured, Shown, part_of, reporting
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
@@ -388,7 +388,7 @@ def _uncertainty(
         return _described(none, spacing_m)
     near = measured is not None and (cdist(measured.tx, tx_m) <= SAME_TX_M).any()
     used = measured if near or len(tx_m) == 1 else None
-    coverage = model.coverage(tx_m, spacing_m=spacing_m, measurements=used, progress=report)
+    coverage = predict_map(model, tx_m, spacing_m=spacing_m, measurements=used, progress=report)
     return _described(_entropy(coverage, threshold_db).drop_vars(("tx", ANTENNA, *TX_COORDINATES)), spacing_m)
 
 
@@ -397,7 +397,7 @@ def _located(
 ) -> tuple[Floats, xr.DataArray]:
     """Return possible transmitter positions (T, 3) [m], and their contributions to the uncertainty."""
     spacing_m = _spacing_m(model.partial)
-    coverage = model.coverage(None, spacing_m=spacing_m, measurements=measured, progress=report)
+    coverage = predict_map(model, None, spacing_m=spacing_m, measurements=measured, progress=report)
     x_m, y_m, probability = (coverage[name].to_numpy() for name in ("tx_x", "tx_y", "p_transmitter"))
     posterior = TransmitterPosterior(x_m, y_m, float(coverage.attrs["transmitter_m"][2]), probability)
     tx_m, weights, _ = posterior.draw(POSITIONS)

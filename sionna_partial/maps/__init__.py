@@ -1,1 +1,1 @@
-"""Partial maps of buildings: PartialMap, its files, ROS maps, arrays, and meshes."""
+"""Partial maps of buildings: PartialMap, its files, ROS maps, arrays, and meshes; `importers` for other formats."""

@@ -93,7 +93,10 @@ class Kind(NamedTuple):
         return self._replace(mean=(float(mean[0]), float(mean[1])), covariance=covariance)
 
     def _learnt(self, others: Sequence[tuple[Floats, Floats]], within: Floats) -> tuple[float, Floats, Floats]:
-        """Return the log-evidence of a covariance (2, 2) between transmitters, and the new mean and covariance."""
+        """Update the prior by other transmitters, whose offset and factor vary with the covariance `within` (2, 2).
+
+        Return the log-evidence of this covariance, and the new mean and covariance.
+        """
         precision, shift, log_p = np.zeros((2, 2)), np.zeros(2), 0.0
         for own_precision, own_shift in others:
             scattered = np.linalg.inv(np.eye(2) + own_precision @ within)
@@ -425,7 +428,8 @@ class Assimilation(Shown):
     >>> partial, tx = sp.map_from_array(cells, resolution_m=1.0), (4.5, 1.5, 1.5)  # in a cell that was not seen
     >>> model = sp.LinkModel(partial)
     >>> measured = sp.Measurements(tx, [(1.5, 1.5, 1.5), (2.5, 2.5, 1.5)], [-81.0, -78.0])
-    >>> posterior = sp.Assimilation.fit(partial, tx, measured, model.predict(tx, measured.rx))
+    >>> from sionna_partial.measurements.assimilation import Assimilation
+    >>> posterior = Assimilation.fit(partial, tx, measured, model.predict(tx, measured.rx))
     >>> rx = [(2.2, 1.8, 1.5)]
     >>> before = model.predict(tx, rx)
     >>> bool(posterior.update(rx, before).gain_mean_db < before.gain_mean_db)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_HEIGHT_M
 from sionna_partial.errors import MeasurementError
-from sionna_partial.maps.bags import GRID, Message, Recording, open_recording
+from sionna_partial.maps.importers.bags import GRID, Message, Recording, open_recording
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.measurements.measurements import Measurements
 
@@ -76,7 +76,7 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> poses = sp.poses_from_bag("drive.bag")  # a recording of yours
+    >>> poses = sp.importers.poses_from_bag("drive.bag")  # a recording of yours
     >>> poses.position_m[0].to_numpy().tolist()
     [5.0, 8.0, 0.0]
     """
@@ -132,7 +132,7 @@ def measurements_from_bag(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> powers = sp.measurements_from_bag("drive.bag", "/rssi", tx=(7.0, 9.8, 1.5), tx_power_dbm=20.0)
+    >>> powers = sp.importers.measurements_from_bag("drive.bag", "/rssi", tx=(7.0, 9.8, 1.5), tx_power_dbm=20.0)
     >>> powers.gain_db.max().item()
     -70.0
     """

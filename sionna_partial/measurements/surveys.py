@@ -269,7 +269,7 @@ def _read_plan_survey(source: Path, pixel_m: float | None) -> Columns:
 
 
 def _read_recording(path: Path) -> Survey:
-    from sionna_partial.maps.vacuum import read_json  # rarely needed
+    from sionna_partial.maps.importers.vacuum import read_json  # rarely needed
 
     raw, _, frame = read_json(path, "measurements", MeasurementError)
     with decoding(path, "no recording of Valeronoi", MeasurementError):

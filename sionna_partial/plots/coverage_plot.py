@@ -162,9 +162,9 @@ def plot_coverage(
     >>> import sionna_partial as sp
     >>> import xarray as xr
     >>> coverage = xr.load_dataset("coverage.nc")  # or directly from predict_map
-    >>> figure = sp.plot_coverage(coverage)
+    >>> figure = sp.plots.plot_coverage(coverage)
     >>> figure.savefig("coverage.png")
-    >>> states = sp.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
+    >>> states = sp.plots.plot_coverage(coverage, layers=("p_los", "p_nlos", "p_outage"))
     """
     maps = transmitters_of(coverage)
     chosen = _choose(layers, threshold_db, coverage)
@@ -657,7 +657,7 @@ def plot_network(network: xr.Dataset) -> Figure:
     Parameters
     ----------
     network : xarray.Dataset
-        From `network_map`.
+        From `predict_network`.
 
     Raises
     ------
@@ -668,7 +668,7 @@ def plot_network(network: xr.Dataset) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> coverage = sp.predict_map(sp.make_home(7), {"a": (3.0, 4.0, 2.2), "b": (6.0, 3.0, 1.0)}, spacing_m=0.5)
-    >>> figure = sp.plot_network(sp.network_map(coverage))
+    >>> figure = sp.plots.plot_network(sp.predict_network(coverage))
     >>> figure.savefig("network.png")
     """
     require_network(network)

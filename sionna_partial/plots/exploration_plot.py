@@ -80,7 +80,7 @@ def plot_exploration(exploration: Exploration) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> exploration = sp.explore_trajectory(sp.make_home(3), steps=(10, 50), seed=0)
-    >>> figure = sp.plot_exploration(exploration)
+    >>> figure = sp.plots.plot_exploration(exploration)
     >>> figure.savefig("exploration.png")
     """
     require_type("exploration", exploration, Exploration, "give what explore_trajectory returned.")
@@ -128,7 +128,7 @@ def animate_exploration(exploration: Exploration, path: str | os.PathLike[str], 
     --------
     >>> import sionna_partial as sp
     >>> exploration = sp.explore_trajectory(sp.make_home(3), steps=range(0, 21, 10), seed=0)
-    >>> sp.animate_exploration(exploration, "exploration.gif")
+    >>> sp.plots.animate_exploration(exploration, "exploration.gif")
     """
     require_type("exploration", exploration, Exploration, "give what explore_trajectory returned.")
     target = output_path(path)
@@ -271,7 +271,7 @@ def plot_next_views(views: NextViews) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> partial = sp.explore(sp.make_home(3), steps=(60,), seed=0)[0]
-    >>> figure = sp.plot_next_views(sp.next_views(partial, goal="area"))
+    >>> figure = sp.plots.plot_next_views(sp.next_views(partial, goal="area"))
     >>> figure.savefig("next_views.png")
     """
     require_type("views", views, NextViews, "give what next_views returned.")

@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
-from sionna_partial.datasets.shards import stage_name
-from sionna_partial.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration
+from sionna_partial.lab.datasets.shards import stage_name
+from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.placement.several import NetworkPlacement
 from sionna_partial.plots.style import (
@@ -36,7 +36,7 @@ from sionna_partial.settings import Material
 from sionna_partial.tracing.power import reflection_loss_db
 
 if TYPE_CHECKING:
-    from sionna_partial.evaluation import Evaluation, Row  # reads data sets with pyarrow, which is optional
+    from sionna_partial.lab.evaluation import Evaluation, Row  # reads data sets with pyarrow, which is optional
 
 _WIDTH_IN, _DPI = 9.0, 130
 _STAR: dict[str, Any] = STAR | {"markersize": 15}
@@ -85,7 +85,7 @@ def plot_placement(placement: TransmitterPlacement) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> found = sp.place_transmitter(sp.make_home(7), objective="coverage", threshold_db=-100.0)
-    >>> figure = sp.plot_placement(found)
+    >>> figure = sp.plots.plot_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, TransmitterPlacement, "give what place_transmitter returned.")
@@ -127,7 +127,7 @@ def plot_network_placement(placement: NetworkPlacement) -> Figure:
     --------
     >>> import sionna_partial as sp
     >>> found = sp.place_transmitters(sp.make_home(7), count=2, threshold_db=-90.0)
-    >>> figure = sp.plot_network_placement(found)
+    >>> figure = sp.plots.plot_network_placement(found)
     >>> figure.savefig("placement.png")
     """
     require_type("placement", placement, NetworkPlacement, "give what place_transmitters returned.")
@@ -214,7 +214,7 @@ def plot_calibration(calibration: MaterialCalibration) -> Figure:
     >>> rx = [(x, y, 1.5) for x in (2.2, 2.9, 3.6, 4.3) for y in (1.7, 2.4, 3.1)]
     >>> measured = sp.Measurements(tx, rx, sp.trace_links(room, tx, rx).gain_db)
     >>> found = sp.calibrate_materials(room, measured)
-    >>> sp.plot_calibration(found).savefig("calibration.png")
+    >>> sp.plots.plot_calibration(found).savefig("calibration.png")
     """
     require_type("calibration", calibration, MaterialCalibration, "give what calibrate_materials returned.")
     count = len(calibration.materials)

@@ -149,7 +149,7 @@ def plot_map(partial: PartialMap, *, tx: ArrayLike | None = None, rx: ArrayLike 
     --------
     >>> import sionna_partial as sp
     >>> home = sp.make_home(3)
-    >>> figure = sp.plot_map(home, tx=(2.0, 3.0, 1.5))
+    >>> figure = sp.plots.plot_map(home, tx=(2.0, 3.0, 1.5))
     >>> figure.savefig("map.png")
     """
     require_map("partial", partial)

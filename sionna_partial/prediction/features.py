@@ -31,8 +31,8 @@ from sionna_partial.prediction.unobserved import (
 )
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
-from sionna_partial.tracing.links import LinkSums, TracedLinks, path_gain_db
-from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.links import LinkSums, TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)

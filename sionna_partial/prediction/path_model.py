@@ -29,8 +29,8 @@ from sionna_partial.process import core_count
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.interactions import DIFFRACTION
-from sionna_partial.tracing.links import TracedLinks, path_gain_db
-from sionna_partial.tracing.paths import SolvedPaths, zenith_azimuth
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db, zenith_azimuth
 
 STATES = (LinkState.LOS, LinkState.NLOS)
 

@@ -55,7 +55,7 @@ FADING_SPREAD = 0.5
 """Prior standard deviation of the logarithm of fading."""
 
 OWN_WEIGHT, OTHERS_WEIGHT = 0.5, 0.3
-"""Exponents of the evidence of a transmitter and of others: errors of a trace are more correlated than assumed."""
+"""Exponents of the evidence of a transmitter's own powers and of other transmitters' powers, whose errors correlate."""
 
 
 @dataclass(frozen=True, eq=False)

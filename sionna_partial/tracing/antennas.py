@@ -88,7 +88,7 @@ def dft_codebook(rows: int, columns: int, polarisations: int = 1) -> NDArray[np.
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> sp.dft_codebook(8, 8).shape
+    >>> sp.channels.dft_codebook(8, 8).shape
     (64, 64)
     """
     for name, value in (("rows", rows), ("columns", columns)):

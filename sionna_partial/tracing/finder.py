@@ -40,11 +40,11 @@ Found = tuple[Candidates | None, SolvedPaths]
 """Candidates and their paths in scene coordinates, row by row; no candidates for paths that rays found."""
 
 _DIRECTED, _ESTIMATED = (0.5, 0.5), (4.5, 0.5)
-"""Factors of the tolerance for opaque walls and through walls: with a directive antenna, whose gain is bounded within
-one degree, and where paths get the power of others that are left out, for materials that the tolerance ignores, too."""
+"""Factors of the tolerance, between opaque walls and through walls: with a directive antenna, and where the expected
+power of omitted paths is added."""
 
 Purpose = Literal["links", "powers"]
-"""Use of paths: as they are, or for powers alone, where paths get the expected power of others that are left out."""
+"""Use of paths: as they are, or for powers alone, to which the expected power of omitted paths is added."""
 
 Counted = Callable[[SolvedPaths], Bools]
 """Function that selects the paths whose power the tolerance refers to."""

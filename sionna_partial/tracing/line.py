@@ -1,9 +1,6 @@
 """Rules for a path wherever it runs, in floor plans and meshes: faces that are one wall, legs, and power.
 
-A path is a sequence of straight legs. Consecutive faces on a leg are one wall if they are at most `depth_m` apart,
-measured across them, with no free cell of the map between them; in meshes also where the leg enters and leaves a closed
-body. One face of a wall has its loss, and none reflects a path in the wall. Where a wall meets another, that one
-reflects, as if the wall continued behind a mirror:
+A path is a sequence of straight legs; docs/physics.md, One wall, has the rule for the faces on a leg:
 
     tx ----|#####|----------|##|-----|------ rx      faces at fractions of the leg: two of a thick wall,
            0     1          2  3     4               two of a thinner wall, and one of a wall seen from one side

@@ -10,15 +10,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
-from sionna_partial.checks import Progress, require_choice
+from sionna_partial.checks import require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
-from sionna_partial.display import Shown, later
+from sionna_partial.display import Shown
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
-from sionna_partial.tracing.paths import SolvedPaths
+from sionna_partial.tracing.paths import SolvedPaths, path_gain_db
 
 if TYPE_CHECKING:
     import xarray as xr
+
+    from sionna_partial.tracing.responses import ArrayPaths
 
 
 @read_only
@@ -92,39 +94,18 @@ class TracedLinks(Shown):
     @property
     def path_link(self) -> NDArray[np.int64]:
         """Index (P,) of the link of each path in the flattened `gain_db`."""
-        return self.path_tx.astype(np.int64) * len(self.rx) + self.path_rx
+        return self.solved.link(len(self.rx))
 
-    def with_every_path(self, scene: Any, *, progress: Progress | bool | None = None) -> TracedLinks:
-        """Trace the links again with ``power_tolerance_db=0``: channels then contain the weakest paths, too.
+    @property
+    def solved(self) -> SolvedPaths:
+        """The paths without their links."""
+        return SolvedPaths(*(getattr(self, field.name) for field in fields(SolvedPaths)))
 
-        Parameters
-        ----------
-        scene : PartialMap, path, Simulation or LinkModel
-            The map on which the links were traced.
-        progress : bool or callable, optional
-            As in `predict_map`.
+    def array_paths(self, **arrays: Any) -> ArrayPaths:
+        """Return the paths between antenna arrays, given by the arguments of `cir`."""
+        from sionna_partial.tracing.responses import ArrayPaths
 
-        Returns
-        -------
-        TracedLinks
-            These links themselves, if they were traced without a tolerance.
-
-        Raises
-        ------
-        MapError, PositionError, BackendError
-            As `trace_links`.
-
-        Examples
-        --------
-        >>> import sionna_partial as sp
-        >>> home = sp.make_home(3)
-        >>> links = sp.trace_links(home, (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
-        >>> every = links.with_every_path(home)
-        >>> every.trace_settings.power_tolerance_db, len(every.a) > len(links.a)
-        (0.0, True)
-        """
-        found: TracedLinks = later("tracing.simulation:with_every_path")(self, scene, progress)
-        return found
+        return ArrayPaths.of(self.solved, self.tx.reshape(-1, 3), self.rx, self.trace_settings, **arrays)
 
     def cir(
         self,
@@ -140,7 +121,8 @@ class TracedLinks(Shown):
         """Return the channel impulse response of each link, as `sionna.rt.Paths.cir` does.
 
         Channels have the paths of the links, which lack weak ones within ``TraceSettings.power_tolerance_db``, the
-        attribute `power_tolerance_db` of the result. `with_every_path`, or a trace with a tolerance of 0, has all.
+        attribute `power_tolerance_db` of the result. `Simulation.with_every_path`, or a trace with a tolerance of 0,
+        has all.
 
         Parameters
         ----------
@@ -181,18 +163,29 @@ class TracedLinks(Shown):
         >>> channels.sizes["link"], channels.sizes["tx_ant"]
         (2, 128)
         """
-        options = {key: value for key, value in locals().items() if key != "self"}
-        return later("channels.responses:cir")(self, **options)
+        from sionna_partial.tracing.responses import cir
 
-    def cfr(self, frequencies_hz: ArrayLike, **options: Any) -> xr.Dataset:
+        arrays = self.array_paths(
+            tx_array=tx_array,
+            rx_array=rx_array,
+            tx_orientation_rad=tx_orientation_rad,
+            rx_orientation_rad=rx_orientation_rad,
+            synthetic_array=synthetic_array,
+            normalize_delays=normalize_delays,
+        )
+        return cir(arrays, memory_gb)
+
+    def cfr(self, frequencies_hz: ArrayLike, *, memory_gb: float = MEMORY_GB, **arrays: Any) -> xr.Dataset:
         """Return the channel frequency response of each link, as `sionna.rt.Paths.cfr` does.
 
         Parameters
         ----------
         frequencies_hz : (F,) array-like
             Frequencies relative to the carrier [Hz].
-        **options
-            Arguments of `cir`.
+        memory_gb : float
+            As in `cir`.
+        **arrays
+            Other arguments of `cir`.
 
         Returns
         -------
@@ -212,9 +205,19 @@ class TracedLinks(Shown):
         >>> links.cfr(np.arange(-32, 32) * 120e3).h.shape
         (1, 1, 1, 64)
         """
-        return later("channels.responses:cfr")(self, frequencies_hz, **options)
+        from sionna_partial.tracing.responses import cfr
 
-    def taps(self, bandwidth_hz: float, l_min: int = -6, l_max: int | None = None, **options: Any) -> xr.Dataset:
+        return cfr(self.array_paths(**arrays), frequencies_hz, memory_gb)
+
+    def taps(
+        self,
+        bandwidth_hz: float,
+        l_min: int = -6,
+        l_max: int | None = None,
+        *,
+        memory_gb: float = MEMORY_GB,
+        **arrays: Any,
+    ) -> xr.Dataset:
         """Return the channel taps of each link at a bandwidth, as `sionna.rt.Paths.taps` does.
 
         Parameters
@@ -223,8 +226,10 @@ class TracedLinks(Shown):
             Bandwidth, and sampling rate, of the sinc filter [Hz].
         l_min, l_max : int
             First and last tap; by default, the last is six after the longest delay.
-        **options
-            Arguments of `cir`.
+        memory_gb : float
+            As in `cir`.
+        **arrays
+            Other arguments of `cir`.
 
         Returns
         -------
@@ -243,7 +248,9 @@ class TracedLinks(Shown):
         >>> links.taps(100e6, l_max=20).sizes["tap"]
         27
         """
-        return later("channels.responses:taps")(self, bandwidth_hz, l_min, l_max, **options)
+        from sionna_partial.tracing.responses import taps
+
+        return taps(self.array_paths(**arrays), bandwidth_hz, l_min, l_max, memory_gb)
 
     def beam_gains(
         self,
@@ -287,12 +294,19 @@ class TracedLinks(Shown):
         >>> from sionna.rt import PlanarArray
         >>> links = sp.trace_links(sp.make_home(3), (2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
         >>> array = PlanarArray(num_rows=4, num_cols=4, pattern="iso", polarization="V")
-        >>> beams = links.beam_gains(sp.dft_codebook(4, 4), tx_array=array)
+        >>> beams = links.beam_gains(sp.channels.dft_codebook(4, 4), tx_array=array)
         >>> beams.best_tx_beam.item()  # broadside
         0
         """
-        options = {key: value for key, value in locals().items() if key != "self"}
-        return later("channels.responses:beam_gains")(self, **options)
+        from sionna_partial.tracing.responses import beam_gains
+
+        arrays = self.array_paths(
+            tx_array=tx_array,
+            rx_array=rx_array,
+            tx_orientation_rad=tx_orientation_rad,
+            rx_orientation_rad=rx_orientation_rad,
+        )
+        return beam_gains(arrays, codebook, rx_codebook, memory_gb)
 
     def to_xarray(self) -> xr.Dataset:
         """Return the links and their paths as a labelled Dataset.
@@ -360,7 +374,9 @@ class TracedLinks(Shown):
         >>> bool(links.spreads().k_factor_db > 0)
         True
         """
-        return later("channels.responses:spreads")(self)
+        from sionna_partial.tracing.responses import spreads
+
+        return spreads(self.solved, self.gain_db)
 
     def to_dataframe(self, of: Literal["links", "paths"] = "links") -> Any:
         """Return a row for each link, or for each path, as a pandas.DataFrame.
@@ -464,7 +480,7 @@ class LinkSums:
 
     def add(self, paths: SolvedPaths, classes: NDArray[np.uint8] | None = None) -> None:
         """Add paths; `classes` (P, D) are from `PartialMap.wall_classes`."""
-        link, sizes = paths.path_tx.astype(np.int64) * self._shape[1] + paths.path_rx, self.path_power.shape[1:]
+        link, sizes = paths.link(self._shape[1]), self.path_power.shape[1:]
         counted = () if classes is None else unnamed_counts(paths.interactions, classes, len(sizes) - 1)
         counts = (np.minimum(count, size - 1) for count, size in zip(counted, sizes, strict=True))
         np.add.at(self.path_power, (link, *counts), paths.power)
@@ -482,9 +498,3 @@ def unnamed_counts(interactions: NDArray[np.uint8], classes: NDArray[np.uint8], 
     """Count the crossings of walls of each class and the reflections (P,) at walls of unnamed materials."""
     at = [(interactions == REFRACTION) & (classes == number) for number in range(1, walls + 1)]
     return [np.count_nonzero(mask, axis=1) for mask in (*at, (interactions == REFLECTION) & (classes > 0))]
-
-
-def path_gain_db(power: Floats) -> Floats:
-    """Return the omnidirectional path gain [dB], at least -150, for a sum of |a|^2 (paper, eq. 5)."""
-    with np.errstate(divide="ignore"):
-        return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.constants import GAIN_FLOOR_DB
 
 SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less [m]."""
@@ -43,6 +44,10 @@ class SolvedPaths:
     @property
     def is_direct(self) -> Bools:
         return (self.interactions == 0).all(axis=1)
+
+    def link(self, receivers: int) -> NDArray[np.int64]:
+        """Return the index (P,) of the link of each path among (T, receivers) links."""
+        return self.path_tx.astype(np.int64) * receivers + self.path_rx
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
         return SolvedPaths(*(column[index] for column in vars(self).values()))
@@ -253,3 +258,9 @@ class Candidates:
 
     def rows(self, index: Indices) -> "Candidates":
         return replace(self, **{name: array[index] for name, array in self.columns.items()})
+
+
+def path_gain_db(power: Floats) -> Floats:
+    """Return the omnidirectional path gain [dB], at least -150, for a sum of |a|^2 (paper, eq. 5)."""
+    with np.errstate(divide="ignore"):
+        return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)

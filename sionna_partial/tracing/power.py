@@ -1,9 +1,4 @@
-"""Power of paths by their geometry, before Sionna RT verifies them.
-
-Slabs follow ITU-R P.2040-3, eq. 31, 37 and 38, edges the uniform theory of diffraction (UTD). Paths between opaque
-walls have an upper bound for vertical antennas, with horizontal components added by magnitude; paths through walls have
-the power of their Jones vector.
-"""
+"""Power of paths by their geometry, before Sionna RT verifies them: slabs, edges and bounds of docs/physics.md."""
 
 import math
 from collections.abc import Iterable
@@ -318,7 +313,7 @@ def at_flats(largest, material, slope, bounces, field):
 def _te_part(along, sine, slope):
     """Return the TE fraction of a vertical field's power at a wall.
 
-    `along` is the squared cosine of the angle between path and wall, seen from above.
+    `along` is the squared cosine of the angle between path and wall, seen from above (docs/physics.md, Jones vector).
     """
     return min(along / (slope * slope + sine * sine * along), 1.0) if slope * slope > 1e-12 else 1.0
 
@@ -361,7 +356,7 @@ def wedge_constants(exterior_rad: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @njit(cache=True, borrows=True)
 def utd_terms(wedge, arrival, departure, terms):
-    """Prepare the four terms of the UTD coefficient of a wedge, cot(psi) F(k L a) / 2 n, for any L.
+    """Prepare the four terms cot(psi) F(k L a) / 2 n of a wedge for any L (docs/physics.md, Wedge).
 
     `wedge` is from `wedge_constants`, directions from the 0-face from `wedge_angle`. `terms` (4, 3) receives cot(psi) /
     2 n, with y = sqrt(a / 2) the sine of n times the angle from psi to the nearest pole of the cotangent, and 1 / y^2.

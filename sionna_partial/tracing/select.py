@@ -1,8 +1,4 @@
-"""Selection of the candidates that Sionna RT verifies, by upper bounds of their power.
-
-The bounds of a link are sorted into levels of 1.5 dB. The weakest levels are left out while their sum does not exceed
-the power that the link may lack. Predictions add the expected power of candidates that are left out.
-"""
+"""Selection of the candidates that Sionna RT verifies, by bounds of their power (docs/physics.md, Power bounds)."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -87,7 +83,8 @@ class Block(NamedTuple):
 class Stage(NamedTuple):
     """Candidates to verify, round after round.
 
-    `left_out` returns the expected power (N,) of the others by the power (N,) that this stage has found.
+    `left_out` returns the expected power (N,) of the omitted candidates; its argument is the power (N,) that this stage
+    found.
     """
 
     rounds: Iterable[Iterator[Block]]
@@ -234,10 +231,10 @@ def discount_after(limits, reflections):
 
 
 class NeedsByDistance(NamedTuple):
-    """Smallest power that matters, relative to free space, by distance from the transmitter.
+    """Smallest power that matters to any receiver beyond or within some distances from the transmitter.
 
-    `relative` is for receivers at least as far away, `near` for receivers at most as far away, times
-    (4 pi / wavelength)^2.
+    Beyond `distance_m`, it is the fraction `relative` of the power in free space. Within, it is `near` times
+    (wavelength / 4 pi)^2.
     """
 
     distance_m: Floats

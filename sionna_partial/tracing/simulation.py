@@ -186,6 +186,36 @@ class Simulation:
         stored: dict[str, Any] = {name: np.load(Path(folder) / f"{name}.npy", mmap_mode="r") for name in names}
         return TracedLinks(**stored, **settings)
 
+    def with_every_path(self, links: TracedLinks, *, progress: Progress | bool | None = None) -> TracedLinks:
+        """Trace links of this map again with ``power_tolerance_db=0``: channels then contain the weakest paths, too.
+
+        Parameters
+        ----------
+        links : TracedLinks
+            Returned as they are if they were traced without a tolerance.
+        progress : bool or callable, optional
+            As in `predict_map`.
+
+        Raises
+        ------
+        MapError, PositionError, BackendError
+            As `trace_links`.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> simulation = sp.Simulation(sp.make_home(3))
+        >>> links = simulation.links((2.0, 3.0, 1.5), [(2.5, 3.0, 1.5)])
+        >>> every = simulation.with_every_path(links)
+        >>> every.trace_settings.power_tolerance_db, len(every.a) > len(links.a)
+        (0.0, True)
+        """
+        if links.trace_settings.power_tolerance_db == 0.0:
+            return links
+        settings = replace(links.trace_settings, power_tolerance_db=0.0)
+        every = Simulation(self.partial, settings, links.scene_settings)
+        return every.links(links.tx, links.rx, invalid="nan", progress=progress)
+
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> PathSet:
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], which can be differentiated.
 
@@ -480,17 +510,6 @@ def trace_links(
     """
     simulation = simulation_of(scene, trace_settings, scene_settings)
     return simulation.links(tx, rx, folder=folder, memory_gb=memory_gb, invalid=invalid, progress=progress)
-
-
-def with_every_path(
-    links: TracedLinks, scene: PartialMap | str | Path | Simulation | Simulated, progress: Progress | bool | None
-) -> TracedLinks:
-    """Trace links again on their map, as `TracedLinks.with_every_path`."""
-    if links.trace_settings.power_tolerance_db == 0.0:
-        return links
-    settings = replace(links.trace_settings, power_tolerance_db=0.0)
-    every = Simulation(simulation_of(scene).partial, settings, links.scene_settings)
-    return every.links(links.tx, links.rx, invalid="nan", progress=progress)
 
 
 def resolved_settings(

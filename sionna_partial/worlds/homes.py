@@ -2,7 +2,7 @@
 
 A plan consists of polygons in metres: outline, rooms, openings along a spanning tree of the rooms and a few more, and
 furniture that leaves room to walk. It is rotated and put onto cells, where walls and furniture swell, as on robots'
-maps. `docs/researchers.md` compares the plans with real homes.
+maps. `docs/worlds.md` compares the plans with real homes.
 """
 
 import math

@@ -7,6 +7,7 @@ import random
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 
 from inputs import KINDS
 
@@ -34,18 +35,18 @@ ODD = (
 CALLS = {
     "PartialMap": {"state": "np.zeros((5, 6), np.uint8)", "resolution_m": "0.1"},
     "map_from_array": {"array": "np.zeros((5, 6))", "resolution_m": "0.1"},
-    "map_from_occupancy": {"data": "np.zeros((5, 6), np.int8)", "resolution_m": "0.1"},
-    "map_from_slam": {"obstacle": "np.zeros((5, 6))", "explored": "np.ones((5, 6))", "resolution_m": "0.1"},
-    "map_from_habitat": {
+    "importers.map_from_occupancy": {"data": "np.zeros((5, 6), np.int8)", "resolution_m": "0.1"},
+    "importers.map_from_slam": {"obstacle": "np.zeros((5, 6))", "explored": "np.ones((5, 6))", "resolution_m": "0.1"},
+    "importers.map_from_habitat": {
         "top_down": "np.ones((5, 6), bool)",
         "fog_of_war": "np.ones((5, 6), bool)",
         "resolution_m": "0.1",
     },
-    "map_from_points": {"points": "CLOUD"},
-    "map_from_drawing": {"path": "valid('plan.dxf', folder)"},
-    "map_from_bag": {"path": "valid('drive.bag', folder)"},
-    "poses_from_bag": {"path": "valid('drive.bag', folder)"},
-    "measurements_from_bag": {
+    "importers.map_from_points": {"points": "CLOUD"},
+    "importers.map_from_drawing": {"path": "valid('plan.dxf', folder)"},
+    "importers.map_from_bag": {"path": "valid('drive.bag', folder)"},
+    "importers.poses_from_bag": {"path": "valid('drive.bag', folder)"},
+    "importers.measurements_from_bag": {
         **{"path": "valid('drive.bag', folder)", "topic": "'/rssi'", "tx": "TX"},
         "tx_power_dbm": "20.0",
     },
@@ -59,11 +60,14 @@ CALLS = {
     "predict_map": {"scene": "room()", "tx": "TX", "spacing_m": "1.0", "predictor": "'paper'"},
     "save_coverage": {"coverage": "coverage()", "path": "folder / 'coverage.nc'"},
     "load_coverage": {"path": "valid('coverage.nc', folder)"},
-    "plot_coverage": {"coverage": "coverage()"},
-    "plot_map": {"partial": "room()"},
+    "plots.plot_coverage": {"coverage": "coverage()"},
+    "plots.plot_map": {"partial": "room()"},
     "Measurements": {"tx": "[TX]", "rx": "[(3.1, 2.5, 1.5)]", "gain_db": "[-70.0]"},
     "link_features": {"partial": "room()", "links": "links()"},
-    "Assimilation.fit": {"partial": "room()", "tx_m": "TX", "measured": "measured()", "prior": "prediction()"},
+    "measurements.assimilation.Assimilation.fit": {
+        **{"partial": "room()", "tx_m": "TX", "measured": "measured()"},
+        **{"prior": "prediction()"},
+    },
     "TracedLinks.cir": {"self": "links()"},
     "TracedLinks.cfr": {"self": "links()", "frequencies_hz": "[0.0, 1e6]"},
     "TracedLinks.taps": {"self": "links()", "bandwidth_hz": "1e8"},
@@ -71,35 +75,38 @@ CALLS = {
     "TracedLinks.to_dataframe": {"self": "links()"},
     "load_antenna": {"path": "valid('antenna.msi', folder)"},
     "Antenna": {"pattern": "'tr38901'", "azimuth_deg": "30.0", "rows": "2", "columns": "2", "beam": "1"},
-    "dft_codebook": {"rows": "4", "columns": "4"},
-    "sample_channels": {"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]", "n": "5", "predictor": "'paper'"},
-    "ChannelSamples.links": {"self": "samples()", "draw": "0"},
-    "save_channels": {"channels": "links()", "path": "folder / 'channels.nc'"},
-    "load_channels": {"path": "valid('channels.nc', folder)"},
-    "network_map": {"coverage": "two_coverages()"},
+    "channels.dft_codebook": {"rows": "4", "columns": "4"},
+    "channels.sample_channels": {
+        **{"scene": "room()", "tx": "TX", "rx": "[(3.1, 2.5, 1.5)]", "n": "5"},
+        **{"predictor": "'paper'"},
+    },
+    "channels.samples.ChannelSamples.links": {"self": "samples()", "draw": "0"},
+    "channels.save_channels": {"channels": "links()", "path": "folder / 'channels.nc'"},
+    "channels.load_channels": {"path": "valid('channels.nc', folder)"},
+    "predict_network": {"coverage": "two_coverages()"},
     "save_network": {"network": "network()", "path": "folder / 'network.nc'"},
-    "plot_network": {"network": "network()"},
+    "plots.plot_network": {"network": "network()"},
     "calibrate_materials": {"scene": "room()", "measurements": "valid('measurements.csv', folder)"},
     "place_transmitter": {"scene": "room()", "predictor": "'paper'"},
     "place_transmitters": {"scene": "room()", "predictor": "'paper'"},
     "next_views": {"scene": "room()"},
-    "plot_calibration": {"calibration": "None"},
-    "plot_exploration": {"exploration": "None"},
-    "plot_placement": {"placement": "None"},
-    "plot_network_placement": {"placement": "None"},
-    "plot_next_views": {"views": "None"},
+    "plots.plot_calibration": {"calibration": "None"},
+    "plots.plot_exploration": {"exploration": "None"},
+    "plots.plot_placement": {"placement": "None"},
+    "plots.plot_network_placement": {"placement": "None"},
+    "plots.plot_next_views": {"views": "None"},
     "explore_trajectory": {"home": "room()", "steps": "3"},
     "DifferentiableScene": {"scene": "room()"},
     "Predictor.predict": {"self": "sp.Predictor.load('paper')", "features": "None"},
-    "animate_exploration": {"exploration": "None", "path": "folder / 'drive.gif'"},
-    "build_dataset": {"folder": "folder / 'links'", "homes": "[]"},
-    "read_dataset": {"folder": "valid('dataset.json', folder).parent"},
-    "train": {"dataset": "valid('dataset.json', folder).parent"},
-    "evaluate": {"predictor": "'paper'", "dataset": "valid('dataset.json', folder).parent"},
+    "plots.animate_exploration": {"exploration": "None", "path": "folder / 'drive.gif'"},
+    "lab.build_dataset": {"folder": "folder / 'links'", "homes": "[]"},
+    "lab.read_dataset": {"folder": "valid('dataset.json', folder).parent"},
+    "lab.train": {"dataset": "valid('dataset.json', folder).parent"},
+    "lab.evaluate": {"predictor": "'paper'", "dataset": "valid('dataset.json', folder).parent"},
 }
 """Public functions and methods, and valid arguments of each."""
 
-SETTINGS = ("TraceSettings", "SceneSettings", "SensorSettings", "DatasetSettings", "Material")
+SETTINGS = ("TraceSettings", "SceneSettings", "SensorSettings", "lab.DatasetSettings", "Material")
 
 COMMANDS = {
     "predict": "MAP --tx 1.1 1.1 --spacing 1.0 --predictor paper --out OUT",
@@ -181,23 +188,21 @@ def _settings(seed: int) -> Iterator[Case]:
     import sionna_partial as sp
 
     for name in SETTINGS:
-        for each in dataclasses.fields(getattr(sp, name)):
+        for each in dataclasses.fields(operator.attrgetter(name)(sp)):
             for odd in ODD:
                 code = f"sp.{name}({each.name}={odd})"
                 yield Case("settings", code, code)
 
 
 def _arguments(seed: int) -> Iterator[Case]:
-    import sionna_partial as sp
-
     for name, base in CALLS.items():
-        every = inspect.signature(operator.attrgetter(name)(sp)).parameters.values()
+        every = inspect.signature(resolve_name(f"sionna_partial.{name}")).parameters.values()
         left_out = ("self", "progress")
         parameters = [each.name for each in every if each.name not in left_out and each.kind != each.VAR_KEYWORD]
         for parameter in parameters:
             for odd in ODD:
                 given = ", ".join(f"{key}={value}" for key, value in (base | {parameter: odd}).items())
-                code = f"sp.{name}({given})"
+                code = f"resolve_name('sionna_partial.{name}')({given})"
                 yield Case("arguments", f"{name}({parameter}={odd})", _INPUTS + code)
 
 

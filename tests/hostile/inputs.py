@@ -18,6 +18,7 @@ import psutil
 from worker import left_behind
 
 import sionna_partial as sp
+from sionna_partial.channels.samples import ChannelSamples
 
 HERE = str(Path(__file__).parent)
 
@@ -204,7 +205,7 @@ def two_coverages() -> Any:
 
 @functools.cache
 def network() -> Any:
-    return sp.network_map(two_coverages(), n=10)
+    return sp.predict_network(two_coverages(), n=10)
 
 
 @functools.cache
@@ -213,8 +214,8 @@ def links() -> sp.TracedLinks:
 
 
 @functools.cache
-def samples() -> sp.ChannelSamples:
-    return sp.sample_channels(room(), TX, [(3.1, 2.5, 1.5)], n=3, predictor="paper")
+def samples() -> ChannelSamples:
+    return sp.channels.sample_channels(room(), TX, [(3.1, 2.5, 1.5)], n=3, predictor="paper")
 
 
 def measured() -> sp.Measurements:
@@ -228,13 +229,13 @@ def prediction() -> sp.LinkPrediction:
 
 
 def _channels(folder: Path) -> Path:
-    sp.save_channels(links(), folder / "channels.nc")
+    sp.channels.save_channels(links(), folder / "channels.nc")
     return folder / "channels.nc"
 
 
 def _read_channels(path: Path) -> None:
     if not python(f"import h5py; h5py.File({str(path)!r}).visititems(print)").returncode:  # HDF5 may crash, not we
-        sp.load_channels(path).load()
+        sp.channels.load_channels(path).load()
 
 
 def _coverage(folder: Path) -> Path:
@@ -249,14 +250,14 @@ def _read_coverage(path: Path) -> None:
         return
     stored = xr.load_dataset(path)
     sp.save_coverage(stored, path.with_name("again.csv"))
-    sp.plot_coverage(stored)
+    sp.plots.plot_coverage(stored)
 
 
 @functools.cache
 def _dataset_folder() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="hostile_dataset_"))
-    settings = sp.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0, 5))
-    sp.build_dataset(folder / "links", [1], settings, workers=1)
+    settings = sp.lab.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0, 5))
+    sp.lab.build_dataset(folder / "links", [1], settings, workers=1)
     return folder / "links"
 
 
@@ -304,8 +305,8 @@ def _bag(name: str, folder: Path) -> Path:
 def _read_bag(path: Path) -> None:
     for read in (
         sp.load_map,
-        sp.poses_from_bag,
-        lambda path: sp.measurements_from_bag(path, "/rssi", TX, tx_power_dbm=20.0),
+        sp.importers.poses_from_bag,
+        lambda path: sp.importers.measurements_from_bag(path, "/rssi", TX, tx_power_dbm=20.0),
     ):
         with suppress(sp.SionnaPartialError):
             read(path)
@@ -337,10 +338,10 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
     ),
     "coverage.nc": (_coverage, _read_coverage),
     "channels.nc": (_channels, _read_channels),
-    "dataset.parquet": (_dataset, lambda path: sp.read_dataset(path.parent.parent)),
+    "dataset.parquet": (_dataset, lambda path: sp.lab.read_dataset(path.parent.parent)),
     "dataset.json": (
         lambda folder: _dataset(folder).parent.parent / "dataset.json",
-        lambda path: sp.read_dataset(path.parent),
+        lambda path: sp.lab.read_dataset(path.parent),
     ),
 }
 """By name of the kind: what writes a valid file into a folder, and what reads it."""

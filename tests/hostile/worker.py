@@ -12,6 +12,7 @@ import tempfile
 import traceback
 import warnings
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 
@@ -42,7 +43,7 @@ def run(code: str, folder: Path) -> tuple[str, str]:
 
     import sionna_partial as sp
 
-    names = {"sp": sp, "np": np, "folder": folder, "command": command, "Path": Path}
+    names = {"sp": sp, "np": np, "folder": folder, "command": command, "Path": Path, "resolve_name": resolve_name}
     try:
         exec(code, names)
     except (sp.SionnaPartialError, Refused) as error:

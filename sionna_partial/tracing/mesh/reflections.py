@@ -1,9 +1,9 @@
 """Specular paths of meshes, with or without walls that they cross, by the sequences of planes that rays met.
 
-A path is a straight line from an image of the transmitter, reflected in the planes of its sequence. Rays determine the
-sequences and, seen from the image, directions and reach of the last leg. A receiver in or near them is a candidate if
-the line to it, folded back, meets a face of each plane. Between opaque faces, Sionna RT finds the faces in the way;
-through walls, every leg is cast through the mesh, and its faces are grouped to walls, which gives the power.
+A path is a straight line from an image of the transmitter (docs/physics.md, Images and beams). Rays determine the
+sequences, and the directions and reach of each last leg, seen from the image. A receiver there is a candidate if the
+line to it, folded back, meets a face of each plane. Between opaque faces, Sionna RT finds the faces in the way. Through
+walls, every leg is cast through the mesh, and its faces are grouped to walls.
 """
 
 import itertools

@@ -1,8 +1,7 @@
 """Beams of a floor plan: sequences of walls that can reflect a path, and the receivers that they reach.
 
-A wall of full height reflects a path in the plan like a line, so the search has two dimensions. The image S of the
-transmitter and a window from A to B, the reflecting part of the last wall, bound a beam. A point in it is
-S + r ((1 - t)(A - S) + t (B - S)): the window is r = 1, t runs from 0 to 1, and on any line 1 / r is linear in t.
+The search has two dimensions. The image S of the transmitter and a window from A to B bound a beam, in which points
+have coordinates t and 1 / r (docs/physics.md, Images and beams).
 
 `follow` takes the beams of one number of reflections to the next: between opaque walls (`Limits.walls` is 0) by
 `views.py`, where the nearest wall reflects, and every sequence is listed, as `select.py` needs the sum of all bounds;

@@ -159,7 +159,7 @@ def write_terms(utd, edge, angle, j, departure, terms):
 
 @njit(cache=True, borrows=True)
 def spread_of(wavelength, length, onward):
-    """Return the spread of the power over an edge, to be divided by the path length, and 2 k L."""
+    """Return the spread of the power over an edge, to be divided by the path length, and 2 k L (docs/physics.md)."""
     spread = wavelength**3 / (64.0 * np.pi**4 * length * onward)
     return spread, 4.0 * np.pi / wavelength * length * onward / (length + onward)
 

@@ -1,5 +1,5 @@
 path = folder / ("a" * 245 + ".npz")
 sp.save_map(sp.make_home(1), path)
-settings = sp.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0,))
-report = sp.build_dataset(folder / "links", [path, 1], settings, workers=1)
-sp.read_dataset(folder / "links")
+settings = sp.lab.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0,))
+report = sp.lab.build_dataset(folder / "links", [path, 1], settings, workers=1)
+sp.lab.read_dataset(folder / "links")

@@ -1,3 +1,3 @@
 links = valid("dataset.json", folder).parent
-must_refuse(lambda: sp.train([links, links]))
-must_refuse(lambda: sp.evaluate("paper", [links, links]))
+must_refuse(lambda: sp.lab.train([links, links]))
+must_refuse(lambda: sp.lab.evaluate("paper", [links, links]))
