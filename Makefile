@@ -7,21 +7,24 @@ unexport PYTHONDONTWRITEBYTECODE
 
 BIN := .venv/bin
 READY := .venv/.ready
+KERNELS := .venv/.kernels
 # Two test processes share two cores: one thread each.
 ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_NUM_INTEROP_THREADS=1
 CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
 	network outlines partial_map predictor ros_map scene settings slab trace unobserved)
-LEARNED_FROM := build/predictor/{camera,mixed,large}
-FRACTIONS := --mixed-sensors --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
+DATASET = $(BIN)/sionna-partial dataset build/predictor
+LEARNED_FROM := build/predictor/{camera,mixed,lidar,large,large_lidar}
+STAGES := --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
+LARGE := --kind hall --kind warehouse --kind floor --short-links 0.5
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
-.PHONY: help demo test check core kernels kernels-plan kernels-mesh suite docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
+.PHONY: help demo test check core kernels kernels-plan kernels-mesh kernels-beams kernels-paths suite docs site pages hostile lint format lock scenes predictor wheel wheel-check clean
 
 help: ## List what can be made
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/^([a-z-]+):.*## (.*)/  make \1\t\2/' | expand -t 24
 
-demo: $(READY) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
+demo: $(KERNELS) ## Predict a half-explored demo home, and compare with the truth (demo-output/)
 	@$(BIN)/sionna-partial demo --out demo-output
 
 test: kernels ## Check style and types, and run the tests (PAGES=1: and all pages; builds the site)
@@ -39,7 +42,7 @@ check: $(READY) ## Check style and types, and run the tests of the core, in two 
 core: $(READY)
 	@$(ONE_THREAD) MPLBACKEND=Agg $(BIN)/python -m pytest -q $(CORE)
 
-kernels-plan kernels-mesh: kernels-%: $(READY)
+kernels-plan kernels-mesh kernels-beams kernels-paths: kernels-%: $(READY)
 	@$(ONE_THREAD) $(if $(filter mesh,$*),nice) $(BIN)/python tests/compile_kernels.py $*
 
 docs: $(READY) ## Build the site, with its pages, notebooks and examples run (build/docs/index.html)
@@ -73,15 +76,16 @@ lock: $(READY) ## Lock the newest allowed dependencies from PyPI in requirements
 scenes: $(READY) ## Make the demo scenes again (scenes/)
 	@$(BIN)/python scenes/make_scenes.py
 
-predictor: $(READY) ## Train the shipped predictors again (sionna_partial/predictors/)
+predictor: $(READY) ## Train predictors like the shipped ones, and put them there (sionna_partial/predictors/)
 	@rm -rf build/predictor
-	@$(BIN)/sionna-partial dataset build/predictor/camera --homes 135 --first-seed 330000 --links 160
-	@$(BIN)/sionna-partial dataset build/predictor/mixed --homes 94 --first-seed 320000 $(FRACTIONS)
-	@$(BIN)/sionna-partial dataset build/predictor/large --homes 54 --first-seed 350000 $(FRACTIONS) \
-		--kind hall --kind warehouse --kind floor --short-links 0.5
+	@$(DATASET)/camera --homes 300 --first-seed 330000 --links 160
+	@$(DATASET)/mixed --homes 184 --first-seed 320000 --mixed-sensors $(STAGES)
+	@$(DATASET)/lidar --homes 30 --first-seed 340000 --field-of-view 360 --range 12 $(STAGES)
+	@$(DATASET)/large --homes 54 --first-seed 350000 --mixed-sensors $(STAGES) $(LARGE)
+	@$(DATASET)/large_lidar --homes 65 --first-seed 360000 --field-of-view 360 --range 20 $(STAGES) $(LARGE)
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --passes 22 --test-fraction 0.1 --out build/predictor/$$networks; \
+			--networks $$networks --passes 12 --test-fraction 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
@@ -113,4 +117,9 @@ $(READY): requirements.lock pyproject.toml install_locked.py
 	"$$python" -m venv --clear .venv
 	@$(BIN)/python install_locked.py
 	@$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	@touch $@
+
+$(KERNELS): $(READY)
+	@echo "compiling, once (half a minute)"
+	@$(MAKE) --no-print-directory -j 2 kernels-beams kernels-paths
 	@touch $@

@@ -20,6 +20,7 @@ import numpy as np
 from stock import peak_memory_gb
 
 import sionna_partial as sp
+from sionna_partial.apps.live.answers import LiveGrid
 from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
 from sionna_partial.constants import CellState
 
@@ -95,7 +96,7 @@ def depot_maps(path: Path, steps: range) -> list[sp.PartialMap]:
 
 def drive(maps: list[sp.PartialMap], spacing_m: float) -> None:
     """Print time and memory of every update of a robot that maps a building."""
-    grids: list[sp.LiveGrid] = []
+    grids: list[LiveGrid] = []
     live = LiveCoverage(free_position(maps[0]), grids.append, LiveSettings(spacing_m=spacing_m))
     print("\n| map | observed cells | first grid [s] | final grid [s] | processor [s] | memory [GB] |")
     print("|---|---|---|---|---|---|")

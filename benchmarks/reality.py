@@ -137,7 +137,7 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
     """Return error [m] and whether the 90 % region holds the truth (D, 2), of each transmitter and draw."""
     link_model.KEPT_BLOCKS = POINTS
     area = GridArea(DEFAULT_HEIGHT_M, 1.0)
-    job, found = CoverageJob(model, area, "indoor", block=MOST_POSITIONS), []
+    job, found = CoverageJob(model, area, block=MOST_POSITIONS), []
     nowhere = grid_receivers(model, np.empty((0, 3)), area)
     for number, rows in enumerate(links.values()):
         rows, tx_m = rows[np.random.default_rng(0).permutation(len(rows))[:POINTS]], rows[0, :3]

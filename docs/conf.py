@@ -1,7 +1,7 @@
 """Sphinx settings of the site that `make docs` builds.
 
 The source folder is the root of the repository: links between the README, `docs/` and the other pages are the same
-here and on GitHub. What is generated goes to `build/`.
+here and on GitHub. Generated files go to `build/`.
 """
 
 import sys

@@ -5,7 +5,7 @@ traced, the distribution equals `LinkModel.predict`: its features change as the 
 gradients:
 
 - Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
-  missing; one that becomes invalid loses its power in a step, which has no derivative.
+  missing; one that becomes invalid loses its power in a step, which has no derivative. `smoothed` includes both.
 - Derivatives of lengths in unknown cells and in walls are differences over 2 mm: they jump where a line passes the
   corner of a cell.
 - Map features, exposure and routes are bilinear between cells of 0.3 m, and range noise between cells of the map.
@@ -25,8 +25,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Floats
-from sionna_partial.checks import Progress, require
+from sionna_partial.checks import Progress, require, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
@@ -68,7 +69,7 @@ from sionna_partial.tracing.gradients import one_transmitter
 from sionna_partial.tracing.links import unnamed_counts
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathSet
 from sionna_partial.tracing.power import mean_loss_db, wall_loss_db
-from sionna_partial.tracing.simulation import Simulation
+from sionna_partial.tracing.simulation import Simulation, nearest_m
 
 _NEAREST_M = 1e-6
 """Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
@@ -81,6 +82,9 @@ _STEEPEST = 30.0
 
 _RELATIVE_STEP = 1e-5
 """Step of central differences, relative to the value or to itself."""
+
+_RIM = np.array([(math.cos(angle), math.sin(angle), 0.0) for angle in np.arange(8) * math.pi / 4.0])
+"""Directions (8, 3) of the positions on the rim of a disc."""
 
 _LIMITS = {
     "tx_m": (-1e9, 1e9),
@@ -213,6 +217,87 @@ class DifferentiableScene:
             As `trace_links`, or for several transmitters.
         """
         return DifferentiableLinks(self, self.simulation.paths(one_transmitter(tx), rx, progress=progress))
+
+    def smoothed(
+        self,
+        objective: Callable[[LinkDistribution], Any],
+        tx: ArrayLike,
+        rx: ArrayLike,
+        *,
+        within_m: float = 0.1,
+        progress: Progress | bool | None = None,
+    ) -> tuple[float, Floats]:
+        """Return the mean of an objective over transmitter positions in a horizontal disc, and its gradient.
+
+        The objective itself jumps wherever a path appears or vanishes. Links are traced from the centre and from eight
+        positions on the rim, except inside walls and at receivers; both have half of the weight. By Gauss' theorem the
+        gradient of the mean over a disc follows from the values on its rim: it is the mean of the gradients, plus the
+        part of the values that gradients do not explain, which is due to paths that appear or vanish in the disc.
+
+        Parameters
+        ----------
+        objective : callable
+            Function of a `LinkDistribution` that returns a () tensor.
+        tx : (3,) array-like
+            Centre of the disc [m].
+        rx, progress
+            As in `links`.
+        within_m : float
+            Radius of the disc [m], above 0 and at most 1.
+
+        Returns
+        -------
+        value : float
+        gradient : (3,) float64 array
+            By the position of the disc [1/m].
+
+        Raises
+        ------
+        PositionError
+            As `links`.
+        SettingsError
+            For a radius out of range.
+
+        Examples
+        --------
+        >>> import sionna_partial as sp
+        >>> import tensorflow as tf
+        >>> cells = [[1, 1, 1, 1, 1], [1, 0, 0, 0, 2], [1, 0, 0, 0, 2], [1, 1, 1, 1, 1]]  # a room, open to the unknown
+        >>> scene = sp.DifferentiableScene(sp.map_from_array(cells, resolution_m=1.0))
+        >>> rx = [(3.0, 2.0, 1.5), (4.5, 1.5, 1.5)]
+        >>> value, gradient = scene.smoothed(lambda links: tf.reduce_mean(links.gain_mean_db), (1.5, 1.5, 1.5), rx)
+        >>> bool(gradient[0] > 0.0)  # nearer to the receivers
+        True
+        """
+        require_number("within_m", within_m, 0.0, 1.0, open_low=True)
+        steps_m = within_m * _RIM
+        with reporting(progress) as report:
+            centre, slope = self._with_slope(objective, tx, rx, part_of(report, 0.0, 1.0 / 9.0))
+            rim_m = np.asarray(tx, dtype=np.float64) + steps_m
+            gap_m = np.linalg.norm(rim_m[:, None] - np.reshape(rx, (-1, 3)), axis=2).min(axis=1, initial=math.inf)
+            possible = self.partial.radios_can_stand(rim_m)
+            possible &= gap_m >= nearest_m(self.simulation.trace_settings.frequency_hz)
+            values, slopes, jump = [], [], np.zeros(3)
+            for number in np.flatnonzero(possible).tolist():
+                part = part_of(report, (number + 1) / 9.0, (number + 2) / 9.0)
+                value, there = self._with_slope(objective, rim_m[number], rx, part)
+                values.append(value)
+                slopes.append(there)
+                unexplained = value - centre - 0.5 * (slope + there) @ steps_m[number]
+                jump += unexplained * steps_m[number] * 2.0 / (len(_RIM) * within_m**2)
+            report(1.0, "done")
+        if not values:
+            return centre, slope
+        return 0.5 * (centre + float(np.mean(values))), 0.5 * (slope + np.mean(slopes, axis=0)) + jump
+
+    def _with_slope(
+        self, objective: Callable[[LinkDistribution], Any], tx: ArrayLike, rx: ArrayLike, progress: Progress
+    ) -> tuple[float, Floats]:
+        links = self.links(tx, rx, progress=progress)
+        tx_m = tf.Variable(links.base.tx_m)
+        with tf.GradientTape() as tape:
+            value = objective(links(tx_m=tx_m))
+        return float(value), tape.gradient(value, tx_m, unconnected_gradients="zero").numpy()
 
     @cached_property
     def _walls(self) -> WallDensity:

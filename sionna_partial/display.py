@@ -20,7 +20,7 @@ THUMBNAIL_PX = 640
 
 _FEW = 4
 
-_COMPILING = "compiling, once: kernel {} of about 200"
+_COMPILING = "compiling, once: kernel {} of 90 to 150"
 
 WAIT_S, COMMAND_WAIT_S, LINE_S = 2.0, 0.1, 60.0
 """Delays of bars in calls and commands, and time between lines without a terminal [s]."""

@@ -207,7 +207,7 @@ class _Kernel:
 
 @contextmanager
 def told_of_compilations(tell: Callable[[int], None]) -> Iterator[None]:
-    """Call `tell` with a running number before each compilation; of nested receivers only the first is called."""
+    """Call `tell` with a running number before each kernel compiles; of nested receivers only the first is called."""
     _told.append(tell)
     try:
         yield
@@ -222,10 +222,11 @@ def _tell_of_compilations() -> None:
     class Listener(event.Listener):
         number = 0
 
-        def on_start(self, event: object) -> None:
-            self.number += 1
-            for tell in _told[:1]:
-                tell(self.number)
+        def on_start(self, event: Any) -> None:
+            if not event.data["dispatcher"].py_func.__module__.startswith("numba."):
+                self.number += 1
+                for tell in _told[:1]:
+                    tell(self.number)
 
         def on_end(self, event: object) -> None:
             """Do nothing: the next compilation begins, or the work goes on."""

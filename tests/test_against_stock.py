@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 import trimesh
 from numpy.typing import NDArray
+from scipy.special import fresnel
 from test_crossings import BRICK, EVERY, RX, TX, meshed, of_several_materials, rooms
 from test_obstacles import low
 from test_trace import SPECULAR, _grid, _half_seen_room, _room, all_paths
 
 import sionna_partial as sp
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, SPEED_OF_LIGHT_M_S
 from sionna_partial.files import temporary_folder
+from sionna_partial.scene.scene import build_scene
 from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import MeshScene, PlanScene, write_scene_of
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
@@ -114,11 +117,12 @@ CASES = {
 }
 
 
-def both(case: Case) -> tuple[sp.TracedLinks, SolvedPaths, NDArray[np.bool_]]:
+def both(case: Case, floor_extent: str = "observed") -> tuple[sp.TracedLinks, SolvedPaths, NDArray[np.bool_]]:
     """Our links, the paths of Sionna RT in the same scene, and which of these are compared."""
     partial, offset_m = case.partial(), np.array([*case.partial().origin_m, 0.0])
     rx = case.rx[partial.radios_can_stand(case.rx)]
-    settings, scene_settings = resolved_settings(partial, case.settings, sp.SceneSettings(material=case.material))
+    scene_settings = sp.SceneSettings(material=case.material, floor_extent=floor_extent)
+    settings, scene_settings = resolved_settings(partial, case.settings, scene_settings)
     links = sp.trace_links(partial, case.tx, rx, trace_settings=settings, scene_settings=scene_settings)
     with temporary_folder() as folder:
         written = write_scene_of(partial, folder, settings, scene_settings)
@@ -152,3 +156,79 @@ def test_no_path_of_stock_is_missing(name: str) -> None:
         assert len(links.a) <= 1.001 * len(shot.a)
         assert ((links.gain_db > -150.0) == (gain_db > -150.0)).all()
         assert (np.abs(links.gain_db - gain_db) < 0.5).mean() >= 0.95
+
+
+METAL = sp.SceneSettings(floor_extent="none", material=sp.Material(1.0, 1e7, 0.1))
+OVER_AN_END = np.array([3.03, 5.51, 1.5])
+"""Transmitter, which sees the side and the end face of a wall; both meet at the edge near it [m]."""
+ONE_EDGE = sp.TraceSettings(max_depth=1, power_tolerance_db=0.0, samples_per_tx=100_000)
+WAVELENGTH_M = SPEED_OF_LIGHT_M_S / CARRIER_FREQUENCY_HZ
+
+
+def end_of_a_wall(width_m: float) -> tuple[sp.PartialMap, NDArray[np.float64]]:
+    """Return a wall of 4 m that ends in the open, and the edge of its end face away from the transmitter [m]."""
+    state = np.zeros((400, 400), np.uint8)
+    state[:200, 250 : 250 + round(width_m / 0.02)] = sp.CellState.WALL
+    partial = sp.PartialMap(state, 0.02)
+    vertices_m = build_scene(partial, METAL).vertices_m
+    return partial, vertices_m[vertices_m.sum(axis=1).argmax()]
+
+
+def around(edge_m: NDArray[np.float64], shadow_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Receivers 2 m behind the edge, by their angle in the shadow, below 0 in sight."""
+    direction = np.arctan2(*(edge_m - OVER_AN_END[:2])[::-1]) - np.radians(shadow_deg)
+    ends_m = edge_m + 2.0 * np.column_stack([np.cos(direction), np.sin(direction)])
+    return np.column_stack([ends_m, np.full(len(ends_m), 1.5)])
+
+
+def transition(x: float) -> complex:
+    """Return F(x) of Kouyoumjian and Pathak (1974), eq. 25."""
+    sine, cosine = fresnel(np.sqrt(2.0 * x / np.pi))
+    return np.sqrt(2.0 * np.pi * x) * 1j * np.exp(1j * x) * (0.5 - cosine - 1j * (0.5 - sine))
+
+
+def utd_db(edge_m: NDArray[np.float64], shadow_deg: float, reflection: float) -> float:
+    """Return the gain over the edge of 90 degrees, field along it, by eq. 17 to 26; both faces reflect that much."""
+    back = OVER_AN_END[:2] - edge_m
+    arrival, before_m, after_m = np.pi - np.arctan2(back[1], back[0]), float(np.linalg.norm(back)), 2.0
+    departure = arrival + np.pi + np.radians(shadow_deg)
+    k, n, total = 2.0 * np.pi / WAVELENGTH_M, 1.5, 0.0j
+    for angle, factor in ((departure - arrival, 1.0), (departure + arrival, reflection)):
+        for side in (1.0, -1.0):
+            a = 2.0 * np.cos(np.pi * n * np.round((angle + side * np.pi) / (2.0 * np.pi * n)) - angle / 2.0) ** 2
+            part = transition(k * before_m * after_m / (before_m + after_m) * a)
+            total += factor * part / np.tan((np.pi + side * angle) / (2.0 * n))
+    size = np.abs(total) ** 2 / (4.0 * n**2 * 2.0 * np.pi * k * before_m * after_m * (before_m + after_m))
+    return float(10.0 * np.log10((WAVELENGTH_M / 4.0 / np.pi) ** 2 * size))
+
+
+class TestEndOfAWall:
+    """The strongest path behind a wall's end, which stock misses if the end is narrow (docs/results.md)."""
+
+    @pytest.mark.parametrize("width_m", [0.08, 0.2])
+    def test_ours_is_the_closed_form(self, width_m: float) -> None:
+        """Metal faces in Sionna RT reflect less than perfect ones, and more than black ones."""
+        partial, edge_m = end_of_a_wall(width_m)
+        shadow_deg = np.array([0.01, 1.0, 3.0, 7.0, 15.0, 30.0])
+        rx = around(edge_m, np.append(shadow_deg, -0.01))
+        links = sp.trace_links(partial, OVER_AN_END, rx, trace_settings=ONE_EDGE, scene_settings=METAL)
+        assert links.path_rx.tolist() == [0, 1, 2, 3, 4, 5, 6, 6]
+        low, high = ([utd_db(edge_m, each, reflection) for each in shadow_deg] for reflection in (-1.0, 0.0))
+        assert (links.gain_db[:-1] > np.array(low)).all()
+        assert (links.gain_db[:-1] < np.array(high)).all()
+        assert (np.array(high) - np.array(low))[:3].max() < 0.8
+        field_db = 20.0 * np.log10([abs(links.a[links.path_rx == rx].sum()) for rx in (0, 6)])
+        length_m = np.linalg.norm(edge_m - OVER_AN_END[:2]) + 2.0
+        half_db = 20.0 * np.log10(WAVELENGTH_M / (4.0 * np.pi * length_m)) - 6.02
+        np.testing.assert_allclose(field_db, half_db, atol=0.1)  # continuous across the shadow boundary
+
+    @pytest.mark.parametrize(("width_m", "found"), [(0.08, False), (0.2, True)])
+    def test_stock_misses_it_over_a_narrow_face(self, width_m: float, found: bool) -> None:
+        partial, edge_m = end_of_a_wall(width_m)
+        case = Case(lambda: partial, ONE_EDGE, OVER_AN_END, around(edge_m, np.array([1.0, 7.0, 30.0])), 0)
+        links, shot, _ = both(replace(case, material=METAL.material), METAL.floor_extent)
+        over = (np.abs(shot.vertices_m[:, 0, :2] - edge_m) < 0.01).all(axis=1)
+        assert np.unique(shot.path_rx[over]).tolist() == ([0, 1, 2] if found else [])
+        assert links.path_rx.tolist() == [0, 1, 2]
+        if found:
+            np.testing.assert_allclose(shot.power[over], np.abs(links.a) ** 2, rtol=1e-3)

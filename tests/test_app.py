@@ -45,6 +45,7 @@ from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.partial_map import cell_centres_m
+from sionna_partial.plots.coverage_plot import report_figure
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -261,6 +262,37 @@ def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
     x_m = drawn["x"] + (column + 0.5) / levels.shape[1] * drawn["dw"]
     y_m = drawn["y"] + (row + 0.5) / levels.shape[0] * drawn["dh"]
     assert math.dist((x_m, y_m), (3.0, 1.0)) < 0.5
+
+
+def test_rates_of_one_and_of_interfering_transmitters(window: Window) -> None:
+    session = window.session
+    window.put((1.0, 1.0))
+    alone = window.answer.layers_of("tx1", -67.0)["rate_mbit_s"]
+    assert float(alone.max()) == pytest.approx(600.5, abs=0.1)  # MCS 11 at 80 MHz
+    session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+    window.settle()
+    assert float(window.answer.layers_of("", -67.0)["rate_mbit_s"].mean()) < 0.9 * float(alone.mean())
+    scale = window.answer.scale("rate_mbit_s", "", -67.0)
+    assert scale is not None
+    assert (scale.title, scale.names[-1]) == ("Mbit/s; wifi6, one spatial stream", "600")
+    session.look(layer="rate_mbit_s")
+    session.set(bandwidth_hz=321e6)  # no standard has it
+    assert (session.shown_view.layer, window.settle()) == ("p_above", "Ready.")
+
+
+def test_rooms_are_listed_with_their_coverage(window: Window) -> None:
+    room = np.where(ROOM == 0, 1 + (np.arange(ROOM.shape[1]) > 20), 0)
+    window.session.open_map(replace(PARTIAL, room=room.astype(np.uint8), room_names=("west", "<east>")), "rooms")
+    window.session.set(material="metal", threshold_dbm=-20.0)
+    window.put((1.0, 1.0))
+    page = Page(Document(), "/files/key")
+    page.session.partial, page.session.answer = window.session.partial, window.answer
+    page.session.settings = window.session.settings
+    page.show()
+    assert re.search(r"Rooms, the least covered first: &lt;east&gt; \d+%, west \d+%\.", page.summary.text)
+    text = report_figure(window.answer.coverage, [23.0], -20.0).axes[-1].texts[0].get_text()
+    assert re.search(r"Rooms above -20 dBm, the least covered first: <east> \d+%, west \d+%", text)
+    page.session.close()
 
 
 def test_kinds_of_access_points_keep_limits_and_weak_clients_decide(window: Window) -> None:
@@ -549,6 +581,24 @@ def picture() -> bytes:
 
 
 class TestDrawing:
+    def test_a_plan_is_shown_above_its_coverage(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
+        session, shown, figures = window.session, Picture(), list[Any]()
+        session.upload_map([("flat.png", picture())])
+        window.settle()
+        session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+        window.settle()
+        session.set(spacing_m=0.5)
+        window.put((1.0, 1.0))
+        shown.show_map(session.partial, session.plan)
+        assert (shown.ink.visible, shown.plan.visible) == (True, False)
+        monkeypatch.setattr(answer_module, "figure_png", lambda figure: figures.append(figure) or b"")
+        session.file("png")
+        (ink,) = (each for each in figures[0].axes[0].images if each.get_extent() == [0.0, 4.2, 0.0, 3.2])
+        opacity = ink.get_array()[..., 3]
+        assert opacity[150, 305] > opacity[150, 100]  # the pale line, which is no wall
+        shown.show_map(PARTIAL, None)
+        assert not shown.ink.visible
+
     def test_a_plan_gets_its_scale_from_a_known_length(self, window: Window, tmp_path: Path) -> None:
         session = window.session
         session.upload_map([("C:\\flat.PNG", picture())])

@@ -303,6 +303,15 @@ class TestAccessor:
         assert not inside["valid"].to_numpy()[~seen].any()
         assert inside.attrs["receivers"] == "indoor"
 
+    def test_receivers_far_from_free_cells_can_be_omitted(self):
+        cells = np.full((4, 12), int(CellState.UNKNOWN), dtype=np.uint8)
+        cells[:, :4] = [[1, 1, 1, 1], [1, 0, 0, 2], [1, 0, 0, 2], [1, 1, 1, 1]]
+        wide = PartialMap(cells, 1.0)
+        every, near = (predict_map(wide, (1.5, 1.5), spacing_m=0.5, receivers=name) for name in ("indoor", "near"))
+        kept = (every["valid"] & (every["x"] < 4.0)).to_numpy()
+        np.testing.assert_array_equal(near["valid"], kept)
+        np.testing.assert_array_equal(near["gain_mean_db"].to_numpy()[kept], every["gain_mean_db"].to_numpy()[kept])
+
     def test_a_weak_client_decides(self, complete, several):
         weak, strong = (complete.radio.power(eirp_dbm=23.0, client_dbm=client)["power_mean_dbm"] for client in (15, 30))
         np.testing.assert_allclose(weak, complete["gain_mean_db"] + 15.0, atol=1e-4)

@@ -4,6 +4,7 @@ import doctest
 import functools
 import pickle
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,8 @@ def searched_once() -> Iterator[None]:
     def once(search: Callable[..., Any]) -> Callable[..., Any]:
         @functools.wraps(search)
         def call(*arguments: Any, **options: Any) -> Any:
-            key = pickle.dumps((search.__name__, arguments, options))
+            fresh = [replace(each) if isinstance(each, sp.PartialMap) else each for each in arguments]
+            key = pickle.dumps((search.__name__, fresh, options))  # of maps without what earlier calls have cached
             if key not in results:
                 results[key] = search(*arguments, **options)
             return results[key]

@@ -18,6 +18,8 @@ import pytest
 from public_names import EVERY, GROUPS, TOP
 
 import sionna_partial
+from sionna_partial.display import _COMPILING
+from sionna_partial.process import _Kernel
 from sionna_partial.resources import EXTRAS
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -330,6 +332,26 @@ for name in ("", *typer.main.get_command(app).commands):
             sys.setprofile(None)
         files = {code.co_filename for code in codes if code.co_name != "<module>"}
         assert len([name for name in files if name.startswith(str(PACKAGE))]) <= 45
+
+    @pytest.mark.parametrize(("place", "frequency_hz"), [(0, 28e9), (1, 5.2e9)])
+    def test_the_first_prediction_compiles_as_many_kernels_as_its_bar_says(
+        self, place: int, frequency_hz: float, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        called: set[_Kernel] = set()
+        call = _Kernel.__call__
+        monkeypatch.setattr(_Kernel, "__call__", lambda kernel, *given: called.add(kernel) or call(kernel, *given))
+        settings = sionna_partial.TraceSettings(frequency_hz)
+        sionna_partial.predict_map(
+            ROOT / "scenes/apartment/step100/map.yaml", (7.0, 9.8), spacing_m=2.0, trace_settings=settings
+        )
+        waiting = [*called]
+        while waiting:
+            function = waiting.pop().__wrapped__  # type: ignore[attr-defined]
+            callees = map(function.__globals__.get, function.__code__.co_names)
+            waiting += (new := {each for each in callees if isinstance(each, _Kernel)} - called)
+            called |= new
+        said = [int(number) for number in re.findall(r"\d+", _COMPILING)][place]
+        assert len(called) == pytest.approx(said, rel=0.1)
 
 
 class TestPublicNames:

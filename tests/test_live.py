@@ -51,7 +51,7 @@ class TestOrder:
         assert heard.step() == [(1, False), (1, True)]
         assert heard[0].coverage.attrs["spacing_m"] == 0.8
         expected = sp.predict_map(sp.importers.map_from_occupancy(message()), TX, spacing_m=0.2)
-        assert heard[-1].coverage.identical(expected)
+        assert heard[-1].coverage.identical(expected)  # every receiver is near a free cell
         sp.save_coverage(expected, tmp_path / "cost.yaml", scene=sp.importers.map_from_occupancy(message()))
         percent = np.flipud(np.asarray(Image.open(tmp_path / "cost.pgm"))).astype(int)
         np.testing.assert_array_equal(np.where(percent == 255, -1, percent), heard[-1].cost)
@@ -60,6 +60,7 @@ class TestOrder:
         assert heard.step() == []
 
     def test_newer_map_comes_before_a_fine_answer_but_not_forever(self) -> None:
+        """The first final grid is not interrupted either: the robot has none yet."""
         heard, rooms = Heard(), [ROOM, grown(), ROOM, grown()]
         heard.live.on_map(message(rooms[0]))
         published = heard.live._publish
@@ -71,7 +72,7 @@ class TestOrder:
 
         heard.live._publish = publish  # type: ignore[assignment]
         steps = [heard.step() for _ in rooms]
-        assert steps == [[(1, False)], [(2, False), (2, True)], [(3, False)], [(4, False), (4, True)]]
+        assert steps == [[(1, False), (1, True)], [(2, False)], [(3, False), (3, True)], [(4, False), (4, True)]]
 
 
 class TestMaps:
@@ -216,7 +217,7 @@ class TestTransmitters:
 
 def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     partial = sp.load_map(Path(__file__).parents[1] / "scenes" / "apartment/step100/map.yaml")
-    heard = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0)
+    heard = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0, every_unknown=True)
     percent = np.array([0, 100, -1])[partial.state]
     sent = message(percent, at=partial.origin_m)
     sent.info.resolution = partial.resolution_m
@@ -231,6 +232,12 @@ def test_unknown_cells_have_their_own_grid_and_costs_are_no_obstacles() -> None:
     assert [*Topics(unknown=True).messages(grid)][:2] == ["/radio/tx", "/radio/tx/unknown"]
     assert list(Topics().messages(grid)) == ["/radio/tx", "/radio/tx/filter_info"]
     assert Topics(unknown=True).published({"tx": None}).keys() >= {"/radio/tx", "/radio/tx/unknown"}
+    near = Heard((7.0, 9.8, 1.5), spacing_m=1.0, threshold_db=-80.0)
+    near.live.on_map(sent)
+    near.step()
+    np.testing.assert_array_equal(near[-1].cost, grid.cost)
+    predicted, all_valid = (each.coverage["valid"].to_numpy() for each in (near[-1], grid))
+    assert predicted.sum() < 0.9 * all_valid.sum()
 
 
 class TestChangedTransmitters:
@@ -261,6 +268,8 @@ class TestChangedTransmitters:
 
     def test_an_answer_for_the_old_position_is_not_published(self) -> None:
         heard = Heard()
+        heard.live.on_map(message(grown()))
+        heard.step()
         heard.live.on_map(message())
         published = heard.live._publish
 
@@ -270,8 +279,8 @@ class TestChangedTransmitters:
                 heard.live.on_transmitter("tx", (2.5, 2.5, 1.5))
 
         heard.live._publish = publish  # type: ignore[assignment]
-        assert heard.step() == [(1, False)]
-        assert heard.step() == [(1, False), (1, True)]
+        assert heard.step() == [(2, False)]
+        assert heard.step() == [(2, False), (2, True)]
         assert heard[-1].coverage.attrs["transmitter_m"].tolist() == [2.5, 2.5, 1.5]
 
 

@@ -8,6 +8,7 @@ import xarray as xr
 
 import sionna_partial as sp
 from sionna_partial.channels.joint import JointLatents
+from sionna_partial.coverage.link_budget import schemes
 from sionna_partial.errors import OutputError, PositionError, SettingsError
 from sionna_partial.placement.several import _greedy, _swapped
 
@@ -56,6 +57,23 @@ def test_powers_of_a_complete_map_give_sinr_and_rate_by_hand() -> None:
     margin_db = 10 * np.log10(power_mw.max(axis=0) / power_mw.min(axis=0))
     np.testing.assert_allclose(network["handover_margin_db"].to_numpy()[valid], margin_db[valid], atol=1e-3)
     assert np.isnan(network["sinr_mean_db"].to_numpy()[~valid]).all()
+
+
+def test_rates_of_a_standard_are_those_of_its_schemes() -> None:
+    room = sp.PartialMap(np.pad(np.zeros((30, 40), np.uint8), 1, constant_values=1), 0.1)
+    wifi = sp.TraceSettings(5.2e9, refraction=False)
+    coverage = sp.predict_map(room, [TX["west"], (3.5, 2.5, 1.5)], spacing_m=0.5, trace_settings=wifi)
+    given = {"tx_power_dbm": -25.0, "bandwidth_hz": 80e6, "channels": ["36", "52"], "n": 2}
+    network = sp.predict_network(coverage, standard="wifi6", **given)
+    valid = np.isfinite(network["sinr_mean_db"].to_numpy())
+    sinr_db, rate = (network[name].to_numpy()[valid] for name in ("sinr_mean_db", "rate_bit_s"))
+    table = schemes("wifi6", 80e6, 5.2e9)
+    expected = [max([each.rate_bit_s for each in table if each.snr_db <= one], default=0.0) for one in sinr_db]
+    np.testing.assert_allclose(rate, expected, rtol=1e-6)
+    assert len(np.unique(rate)) > 2
+    assert network["rate_bit_s"].long_name == "mean rate of wifi6, one spatial stream"
+    with pytest.raises(SettingsError, match="bandwidth_hz"):
+        sp.predict_network(coverage, standard="wifi6", bandwidth_hz=1e8)
 
 
 def test_probabilities_agree_with_the_maps(coverage: xr.Dataset) -> None:

@@ -12,7 +12,7 @@ import sionna_partial as sp
 CELLS = {
     "map": "import sionna_partial as sp\nfrom sionna_partial.resources import scenes_folder\n"
     "partial = sp.load_map(scenes_folder() / 'apartment' / 'step100')\npartial",
-    "plot-map": "tx = (7.0, 9.8, 1.5)\nsp.plot_map(partial, tx=tx)",
+    "plot-map": "tx = (7.0, 9.8, 1.5)\nsp.plots.plot_map(partial, tx=tx)",
     "pyplot": "import sys\n'matplotlib.pyplot' in sys.modules",
     "coverage": "coverage = sp.load_coverage('coverage.nc')\ncoverage.radio",
     "plot-coverage": "sp.plots.plot_coverage(coverage)",

@@ -1,14 +1,14 @@
 """The documentation: its Python blocks run as they stand, its commands parse, and its pages lead to each other."""
 
 import json
-import os
 import re
-import subprocess
-import sys
+import runpy
+import warnings
 from pathlib import Path
 
 import ezdxf
 import laspy
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import typer
@@ -66,14 +66,23 @@ PAGES_WITH_PYTHON = tuple(page for page in PAGES if blocks(page, "python"))
 
 @pytest.mark.pages
 @pytest.mark.parametrize("page", PAGES_WITH_PYTHON, ids=lambda page: page.name)
-def test_python_blocks_run(page: Path, tmp_path: Path) -> None:
-    """In a process of their own they read `scenes/`, or a scan of the reader's; each file that they write is there."""
+def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They read `scenes/`, or a scan of the reader's; each file that they write is there.
+
+    The pages share a process, as libraries take longer to import than most pages to run: the order is checked here.
+    """
     (tmp_path / "scenes").symlink_to(scenes_folder())
     write_scans(tmp_path)
     code = "".join(blocks(page, "python"))
+    libraries = re.findall(
+        r"^ *(?:import|from) (sionna_partial|sionna|mitsuba|drjit|tensorflow|keras)\b", code, re.MULTILINE
+    )
+    assert libraries[0] == "sionna_partial"
     (tmp_path / "page.py").write_text(code, encoding="utf-8")
-    environment = os.environ | {"MPLBACKEND": "Agg", "PYTHONPATH": str(ROOT)}
-    subprocess.run([sys.executable, "page.py"], cwd=tmp_path, env=environment, check=True, capture_output=True)
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings(action="default"):
+        runpy.run_path("page.py", run_name="__main__")
+    plt.close("all")
     written = re.findall(r"(?:save\w*|animate_exploration|export_scene)\(.*?\"([^\"]+)\"\)", code)
     for name in written:
         path = tmp_path / name
@@ -129,12 +138,15 @@ def test_only_the_repository_is_installed_from() -> None:
         )
 
 
-def test_pages_named_in_code_exist() -> None:
+def test_pages_and_sections_named_in_code_exist() -> None:
     for folder in ("sionna_partial", "docs", "tests", "examples", "benchmarks"):
         for path in (ROOT / folder).rglob("*"):
             if path.suffix in (".py", ".md", ".ipynb", ".html", ".rst"):
-                for name in re.findall(r"\bdocs/[\w/]+\.\w+", path.read_text("utf-8")):
+                text = path.read_text("utf-8")
+                for name in re.findall(r"\bdocs/[\w/]+\.\w+", text):
                     assert (ROOT / name).exists(), f"{path.name} names {name}"
+                for name, section in re.findall(r"\b(docs/\w+\.md), ([A-Z][\w ]+)", text):
+                    assert section.lower().replace(" ", "-") in anchors(ROOT / name), f"{path.name} cites {section}"
 
 
 def test_notebooks_are_stored_without_outputs_and_link_to_files_and_headings() -> None:

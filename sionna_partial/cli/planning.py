@@ -2,6 +2,7 @@
 
 import itertools
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -281,6 +282,7 @@ def live(
         raise typer.BadParameter("--frequency is missing: give for example 5.2GHz, or a --connection with it.")
     last: dict[str, Any] = {}
     robot: Any = None
+    settings = replace(settings, every_unknown=topics.unknown)
     if bag is None and rosbridge:
         from sionna_partial.apps.live.topics import Rosbridge
 

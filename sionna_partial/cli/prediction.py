@@ -75,7 +75,10 @@ def predict(
     pixel: opt.Pixel = None,
     receivers: Annotated[
         str,
-        typer.Option(metavar="indoor|anywhere|inside", help="Receivers; outdoors in outage, or omitted (inside)."),
+        typer.Option(
+            metavar="indoor|anywhere|inside|near",
+            help="Receivers; outdoors in outage or omitted (inside), or within 1 m of free cells (near).",
+        ),
     ] = "indoor",
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
@@ -283,6 +286,9 @@ def network(
             show_default=False,
         ),
     ] = [],  # noqa: B006
+    standard: Annotated[
+        str, typer.Option(metavar="wifi6|wifi7|nr", help="Standard of the rate. Default: Shannon's bound.")
+    ] = "",
     spacing: Annotated[float, typer.Option(help="Distance between receivers [m].")] = 0.25,
     rx_height: opt.RxHeight = DEFAULT_HEIGHT_M,
     settings: opt.Settings,
@@ -313,9 +319,8 @@ def network(
             progress=part_of(report, 0.0, 0.8),
         )
         report(0.8, "drawing links together")
-        found = sp.predict_network(
-            coverage, tx_power_dbm=powers_dbm, channels=_parse_channels(channel), **asdict(budget)
-        )
+        given = asdict(budget) | {"channels": _parse_channels(channel), "standard": standard or None}
+        found = sp.predict_network(coverage, tx_power_dbm=powers_dbm, **given)
         with atomic_files(out) as folder:
             report(0.9, "writing")
             for name in ("coverage.nc", "coverage.html"):

@@ -12,6 +12,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import maximum_filter
 from scipy.spatial import cKDTree
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
@@ -56,7 +57,10 @@ from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
 from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
 
-RECEIVERS = ("indoor", "anywhere", "inside")
+RECEIVERS = ("indoor", "anywhere", "inside", "near")
+
+NEAR_M, NEAR_SPACINGS = 1.0, 2
+"""Distance from free cells up to which receivers are "near" [m], and at least, in spacings."""
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
 Area: TypeAlias = tuple[float, float, float, float]
@@ -147,9 +151,10 @@ def predict_map(
         transmitters farther than 0.5 m from `tx` are not used where walls are opaque; through walls they contribute to
         the material of walls and the offset of powers. Where the material is unknown, the attributes `wall_material`
         and `wall_loss_db` contain its probabilities and the expected loss of a wall.
-    receivers : {"indoor", "anywhere", "inside"}
+    receivers : {"indoor", "anywhere", "inside", "near"}
         Receivers that probabilities and gains refer to. "inside" is "indoor" without the receivers outside a complete
-        map, which are then not `valid`: faster.
+        map, and "near" is "indoor" without those farther than 1 m (two spacings, if more) from free cells; these are
+        then not `valid`: faster.
     memory_gb : float
         Memory limit of the process [GB]. Receivers are traced and predicted in blocks that fit.
     progress : bool or callable, optional
@@ -194,14 +199,13 @@ def predict_map(
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     require_choice("receivers", receivers, RECEIVERS)
     require_memory(memory_gb)
-    where = GridArea(rx_height_m, spacing_m, _checked_area(model.partial, area_m), inside=receivers == "inside")
+    where = GridArea(rx_height_m, spacing_m, _checked_area(model.partial, area_m), receivers)
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, where)
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
     maps, weights = [], []
     with reporting(progress) as report:
         report(0.0, "building the scene")
-        of_receivers = RECEIVERS[0] if where.inside else receivers
-        job = CoverageJob(model, where, of_receivers, block).with_others(transmitters, measurements)
+        job = CoverageJob(model, where, block).with_others(transmitters, measurements)
         for number, transmitter in enumerate(transmitters):
             part = part_of(report, number / len(transmitters), (number + 1) / len(transmitters))
             coverage, of_materials = job.coverage(transmitter, part)
@@ -216,12 +220,12 @@ def predict_map(
 
 @dataclass(frozen=True)
 class GridArea:
-    """Height, spacing and bounds of receivers [m]; `inside` omits those outside a complete map."""
+    """Height, spacing and bounds of receivers [m], and which they are."""
 
     rx_height_m: float
     spacing_m: float
     bounds_m: Area | None = None
-    inside: bool = False
+    receivers: str = RECEIVERS[0]
 
 
 @dataclass(frozen=True)
@@ -263,7 +267,6 @@ class CoverageJob:
 
     model: LinkModel
     area: GridArea
-    receivers: str
     block: int
     others: Mapping[str, Sequence[Assimilation]] = field(default_factory=dict)
     """Assimilated measurements of other transmitters, by the transmitter they are used for."""
@@ -278,8 +281,8 @@ class CoverageJob:
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
+        anywhere = self.area.receivers == "anywhere"
         for links in self._averaged(source, grid.rx_m, report):
-            anywhere = self.receivers == "anywhere"
             blocks.append(link_columns(links.phi, links.prediction, links.p_indoor, anywhere=anywhere))
             complete &= bool(links.complete.all())
         values = {name: np.concatenate([columns[name] for columns in blocks]) for name in blocks[0]}
@@ -288,7 +291,7 @@ class CoverageJob:
             ANTENNA: str(source.antenna),
             "rx_height_m": float(self.area.rx_height_m),
             "spacing_m": float(self.area.spacing_m),
-            "receivers": self.receivers,
+            "receivers": "anywhere" if anywhere else RECEIVERS[0],
         }
         if measured is not None and len(measured):
             attributes |= _measurement_attributes(measured, source)
@@ -506,8 +509,10 @@ def grid_receivers(model: LinkModel, tx_m: Floats, area: GridArea) -> Receivers:
     for each_m in tx_m:
         far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
     valid = far & clear_of_walls(partial, points)
-    if area.inside and partial.is_complete:
+    if area.receivers == "inside" and partial.is_complete:
         valid &= cell_state != CellState.UNKNOWN
+    elif area.receivers == "near":
+        valid &= _near_free_cells(partial, points, max(NEAR_M, NEAR_SPACINGS * area.spacing_m))
     if not far.any() and limit_m > SHORTEST_M:
         raise PositionError(
             f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
@@ -519,6 +524,13 @@ def grid_receivers(model: LinkModel, tx_m: Floats, area: GridArea) -> Receivers:
             f"spacing_m = {area.spacing_m:g}, give a smaller one."
         )
     return Receivers(x_m, y_m, cell_state, valid, points[valid])
+
+
+def _near_free_cells(partial: PartialMap, points_m: Floats, limit_m: float) -> Bools:
+    """Return which points are within a distance of free cells along x and y; all, if there are none."""
+    free, cells = partial.state == CellState.FREE, math.ceil(limit_m / partial.resolution_m)
+    near = maximum_filter(free, size=2 * cells + 1) | ~free.any()
+    return np.asarray(near[partial.cell_index(points_m)])
 
 
 def _checked_area(partial: PartialMap, area_m: ArrayLike | None) -> Area | None:

@@ -16,7 +16,7 @@ from sionna_partial.channels.joint import JointLatents
 from sionna_partial.checks import number_of, require, require_names, require_type, require_whole
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, transmitters_of
-from sionna_partial.coverage.link_budget import LinkBudget, transmit_powers_dbm
+from sionna_partial.coverage.link_budget import LinkBudget, Scheme, schemes, transmit_powers_dbm
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import LinkPrediction
@@ -56,6 +56,7 @@ def predict_network(
     load: float = 1.0,
     sinr_threshold_db: float = 0.0,
     channels: Mapping[str, Any] | Sequence[Any] | None = None,
+    standard: str | None = None,
     n: int = 100,
     seed: int = 0,
 ) -> xr.Dataset:
@@ -64,7 +65,8 @@ def predict_network(
     Links are drawn jointly (`JointLatents`), because one unseen wall blocks several of them. In each draw a receiver is
     served by the strongest transmitter, and the others on its channel interfere: ``SINR = P_b / (N + load * sum of the
     other P)``, with P = transmit power x path gain and N = -174 dBm/Hz + 10 log10(bandwidth) + noise figure. The rate
-    is bandwidth x log2(1 + SINR). A receiver at a transmitter has 0 dB.
+    is bandwidth x log2(1 + SINR), or the rate of the fastest scheme of `standard` at that SINR. A receiver at a
+    transmitter has 0 dB.
 
     Parameters
     ----------
@@ -82,6 +84,8 @@ def predict_network(
     channels : mapping or sequence, optional
         Channel of each transmitter by its name: a plan; or the channels that there are, such as ``[1, 6, 11]``, from
         which a plan with a large mean rate is proposed. Different channels do not interfere. By default all share one.
+    standard : {"wifi6", "wifi7", "nr"}, optional
+        Standard of `rate_bit_s`, as in `coverage.radio.rate`; Shannon's bound by default.
     n : int
         Number of draws, at most 1,000.
     seed : int
@@ -96,7 +100,8 @@ def predict_network(
     Raises
     ------
     SettingsError
-        For a coverage of one transmitter, a value out of range, or channels for other transmitters.
+        For a coverage of one transmitter, a value out of range, channels for other transmitters, or a bandwidth or
+        frequency that the standard lacks.
 
     Examples
     --------
@@ -115,6 +120,7 @@ def predict_network(
     coverage = coverage.transpose("tx", "y", "x", ...)
     powers_dbm = transmit_powers_dbm(tx_power_dbm, coverage.sizes["tx"])
     budget = LinkBudget(noise_figure_db, bandwidth_hz, load, sinr_threshold_db)
+    table = [] if standard is None else schemes(standard, bandwidth_hz, float(coverage.attrs["frequency_hz"]))
     require_whole("n", n, 2, MOST_DRAWS)
     require_whole("seed", seed, 0, 2**63)
     valid: Bools = np.any(coverage["valid"].to_numpy(), axis=0)
@@ -137,11 +143,15 @@ def predict_network(
         here = slice(start, start + _RECEIVERS_AT_ONCE)
         gain_db = latents.draw(every.take((slice(None), here)), tx_m, rx_m[here], n, [seed])[1]
         received_dbm = np.where(gain_db > GAIN_FLOOR_DB, gain_db, -np.inf) + powers_dbm[:, None]
-        parts.append(_statistics(received_dbm, budget, plan))
+        parts.append(_statistics(received_dbm, budget, plan, table))
     found = {name: np.concatenate([part[name] for part in parts], axis=-1) for name in VARIABLES}
     _limit_outage(found, every.p_outage)
     coverage = coverage.assign_coords(channel=("tx", plan))
-    return _labelled(coverage, found, valid, {"tx_power_dbm": powers_dbm, **asdict(budget), "draws": n, "seed": seed})
+    settings = {"tx_power_dbm": powers_dbm, **asdict(budget), "draws": n, "seed": seed}
+    network = _labelled(coverage, found, valid, settings)
+    if standard is not None:
+        network["rate_bit_s"].attrs["long_name"] = f"mean rate of {standard}, one spatial stream"
+    return network
 
 
 def require_network(network: xr.Dataset) -> None:
@@ -202,7 +212,9 @@ def _sinr(power_mw: Floats, budget: LinkBudget, plan: Sequence[str]) -> Floats:
     return np.asarray(best_mw / (noise_mw + budget.load * np.maximum(on_channel_mw - best_mw, 0.0)))
 
 
-def _statistics(received_dbm: Floats, budget: LinkBudget, plan: Sequence[str]) -> dict[str, NDArray[Any]]:
+def _statistics(
+    received_dbm: Floats, budget: LinkBudget, plan: Sequence[str], table: Sequence[Scheme]
+) -> dict[str, NDArray[Any]]:
     power_mw = 10.0 ** (received_dbm / 10.0)
     best_mw, best = power_mw.max(axis=1), power_mw.argmax(axis=1)
     received = best_mw > 0.0
@@ -212,6 +224,10 @@ def _statistics(received_dbm: Floats, budget: LinkBudget, plan: Sequence[str]) -
         sinr_db = np.maximum(10.0 * np.log10(sinr), _LOWEST_SINR_DB)
         next_mw = np.sort(power_mw, axis=1)[:, -2] if power_mw.shape[1] > 1 else np.zeros_like(best_mw)
         margin_db = 10.0 * np.log10(best_mw / np.maximum(next_mw, noise_mw))
+    rate_bit_s = budget.bandwidth_hz * np.log2(1.0 + sinr)
+    if table:
+        lowest_db, rates = np.array(table).T
+        rate_bit_s = np.insert(rates, 0, 0.0)[np.searchsorted(lowest_db, sinr_db, side="right")]
     count = power_mw.shape[1]
     p_best = np.stack([((best == number) & received).mean(axis=0) for number in range(count)])
     return {
@@ -221,7 +237,7 @@ def _statistics(received_dbm: Floats, budget: LinkBudget, plan: Sequence[str]) -
         "sinr_mean_db": sinr_db.mean(axis=0),
         "sinr_p10_db": np.percentile(sinr_db, 10.0, axis=0),
         "p_sinr_above": (sinr_db > budget.sinr_threshold_db).mean(axis=0),
-        "rate_bit_s": budget.bandwidth_hz * np.log2(1.0 + sinr).mean(axis=0),
+        "rate_bit_s": rate_bit_s.mean(axis=0),
         "handover_margin_db": np.where(received, np.maximum(margin_db, 0.0), 0.0).mean(axis=0),
     }
 

@@ -20,10 +20,11 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import distance_transform_edt, maximum_filter
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.coverage.dataset import (
+    FLOORS,
     TX_COORDINATES,
     WALL_PARTS,
     probability_above,
@@ -36,6 +37,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.style import (
     FAILS,
+    INK,
     STAR,
     STATE_COLOURS,
     Figure,
@@ -60,7 +62,7 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
-_REPORT_LINE_IN, _REPORT_WIDTH, _BESIDE_IN, _BELOW_IN = 0.14, 124, (1.1, 0.45), (0.5, 1.0)
+_REPORT_LINE_IN, _REPORT_WIDTH, _MOST_ROOMS, _BESIDE_IN, _BELOW_IN = 0.14, 124, 12, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
 
@@ -438,12 +440,28 @@ def _draw_names(axis: Axes, coverage: xr.Dataset) -> None:
 
 
 def plot_layer(
-    coverage: xr.Dataset, one: xr.Dataset, layer: Layer, outline: Outline | None, partial: PartialMap, title: str
+    coverage: xr.Dataset,
+    one: xr.Dataset,
+    layer: Layer,
+    outline: Outline | None,
+    partial: PartialMap,
+    title: str,
+    plan: tuple[States, tuple[float, float]] | None = None,
 ) -> Figure:
-    """Draw a layer of `one` (y, x) with all transmitters of `coverage`, as on the page of the app."""
+    """Draw a layer of `one` (y, x) with all transmitters of `coverage`, as on the page of the app.
+
+    `plan` has shades (rows, columns) of a floor plan, and its width and height [m].
+    """
     aspect = one.sizes["x"] / one.sizes["y"]
     figure, ((axis,),) = _panels(1, 1, aspect, keys_in=1.2)
     _draw(axis, one, layer, halo_px=1)
+    if plan is not None:
+        shade, (width_m, height_m) = plan
+        picture = np.zeros((*shade.shape, 4), dtype=np.uint8)
+        picture[..., 3] = np.array(INK)[shade]
+        limits = axis.get_xlim(), axis.get_ylim()
+        axis.imshow(picture, extent=(0.0, width_m, 0.0, height_m), zorder=1.5)
+        axis.set(xlim=limits[0], ylim=limits[1])
     handles: list[Line2D | Patch] = [Line2D([], [], label="transmitter", **_STAR), *_draw_named_walls(axis, partial)]
     handles += [Patch(facecolor="black", label="wall")] if wall_cells(one).any() else []
     handles += outline.draw(axis, one) if outline else []
@@ -602,6 +620,7 @@ def _report_table(
         x, y, z = one.attrs["transmitter_m"]
         rows.append(f"{name[:_ROW_NAME]} at ({x:z.2f}, {y:z.2f}, {z:z.2f}) m, {power_dbm:g} dBm")
     rows += ["any transmitter"] if len(maps) > 1 else []
+    rooms = room_fractions(coverage, threshold_dbm, powers_dbm)[:_MOST_ROOMS]
     rows = [row.ljust(max(map(len, rows))) for row in rows]
     for level_dbm in threshold_dbm + _REPORTED_DB:
         given: Any = {"probability": _LIKELY, "eirp_dbm": powers_dbm}
@@ -609,7 +628,19 @@ def _report_table(
         together = coverage.radio.area(level_dbm, any_transmitter=True, **given)["fraction"].to_numpy()
         cells = [f"{seen:.0%} /{every:>4.0%}" for seen, every, *_ in (*area, together)]
         rows = [row + cell.rjust(13) for row, cell in zip(rows, [f"{level_dbm:g} dBm", *cells], strict=False)]
+    if rooms:
+        each = ", ".join(f"{name} {fraction:.0%}" for name, fraction in rooms)
+        of_rooms = f"Rooms above {threshold_dbm:g} dBm, the least covered first: {each}"
+        rows += ["", textwrap.fill(of_rooms, _REPORT_WIDTH)]
     return "\n".join(rows)
+
+
+def room_fractions(coverage: xr.Dataset, threshold_dbm: float, powers_dbm: ArrayLike) -> list[tuple[str, float]]:
+    """Return the rooms of a map of named transmitters and their covered fractions, the least covered first."""
+    area = coverage.radio.area(threshold_dbm, probability=_LIKELY, eirp_dbm=powers_dbm, any_transmitter=True)
+    of_rooms = area["fraction"].isel(floor=slice(len(FLOORS), None))
+    rooms = zip(map(str, of_rooms["floor"].to_numpy()), of_rooms.to_numpy().tolist(), strict=True)
+    return sorted([room for room in rooms if np.isfinite(room[1])], key=lambda room: room[1])
 
 
 def _report_notes(coverage: xr.Dataset, partial: PartialMap | None) -> list[str]:
@@ -684,11 +715,12 @@ def plot_network(network: xr.Dataset) -> Figure:
     bar = figure.colorbar(ScalarMappable(norm, servers), ax=axes[0, 0], ticks=range(len(names)))
     bar.ax.set_yticklabels(names, parse_math=False)
     threshold_db = float(network.attrs["sinr_threshold_db"])
+    rate_name = str(network["rate_bit_s"].attrs.get("long_name", "mean rate")).capitalize()
     top_bit_s = float(np.nanmax(network["rate_bit_s"])) / 1e6 if np.isfinite(network["rate_bit_s"]).any() else 1.0
     layers = (
         (axes[0, 1], "sinr_mean_db", 1.0, Normalize(-20.0, 40.0), "Mean SINR [dB]"),
         (axes[1, 0], "p_sinr_above", 1.0, Normalize(0.0, 1.0), f"P(SINR > {threshold_db:g} dB)"),
-        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), "Mean Shannon rate [Mbit/s]"),
+        (axes[1, 1], "rate_bit_s", 1e-6, Normalize(0.0, top_bit_s), f"{rate_name} [Mbit/s]"),
     )
     for axis, name, scale, norm, title in layers:
         _draw_network(axis, network, scale * network[name].to_numpy(), "viridis", norm)

@@ -12,6 +12,7 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, Normalize, to_hex
+from numpy.typing import ArrayLike
 
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION, transmitters_of
 from sionna_partial.plots.coverage_plot import (
@@ -143,6 +144,7 @@ def radio_layers(servers: int) -> dict[str, Layer]:
         "power_mean_dbm": ("Mean received power", *level),
         "snr_mean_db": ("Mean SNR", *ratio),
         "p_above": ("P(power > threshold)", Normalize(0.0, 1.0), "cividis", "probability"),
+        "rate_mbit_s": ("Mean rate", Normalize(0.0, 1000.0), "viridis", "Mbit/s"),
         "sinr_mean_db": ("Mean SINR of the strongest", *ratio),
         "best_server": ("Strongest transmitter", numbers, ListedColormap(server_colours(servers)), ""),
     }
@@ -160,8 +162,16 @@ def server_codes(count: int) -> list[str]:
 
 def level_codes(below: int, above: int) -> list[str]:
     """Return CSS colours for steps below and above a threshold, with a break between them."""
-    steps = [*np.linspace(0.0, 0.3, below), *np.linspace(0.6, 1.0, above)]
-    return [to_hex(colour) for colour in colormaps["viridis"](steps)]
+    return _viridis([*np.linspace(0.0, 0.3, below), *np.linspace(0.6, 1.0, above)])
+
+
+def step_codes(count: int) -> list[str]:
+    """Return CSS colours for equal steps."""
+    return _viridis(np.linspace(0.0, 1.0, count))
+
+
+def _viridis(parts: ArrayLike) -> list[str]:
+    return [to_hex(colour) for colour in colormaps["viridis"](parts)]
 
 
 def _empty_plot(coverage: xr.Dataset) -> Any:

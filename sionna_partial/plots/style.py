@@ -49,6 +49,9 @@ _OTHER_MATERIAL = "#004488"
 FAILS = "#d4145a"
 """Colour of the hatching where the threshold is not exceeded."""
 
+INK = tuple(round(0.7 * (255 - shade)) for shade in range(256))
+"""Opacities of black, by the shade of a floor plan's picture above a coverage."""
+
 _POINTS = 72
 """Pixels of a notebook per inch."""
 

@@ -49,7 +49,7 @@ _FIRST, _LEAST = -1.5, -4.0
 
 _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
 """Width of the unknown border around known cells [m]; cells at the border of an image that are blurred, and left out;
-cells joined by pooling. Images are centred on the known cells, so that the result does not depend on grid and origin.
+cells joined by pooling. Images are centred on the mean known cell, so that grid, origin and far cells do not matter.
 """
 
 _LINES_AT_ONCE = 4096
@@ -166,10 +166,13 @@ class UnseenWalls(NamedTuple):
     def of_map(self, partial: PartialMap) -> WallDensity:
         known = _known_part(partial)
         x0, y0, x1, y1 = known.bounds_m
-        corner_m, half_m = np.array([x0, y0]), 0.5 * np.array([x1 - x0, y1 - y0])
-        groups = np.ceil(np.round((half_m + _BORDER_M) / (0.5 * _POOLED * CELL_M), 6))  # to either side, of half a pool
-        nx, ny = (groups * _POOLED).astype(int).tolist()
-        start_m = corner_m + half_m - 0.5 * _POOLED * CELL_M * groups
+        corner_m, end_m, cells = np.array([x0, y0]), np.array([x1, y1]), np.argwhere(known.state != CellState.UNKNOWN)
+        middle = cells.mean(axis=0) + 0.5 if len(cells) else 0.5 * np.array(known.shape)
+        middle_m = corner_m + known.resolution_m * middle[::-1]
+        half_m = np.maximum(middle_m - corner_m, end_m - middle_m) + _BORDER_M
+        pools = np.ceil(np.round(half_m / (_POOLED * CELL_M), 6))
+        nx, ny = (2 * pools * _POOLED).astype(int).tolist()
+        start_m = middle_m - _POOLED * CELL_M * pools
         image = map_image(known, (ny, nx), np.round((start_m - corner_m) / known.resolution_m, 6))
         per_m = _symmetric_walls(self.cells, image[None].astype(np.float32))
         inner = slice(_BLURRED_CELLS, -_BLURRED_CELLS)

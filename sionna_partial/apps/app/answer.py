@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from sionna_partial.apps.app.drawing import Plan
 from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Checked, require_choice
@@ -15,7 +16,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import Outline, Scale, plot_layer
-from sionna_partial.plots.coverage_viewer import STATES, level_codes, radio_layers, server_codes
+from sionna_partial.plots.coverage_viewer import STATES, level_codes, radio_layers, server_codes, step_codes
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
 from sionna_partial.prediction.predictor import LinkPrediction
 
@@ -30,11 +31,16 @@ LAYERS = radio_layers(MOST_TRANSMITTERS)
 NETWORK_LAYERS = ("sinr_mean_db", "best_server")
 """Layers of several transmitters alone."""
 
+RATE = "rate_mbit_s"
+"""Layer of frequencies and bandwidths that a standard has."""
+
 LEVELS = ("power_mean_dbm", "gain_mean_db", "snr_mean_db")
 """Layers whose scales follow the threshold."""
 
 _STEP_DB, _BELOW, _ABOVE = 5.0, 6, 8
 """Steps of scales [dB], and their number below and above the threshold."""
+
+_RATE_STEPS = 10
 
 
 @dataclass(frozen=True)
@@ -79,7 +85,12 @@ class Answer:
         above = LinkPrediction.of_columns(lambda each: coverage[each].to_numpy()).probability_above(threshold_db)
         above = above[names.index(name)] if name in names else np.fmax.reduce(above, axis=0)  # of any transmitter
         found: dict[str, Any] = {"p_above": (("y", "x"), above)}
+        standard, _ = self.settings.schemes
+        if standard and len(names) == 1:
+            rate = radio.rate(standard, eirp_dbm=eirp_dbm, bandwidth_hz=self.settings.bandwidth_hz)
+            found[RATE] = rate.isel(tx=0, drop=True) / 1e6
         if self.network is not None:
+            found |= {RATE: self.network["rate_bit_s"] / 1e6} if standard else {}
             found |= {"best_server": (("y", "x"), best), "sinr_mean_db": self.network["sinr_mean_db"]}
         return one.assign(found)
 
@@ -95,6 +106,11 @@ class Answer:
         if layer == "link_state":
             codes = [STATE_COLOURS[state] for state in sorted(STATE_COLOURS)]
             return Scale(codes, -0.5, len(codes) - 0.5, [*range(len(codes))], STATES, LAYERS[layer].title)
+        standard, table = self.settings.schemes
+        if layer == RATE and table:
+            ticks = np.linspace(0.0, table[-1].rate_bit_s / 1e6, _RATE_STEPS + 1).tolist()
+            title = f"Mbit/s; {standard}, one spatial stream"
+            return Scale(step_codes(_RATE_STEPS), 0.0, ticks[-1], ticks, [f"{tick:.0f}" for tick in ticks], title)
         if layer not in LEVELS:
             return None
         eirp_dbm = self.eirp_dbm[names.index(name)] if name in names else self.eirp_dbm.max()
@@ -110,7 +126,7 @@ class Answer:
         title = LAYERS[view.layer].title.replace("threshold", f"{threshold_dbm:g} dBm")
         if view.transmitter or len(self.eirp_dbm) > 1:
             of_all = "any transmitter" if view.layer == "p_above" else "the strongest transmitter"
-            title += f", {view.transmitter or of_all}" if view.layer not in ("best_server", "sinr_mean_db") else ""
+            title += f", {view.transmitter or of_all}" if view.layer not in (*NETWORK_LAYERS, RATE) else ""
         if not self.is_final:
             return f"{title} (coarse)"
         return title + (", the whole home" if self.truth is not None else ", the partial map") * view.truth
@@ -139,12 +155,15 @@ class Answer:
         return float((states[0] == states[1]).mean()), math.sqrt(float(np.mean((gains_db[0] - gains_db[1]) ** 2)))
 
 
-def answer_png(answer: Answer, view: View, threshold_dbm: float, partial: PartialMap, title: str) -> bytes:
-    """Return the picture of the page as PNG."""
+def answer_png(
+    answer: Answer, view: View, threshold_dbm: float, partial: PartialMap, title: str, plan: Plan | None = None
+) -> bytes:
+    """Return the picture of the page as PNG, with the floor plan that it shows."""
     name = view.transmitter
     one = answer.layers_of(name, threshold_dbm, truth=view.truth)
     layer, scale = LAYERS[view.layer], answer.scale(view.layer, name, threshold_dbm)
     layer = scale.of(layer) if scale else layer
     layer = replace(layer, title=answer.title(view, threshold_dbm))
-    figure = plot_layer(answer.coverage, one, layer, answer.outline(view, one, threshold_dbm), partial, title)
+    outline, drawn = answer.outline(view, one, threshold_dbm), None if plan is None else (plan.shade, plan.size_m)
+    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn)
     return figure_png(figure)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.apps.app.answer import LAYERS, LIKELY, NETWORK_LAYERS, OUTLINES, Answer
+from sionna_partial.apps.app.answer import LAYERS, LIKELY, OUTLINES, Answer
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
 from sionna_partial.apps.app.files import FILES
 from sionna_partial.apps.app.picture import Picture
@@ -18,6 +18,7 @@ from sionna_partial.apps.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, 
 from sionna_partial.apps.app.session import MORE_STEPS, ROUNDING_M, Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.coverage_plot import room_fractions
 from sionna_partial.plots.coverage_viewer import server_codes
 from sionna_partial.plots.style import material_colour
 from sionna_partial.resources import demo_homes
@@ -40,6 +41,9 @@ _FILE_NAMES = {
     "pdf": "Report (PDF)",
     "project": "Save the project",
 }
+
+_NARROW: dict[str, Any] = {"max_width": 128}
+"""Width of fields beside longer texts, which would be cut off on a phone [pixels]."""
 
 _AREA_HINT = "Drag around the area, or click on its corners and double-click on the last one."
 _UPLOAD = "document.getElementById(id).click()"
@@ -87,10 +91,10 @@ class Page:
 
         session, transmitter = self.session, lambda name: self.session.look(transmitter=name)
         self.layer = self._on(
-            Select(title="Layer", name="layer", value="p_above", options=self._options(1)),
+            Select(title="Layer", name="layer", value="p_above", options=self._options()),
             lambda name: session.look(layer=name),
         )
-        self.which = self._on(Select(title="Shown for", value=""), transmitter)
+        self.which = self._on(Select(title="Shown for", value="", **_NARROW), transmitter)
         self.truth = self._on(
             Select(title="Computed for", value="", options=list[Any](_COMPUTED_FOR.items())),
             lambda value: session.look(truth=bool(value)),
@@ -100,7 +104,13 @@ class Page:
             lambda value: session.set(threshold_dbm=float(value)),
         )
         self.outline = self._on(
-            Select(title="Line at the threshold", name="outline", value="p_above", options=list[Any](OUTLINES.items())),
+            Select(
+                title="Line at the threshold",
+                name="outline",
+                value="p_above",
+                options=list[Any](OUTLINES.items()),
+                max_width=148,
+            ),
             lambda name: session.look(outline=name),
         )
         presets: list[Any] = [("", "own values"), *((name, name) for name in PRESETS)]
@@ -167,7 +177,7 @@ class Page:
         models: list[Any] = [(name, name or "own power") for name in MODELS]
         self.model = self._on(Select(title="Kind", name="model", options=models), lambda name: self._change(model=name))
         self.channel = self._on(
-            Select(title="Channel", name="channel", value=""), lambda name: self._change(channel=name)
+            Select(title="Channel", name="channel", value="", **_NARROW), lambda name: self._change(channel=name)
         )
         self.goal = Spinner(title="Covered floor [%]", name="goal", low=1, high=100, step=1, value=95)
         self.most = Spinner(title="At most", name="most", low=1, high=MOST_TRANSMITTERS, step=1, value=4)
@@ -178,7 +188,7 @@ class Page:
         )
         self.aims = {
             name: self._on(
-                Spinner(title=title, name=name, step=5, low=low, high=high, format="0.[0]"),
+                Spinner(title=title, name=name, step=5, low=low, high=high, format="0.[0]", max_width=80),
                 functools.partial(self._change_antenna, name),
                 "value_throttled",
             )
@@ -489,7 +499,7 @@ class Page:
         self.channel.value, self.channel.disabled = chosen.channel if chosen else "", chosen is None
         self.plan_channels.visible = len(names) > 1
         options = [("", _STRONGEST)] * (len(names) != 1) + [(name, name) for name in names]
-        self.which.options, self.layer.options = options, self._options(len(names))
+        self.which.options, self.layer.options = options, self._options()
         view = session.shown_view
         self.which.value = view.transmitter if len(names) != 1 else names[0]
         self.layer.value, self.outline.value, self.truth.value = view.layer, view.outline, "1" * view.truth
@@ -528,8 +538,8 @@ class Page:
                 lines.append(([each.x_m, ends[0]], [each.y_m, ends[1]]))
         return {"xs": [xs for xs, _ in lines], "ys": [ys for _, ys in lines]}
 
-    def _options(self, transmitters: int) -> list[Any]:
-        return [(name, layer.title) for name, layer in LAYERS.items() if transmitters > 1 or name not in NETWORK_LAYERS]
+    def _options(self) -> list[Any]:
+        return [(name, LAYERS[name].title) for name in self.session.layers]
 
     def _show_answer(self) -> None:
         session, answer, partial = self.session, self.session.answer, self.session.partial
@@ -545,7 +555,8 @@ class Page:
         self.links.text = " ".join(links) if partial is not None else ""
         title = "Map" if answer is None else answer.title(view, threshold_dbm)
         settings = session.settings if answer is None else answer.settings
-        self.picture.plot.title.text = title if partial is None else f"{title}\n{settings.text(partial)}"
+        text = " " if partial is None else settings.text(partial)
+        self.picture.plot.title.text = f"{title}\n{text}"  # two lines always: their space is found once
 
     def _show_values(self) -> None:
         answer, threshold_dbm = self.session.answer, self.session.settings.threshold_dbm
@@ -605,6 +616,10 @@ def _summary(answer: Answer, threshold_dbm: float) -> str:
         for name, seen, every in rows
     )
     text = f"Above {threshold_dbm:g} dBm with probability {LIKELY:g}: {'; '.join(fractions)}."
+    rooms = room_fractions(answer.coverage, threshold_dbm, answer.eirp_dbm)
+    if rooms:
+        each = ", ".join(f"{html.escape(room)} {fraction:.0%}" for room, fraction in rooms)
+        text += f" Rooms, the least covered first: {each}."
     found = answer.agreement()
     if found is not None:
         text += f" Against the whole home: link state right on {found[0]:.0%} of its floor, RMSE {found[1]:.1f} dB."

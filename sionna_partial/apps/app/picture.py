@@ -9,7 +9,7 @@ from contourpy import contour_generator
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.apps.app.answer import LAYERS, LEVELS, Answer, View
+from sionna_partial.apps.app.answer import LAYERS, LEVELS, RATE, Answer, View
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
 from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
@@ -17,7 +17,7 @@ from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import Outline, extent_m, outside, to_the_edge
 from sionna_partial.plots.coverage_viewer import STATES, add_layer
-from sionna_partial.plots.style import FAILS, material_colour
+from sionna_partial.plots.style import FAILS, INK, material_colour
 
 _UNSELECT = "points.selection_manager.clear()"
 """Otherwise the next drag would move a clicked transmitter as well."""
@@ -54,6 +54,7 @@ _TOOLTIPS = (
     ("received power", "@power_mean_dbm{0.0} dBm"),
     ("SNR", "@snr_mean_db{0.0} dB"),
     ("P(above threshold)", "@p_above{0.00}"),
+    ("mean rate", "@rate_mbit_s{0} Mbit/s"),
 )
 _GROUND = ("#ffffff", "#000000", "#b9bec4", "#e4e6e9", "#ffffff")
 _WALLS = ("#00000000", "#000000", "#00000000", "#ffffff60", "#ffffffcc")
@@ -94,6 +95,7 @@ class Picture:
             sizing_mode="stretch_both",
             x_axis_label="x [m]",
             y_axis_label="y [m]",
+            title="Map\n ",
             tools="pan,wheel_zoom,box_zoom,reset",
             active_drag=None,
             active_scroll=None,
@@ -116,8 +118,10 @@ class Picture:
         for name, (_, bar) in self.parts.items():
             bar.height, bar.padding, bar.title_standoff = 10, 3, 2
             bar.title = bar.title or LAYERS[name].title  # bars of one height
-            if name in LEVELS:
+            if name in (*LEVELS, RATE):
                 bar.ticker = FixedTicker()
+        clear = LinearColorMapper(palette=[f"#000000{alpha:02x}" for alpha in INK], low=0, high=len(INK) - 1)
+        self.ink = plot.image(image="cells", source=self.shades, color_mapper=clear, visible=False, **where)
         hatch: dict[str, Any] = {"hatch_pattern": "left_diagonal_line", "hatch_color": FAILS, "hatch_weight": 1.5}
         look: dict[str, Any] = {"fill_color": FAILS, "fill_alpha": 0.01, "line_color": None, **hatch}
         fails = plot.multi_polygons("xs", "ys", source=self.fails, hatch_scale=14, **look)  # no fill hides hatches
@@ -143,6 +147,7 @@ class Picture:
             "unseen": LegendItem(label={"value": "not observed"}, renderers=[unseen]),
         }
         look: dict[str, Any] = {"orientation": "horizontal", "border_line_color": None, "padding": 0, "margin": 2}
+        look["spacing"] = 10
         plot.add_layout(Legend(items=[*self.keys.values()], label_text_font_size="12px", **look), "above")
 
     def _add_marks(self) -> None:
@@ -215,7 +220,7 @@ class Picture:
             shade = np.flipud(ndimage.minimum_filter(plan.shade, merge)[::merge, ::merge])
             self.shades.data = {"cells": [shade], "x": [0.0], "y": [0.0], "dw": [width_m], "dh": [height_m]}
             self.wall_shades.low = plan.threshold + 1
-        self.plan.visible = plan is not None and not has_map
+        self.plan.visible, self.ink.visible = plan is not None and not has_map, plan is not None and has_map
 
     def show_answer(self, answer: Answer | None, view: View, threshold_dbm: float) -> None:
         """Draw the layers of a view."""

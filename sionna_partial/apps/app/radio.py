@@ -2,6 +2,7 @@
 
 import math
 import re
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Annotated, NamedTuple
 
@@ -9,12 +10,20 @@ import numpy as np
 
 from sionna_partial.checks import Checked, Within, require, require_choice
 from sionna_partial.constants import DEFAULT_HEIGHT_M
-from sionna_partial.coverage.link_budget import ACCESS_POINTS, EIRP_LIMITS, access_point_eirp_dbm, access_point_gain_dbi
+from sionna_partial.coverage.link_budget import (
+    ACCESS_POINTS,
+    EIRP_LIMITS,
+    Scheme,
+    access_point_eirp_dbm,
+    access_point_gain_dbi,
+    schemes,
+)
+from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap, nearest_free_m
 from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings, material_name
 from sionna_partial.tracing.antennas import Antenna
 
-MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS, _LONGEST_CHANNEL = 10, 1000, 30_000, 8
+MOST_TRANSMITTERS, _NEAREST_CELLS, _MOST_RECEIVERS, _LONGEST_CHANNEL = 10, 1000, 10_000, 8
 
 FINEST_M = 0.15
 """Default spacing of receivers [m]."""
@@ -126,6 +135,14 @@ class RadioSettings(Checked):
         """Name of the preset with this frequency and bandwidth, "" for none."""
         own = self.frequency_hz, self.bandwidth_hz
         return next((name for name, preset in PRESETS.items() if preset[:2] == own), "")
+
+    @property
+    def schemes(self) -> tuple[str, list[Scheme]]:
+        """Standard of the rates and its schemes, or "" and none for other frequencies and bandwidths."""
+        for standard in ("wifi6", "nr"):
+            with suppress(SettingsError):
+                return standard, schemes(standard, self.bandwidth_hz, self.frequency_hz)
+        return "", []
 
     @property
     def channels(self) -> tuple[str, ...]:

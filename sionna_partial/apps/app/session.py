@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from sionna_partial.apps.app.answer import NETWORK_LAYERS, Answer, View, answer_png
+from sionna_partial.apps.app.answer import LAYERS, NETWORK_LAYERS, RATE, Answer, View, answer_png
 from sionna_partial.apps.app.drawing import LENGTH, STROKES, Plan, Source, Stroke, drawn, read_again, uploaded_source
 from sionna_partial.apps.app.files import (
     FILES,
@@ -335,10 +335,17 @@ class Session(WindowJobs):
             self.predict()
 
     @property
+    def layers(self) -> list[str]:
+        """Layers of these transmitters and settings."""
+        lacking = () if len(self.transmitters) > 1 else NETWORK_LAYERS
+        lacking = lacking if self.settings.schemes[0] else (*lacking, RATE)
+        return [name for name in LAYERS if name not in lacking]
+
+    @property
     def shown_view(self) -> View:
         """The view, with what there is."""
         several = len(self.transmitters) > 1
-        layer = self.view.layer if several or self.view.layer not in NETWORK_LAYERS else View.layer
+        layer = self.view.layer if self.view.layer in self.layers else View.layer
         name = self.view.transmitter if several and self.view.transmitter in self.transmitters else ""
         return replace(self.view, layer=layer, transmitter=name, truth=self.view.truth and self.home is not None)
 
@@ -432,7 +439,11 @@ class Session(WindowJobs):
             if len(tx_m) > 1:
                 report(0.7, "SINR of the network")
                 network = predict_network(
-                    found, tx_power_dbm=eirp_dbm, bandwidth_hz=settings.bandwidth_hz, channels=channels
+                    found,
+                    tx_power_dbm=eirp_dbm,
+                    bandwidth_hz=settings.bandwidth_hz,
+                    channels=channels,
+                    standard=settings.schemes[0] or None,
                 )
                 answer = replace(answer, network=network)
             yield functools.partial(self._take_answer, answer)
@@ -525,10 +536,8 @@ class Session(WindowJobs):
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.2, "planning channels")
             powers_dbm = network.attrs["tx_power_dbm"]
-            bandwidth_hz = settings.bandwidth_hz
-            found = predict_network(
-                answer.coverage, tx_power_dbm=powers_dbm, bandwidth_hz=bandwidth_hz, channels=channels
-            )
+            given = {"bandwidth_hz": settings.bandwidth_hz, "standard": settings.schemes[0] or None}
+            found = predict_network(answer.coverage, tx_power_dbm=powers_dbm, channels=channels, **given)
             yield functools.partial(take, found)
 
         self.begin(work)
@@ -612,9 +621,8 @@ class Session(WindowJobs):
         threshold_dbm = self.settings.threshold_dbm
         text = answer.settings.text(self._map())
         if kind == "png":
-            return answer_png(
-                answer, self.shown_view, threshold_dbm, self._map(), f"{PurePath(self.title).name}\n{text}"
-            )
+            title = f"{PurePath(self.title).name}\n{text}"
+            return answer_png(answer, self.shown_view, threshold_dbm, self._map(), title, self.plan)
         heading = self.title, f"{answer.made:%Y-%m-%d}", text
         return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=self._map())
 

@@ -95,6 +95,8 @@ class LiveSettings(Checked):
         Time between two lists of next views [s]; 0 lists them on request only.
     max_cost : int
         Largest value of a published grid [percent]: nav2 reads 99 as an inscribed obstacle and 100 as an obstacle.
+    every_unknown : bool
+        Whether final grids have all unknown cells; by default those within 1 m (two spacings, if more) of free ones.
 
     Examples
     --------
@@ -111,6 +113,7 @@ class LiveSettings(Checked):
     refresh_s: Annotated[float, Within(0.1, 1e6)] = 10.0
     views_every_s: Annotated[float, Within(0.0, 1e6)] = 0.0
     max_cost: Annotated[int, Within(1, 100)] = MAX_COST
+    every_unknown: bool = False
 
 
 class _NewerMap(Exception):
@@ -194,7 +197,7 @@ class LiveCoverage:
         self._closed = False
         self._newest: MapMessage | None = None
         self._waiting: MapMessage | None = None
-        self._answered, self._gave_way, self._stepped_s = 0, False, -math.inf
+        self._answered, self._gave_way, self._stepped_s = 0, True, -math.inf  # the first final grid gives no way
         self.frame = self.settings.frame.lstrip("/")
         self._pose: tuple[float, float, float] | None = None
         self._powers: dict[str, dict[tuple[int, int], tuple[float, float, float]]] = {name: {} for name in self.tx_m}
@@ -445,6 +448,7 @@ class LiveCoverage:
             spacing_m=self.settings.spacing_m * (1 if is_final else COARSER),
             rx_height_m=self.settings.rx_height_m,
             area_m=grid.partial.bounds_m,
+            receivers="near" if is_final and not self.settings.every_unknown else "indoor",
             measurements=measured,
             progress=report,
         )
