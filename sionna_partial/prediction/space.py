@@ -1,6 +1,6 @@
 """Fields of the known and unknown space of a map: exposure to unobserved space, routes between points, images.
 
-Fields live on cells of 0.3 m that are centred on the mean known cell of the map, so that neither the grid of the map nor its
+Fields live on cells of 0.3 m that are centred on the known part of the map, so that neither the grid of the map nor its
 origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
 
 - exposure: probability that a walk from a point, of mean length `WALK_M`, ends in unobserved space.
@@ -71,11 +71,11 @@ class MapSpace:
     def __init__(self, partial: PartialMap) -> None:
         known = np.argwhere(partial.state != CellState.UNKNOWN)
         self._is_empty = len(known) == 0
-        known = known if len(known) else np.full((1, 2), -0.5)
-        centre = known.mean(axis=0) + 0.5  # of mass: one more cell hardly moves it
+        ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
+        centre = 0.5 * (ends[0] + ends[1])
         self._cells = CELL_M / partial.resolution_m
-        half = (np.abs(known + 0.5 - centre).max(axis=0) + 0.5) / self._cells + MARGIN_CELLS
-        half_counts = (np.ceil(half / POOLED_CELLS - 1e-9) * POOLED_CELLS).astype(int)
+        half = 0.5 * (ends[1] - ends[0]) / self._cells + MARGIN_CELLS
+        half_counts = (np.ceil(half / (POOLED_CELLS / 2) - 1e-9) * (POOLED_CELLS / 2)).astype(int)
         self.shape = tuple((2 * half_counts).tolist())
         first = centre - half_counts * self._cells
         self.corner_m = np.array(partial.origin_m) + partial.resolution_m * first[::-1]
