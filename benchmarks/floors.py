@@ -30,7 +30,7 @@ def main() -> None:
     parser.add_argument("dataset", type=Path)
     parser.add_argument("predictors", nargs="*", help="in addition to the shipped ones")
     arguments = parser.parse_args()
-    links = sp.read_dataset(arguments.dataset)
+    links = sp.lab.read_dataset(arguments.dataset)
     links = links.take(~links.anywhere)
     found = {name: sp.Predictor.load(name).predict(links.phi) for name in ("map", "paper", *arguments.predictors)}
     groups = {"all links": np.ones(len(links.home), dtype=bool)}

@@ -7,6 +7,11 @@ prints the table of docs/live.md: the shipped apartment, and a hall of 30 x 15 m
     .venv/bin/python benchmarks/live.py --depot ../shared/slam/depot.yaml
 
 prints every update of a robot with a lidar of 8 m that maps a whole depot.
+
+    .venv/bin/python benchmarks/live.py --growing --frequency 5.2
+
+prints the processor time of a new process on the apartment as it grows, with one thread if OMP_NUM_THREADS and
+NUMBA_NUM_THREADS are 1.
 """
 
 import argparse
@@ -94,21 +99,32 @@ def depot_maps(path: Path, steps: range) -> list[sp.PartialMap]:
     return sp.explore(whole, steps=[*steps], sensor=sp.SensorSettings(field_of_view_deg=360.0, range_m=8.0))
 
 
-def drive(maps: list[sp.PartialMap], spacing_m: float) -> None:
+def drive(maps: list[sp.PartialMap], spacing_m: float, frequency_hz: float) -> None:
     """Print time and memory of every update of a robot that maps a building."""
     grids: list[LiveGrid] = []
-    live = LiveCoverage(free_position(maps[0]), grids.append, LiveSettings(spacing_m=spacing_m))
-    print("\n| map | observed cells | first grid [s] | final grid [s] | processor [s] | memory [GB] |")
+    processor_s: list[float] = []
+
+    def publish(grid: LiveGrid) -> None:
+        grids.append(grid)
+        processor_s.append(time.process_time())
+
+    settings = LiveSettings(spacing_m=spacing_m)
+    trace_settings = sp.TraceSettings(frequency_hz)
+    live = LiveCoverage(free_position(maps[0]), publish, settings, trace_settings=trace_settings)
+    live._warm_up()  # as `run` does before the first map
+    print(f"\nprocessor time until the first map: {time.process_time():.1f} s")
+    print("\n| map | free [m2] | coarse grid [s] | final grid [s] | processor [s] | memory [GB] |")
     print("|---|---|---|---|---|---|")
     for number, partial in enumerate(maps):
         grids.clear()
-        start_s = time.process_time()
+        processor_s[:] = [time.process_time()]
         live.on_map(message(partial))
         live.step()
         first_s, final_s = (next(grid.age_s for grid in grids if grid.is_final == final) for final in (False, True))
-        cells, used_s = int((partial.state != CellState.UNKNOWN).sum()), time.process_time() - start_s
-        times = f"{first_s:.1f} | {final_s:.1f} | {used_s:.1f}"
-        print(f"| {number} | {cells} | {times} | {memory_mb() / 1e3:.2f} |", flush=True)
+        free_m2 = float((partial.state == CellState.FREE).sum()) * partial.resolution_m**2
+        coarse_s, fine_s = np.diff(processor_s)
+        times = f"{first_s:.1f} | {final_s:.1f} | {coarse_s:.1f}, {fine_s:.1f}"
+        print(f"| {number} | {free_m2:.1f} | {times} | {memory_mb() / 1e3:.2f} |", flush=True)
     print(f"peak memory: {peak_memory_gb():.2f} GB")
 
 
@@ -117,13 +133,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--updates", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--spacing", type=float, default=0.15, help="of the receivers in the depot [m]")
+    parser.add_argument("--spacing", type=float, default=0.15, help="of the receivers of a robot's map [m]")
     parser.add_argument("--depot", type=Path, help="map of SLAM; measures nothing else")
+    parser.add_argument("--growing", action="store_true", help="measures the apartment as it grows, and nothing else")
+    parser.add_argument("--frequency", type=float, default=28.0, help="of the depot, and of --growing [GHz]")
     given = parser.parse_args()
-    if given.depot:
-        drive(depot_maps(given.depot, range(1, 402, 100)), given.spacing)
-        return
     apartment = [sp.load_map(APARTMENT / f"step{step:03d}/map.yaml") for step in (50, 100, 150)]
+    if given.depot or given.growing:
+        maps = depot_maps(given.depot, range(1, 402, 100)) if given.depot else apartment
+        drive(maps, given.spacing, given.frequency * 1e9)
+        return
     large = [half_seen_hall(fraction) for fraction in (0.5, 0.6, 0.7)]
     print("| map | cells | first grid [s] | final grid [s] |\n|---|---|---|---|")
     for name, maps in (("apartment", apartment), ("hall of 30 x 15 m", large)):

@@ -37,20 +37,34 @@ ROOMS = {
     "maps": "Maps",
     "scene": "Scenes",
     "tracing": "Tracing",
-    "channels": "Channels",
     "prediction": "Prediction",
     "coverage": "Coverage",
     "export": "Coverage",
-    "plots": "Pictures",
     "worlds": "Homes and robots",
     "calibration": "Calibration and placement",
     "placement": "Calibration and placement",
     "exploration": "Homes and robots",
     "differentiable": "Gradients",
-    "lab": "Data sets and training",
     "settings": "Settings",
 }
 """Headings of the API reference by room of the package; the names of other rooms follow under "More"."""
+
+GROUPS = {
+    "maps.importers": "sp.importers: maps and recordings of other formats",
+    "channels": "sp.channels: channels of links",
+    "plots": "sp.plots: pictures",
+    "lab": "sp.lab: data sets and training",
+}
+"""Headings of the modules whose names are public as well."""
+
+RETURNED = (
+    *("calibration.calibration.MaterialCalibration", "channels.samples.ChannelSamples"),
+    *("exploration.explore.Exploration", "exploration.next_views.NextView", "exploration.next_views.NextViews"),
+    *("placement.placement.TransmitterPlacement", "placement.several.NetworkPlacement", "settings.PlacementSettings"),
+    *("measurements.assimilation.Assimilation", "apps.live.coverage.LiveCoverage", "apps.live.coverage.LiveSettings"),
+    "tracing.gradients.GainGradients",
+)
+"""Classes that are imported from their modules."""
 
 
 def figures(block: tuple, block_vars: dict, gallery_conf: dict) -> str:
@@ -65,19 +79,30 @@ def figures(block: tuple, block_vars: dict, gallery_conf: dict) -> str:
     return figure_rst(paths, gallery_conf["src_dir"])
 
 
+def public_names(package: str = "") -> list[tuple[str, str]]:
+    """Modules and names that the stub of a package imports from modules of ours."""
+    stub = ROOT / "sionna_partial" / package.replace(".", "/") / "__init__.pyi"
+    imports = [node for node in ast.parse(stub.read_text(encoding="utf-8")).body if isinstance(node, ast.ImportFrom)]
+    names = [(str(node.module).partition(".")[2], alias.name) for node in imports for alias in node.names]
+    return [(module, name) for module, name in names if f"{module}.{name}".lstrip(".") not in GROUPS]
+
+
 def write_api() -> None:
-    """Write a page that lists every public name by room."""
-    tree = ast.parse((ROOT / "sionna_partial" / "__init__.pyi").read_text(encoding="utf-8"))
+    """Write a page that lists every public name by room, and those of the groups."""
     names: dict[str, list[str]] = {heading: [] for heading in [*ROOMS.values(), "More"]}
-    for node in tree.body:
-        if isinstance(node, ast.ImportFrom):
-            names[ROOMS.get(str(node.module).split(".")[1], "More")] += [alias.name for alias in node.names]
+    for module, name in public_names():
+        names[ROOMS.get(module.partition(".")[0], "More")].append(name)
+    names |= {heading: [f"{group}.{name}" for _, name in public_names(group)] for group, heading in GROUPS.items()}
+    names["Results, and classes that few need"] = [*RETURNED]
     lines = ["API reference", "=============", "", ".. currentmodule:: sionna_partial", ""]
     for heading, members in names.items():
-        if members:
-            lines += [heading, "-" * len(heading), "", ".. autosummary::", "   :toctree: .", ""]
-            lines += [*(f"   {name}" for name in members), ""]
+        lines += [heading, "-" * len(heading), "", ".. autosummary::", "   :toctree: .", ""]
+        lines += [*(f"   {name}" for name in members), ""]
     API.mkdir(parents=True, exist_ok=True)
+    listed = {f"sionna_partial.{name}" for members in names.values() for name in members}
+    for page in API.glob("sionna_partial.*.rst"):  # of an earlier build, with other names
+        if page.stem not in listed:
+            page.unlink()
     text = "\n".join(lines)
     page = API / "index.rst"
     if not page.exists() or page.read_text(encoding="utf-8") != text:

@@ -186,13 +186,15 @@ class TestSmoothed:
         return tf.reduce_mean(found.gain_mean_db)
 
     def test_means_of_single_predictions(self):
-        scene, within_m = scene_of("partial", "paper"), 0.01
-        value, gradient = scene.smoothed(self.mean_db, TX_M, RX_M, within_m=within_m)
+        """Of direct paths, as others come and go: a trace leaves out weak ones."""
+        direct, within_m, rx = sp.TraceSettings(max_depth=0), 0.01, RX_M[[0, 5]]
+        scene = sp.DifferentiableScene(MAPS["partial"], predictor=loaded("paper"), trace_settings=direct)
+        value, gradient = scene.smoothed(self.mean_db, TX_M, rx, within_m=within_m)
         angles = np.arange(8) * np.pi / 4.0
         rim_m = TX_M + within_m * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])
         values, slopes = [], []
         for position_m in (TX_M, *rim_m):
-            links, tx_m = scene.links(position_m, RX_M), tf.Variable(position_m)
+            links, tx_m = scene.links(position_m, rx), tf.Variable(position_m)
             with tf.GradientTape() as tape:
                 single = self.mean_db(links(tx_m=tx_m))
             values.append(single.numpy())
@@ -200,8 +202,8 @@ class TestSmoothed:
         weight = np.array([0.5, *np.full(8, 1.0 / 16.0)])
         assert value == pytest.approx(weight @ values, abs=1e-6)
         mean = weight @ np.array(slopes)
-        assert np.linalg.norm(mean) > 1.0
-        np.testing.assert_allclose(gradient, mean, atol=0.03 * np.linalg.norm(mean))  # no path appears
+        assert np.linalg.norm(mean) > 0.5
+        np.testing.assert_allclose(gradient, mean, atol=0.02 * np.linalg.norm(mean))
 
     def test_what_appears_has_a_part_in_the_gradient(self):
         """Receivers in a row behind the pillar come into sight one by one, which no path's derivative shows."""
@@ -216,8 +218,8 @@ class TestSmoothed:
         for axis in (0, 1):
             step = 0.1 * np.eye(3)[axis]
             ends = [scene.smoothed(seen, at + way * step, rx, within_m=radius_m)[0] for way in (1.0, -1.0)]
-            assert gradient[axis] == pytest.approx((ends[0] - ends[1]) / 0.2, abs=0.04)
-        assert np.linalg.norm(gradient) > 0.1
+            assert gradient[axis] == pytest.approx((ends[0] - ends[1]) / 0.2, abs=0.08)
+        assert np.linalg.norm(gradient) > 0.2
 
     def test_positions_in_walls_and_at_receivers_are_left_out(self):
         near_wall = np.array([0.13, 1.5, 1.4])
@@ -227,14 +229,12 @@ class TestSmoothed:
 
     def test_ascent_on_the_apartment(self):
         scene = sp.DifferentiableScene(sp.load_map(scenes_folder() / "apartment" / "step100" / "map.yaml"))
-        x, y = np.meshgrid(np.arange(6.2, 9.0, 0.7), np.arange(3.0, 12.0, 1.5))
-        rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])
-        rx, at, values = rx[scene.partial.radios_can_stand(rx)], np.array([7.0, 9.8, 1.5]), []
-        for _ in range(3):
-            value, gradient = scene.smoothed(lambda found: tf.reduce_mean(found.coverage(-100.0)), at, rx)
-            values.append(value)
-            at = at + 0.25 * np.array([*gradient[:2], 0.0]) / np.linalg.norm(gradient[:2])
-        assert values[0] < values[1] < values[2]
+        x, y = np.meshgrid([6.4, 7.8], np.arange(3.0, 12.0, 1.5))
+        rx, at = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)]), np.array([7.0, 9.8, 1.5])
+        rx = rx[scene.partial.radios_can_stand(rx)]
+        value, gradient = scene.smoothed(lambda found: tf.reduce_mean(found.coverage(-100.0)), at, rx)
+        there = at + 0.25 * np.array([*gradient[:2], 0.0]) / np.linalg.norm(gradient[:2])
+        assert scene.smoothed(lambda found: tf.reduce_mean(found.coverage(-100.0)), there, rx)[0] > value
 
     def test_radius(self):
         with pytest.raises(SettingsError, match=r"within_m = 0 is not allowed: give a number in \(0, 1\]\."):

@@ -15,6 +15,7 @@ from public_names import EVERY
 from rosbag_files import write_drive
 
 import sionna_partial as sp
+from sionna_partial.placement import placement, several
 
 pytestmark = [QUIET, pytest.mark.usefixtures("short_search")]
 
@@ -30,6 +31,9 @@ ALONE = tuple((name,) for name in EVERY if name not in sum(CHAINS, ()))
 
 SEARCHES = ("calibrate_materials", "place_transmitter", "place_transmitters", "trace_links")
 """Names that several examples call with equal arguments, and that take time."""
+
+FEW = ((placement, "RECEIVERS", 40), (several, "RECEIVERS", 40), (several, "CANDIDATES", 8), (several, "DRAWS", 20))
+"""Numbers that placements compare: the examples print nothing that depends on them."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -50,6 +54,8 @@ def searched_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         for name in SEARCHES:
             patch.setattr(sp, name, once(getattr(sp, name)))
+        for module, name, value in FEW:
+            patch.setattr(module, name, value)
         yield
 
 

@@ -10,6 +10,7 @@ import sionna_partial as sp
 from sionna_partial.channels.joint import JointLatents
 from sionna_partial.coverage.link_budget import schemes
 from sionna_partial.errors import OutputError, PositionError, SettingsError
+from sionna_partial.placement import several
 from sionna_partial.placement.several import _greedy, _swapped
 
 TX = {"west": (1.0, 1.0, 1.5), "east": (4.5, 2.5, 1.5)}
@@ -136,7 +137,11 @@ def test_links_through_the_same_unknown_cells_are_alike() -> None:
     assert (np.sort(quantiles, axis=0) * 100 // 1 == np.arange(100)[:, None]).all()  # evenly spread
 
 
-def test_several_are_placed_greedily_and_then_swapped(half_seen: sp.PartialMap) -> None:
+def test_several_are_placed_greedily_and_then_swapped(
+    half_seen: sp.PartialMap, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(several, "CANDIDATES", 12)
+    monkeypatch.setattr(several, "DRAWS", 40)
     covered = np.array([[1, 1, 1, 1, 0, 0], [1, 1, 0, 0, 1, 0], [0, 0, 1, 1, 0, 1]], dtype=bool)[None]
     weight = np.full(6, 1 / 6)
     greedy, scores = _greedy(covered, weight, 2)

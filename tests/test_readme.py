@@ -66,8 +66,10 @@ PAGES_WITH_PYTHON = tuple(page for page in PAGES if blocks(page, "python"))
 
 @pytest.mark.pages
 @pytest.mark.parametrize("page", PAGES_WITH_PYTHON, ids=lambda page: page.name)
-def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They read `scenes/`, or a scan of the reader's; each file that they write is there.
+def test_python_blocks_run(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """They read `scenes/`, or a scan of the reader's; each file that they write is there, and what they say they print.
 
     The pages share a process, as libraries take longer to import than most pages to run: the order is checked here.
     """
@@ -83,6 +85,9 @@ def test_python_blocks_run(page: Path, tmp_path: Path, monkeypatch: pytest.Monke
     with warnings.catch_warnings(action="default"):
         runpy.run_path("page.py", run_name="__main__")
     plt.close("all")
+    printed = capsys.readouterr().out.splitlines()
+    for line in re.findall(r"^print\(.*\)  # prints (.*)$", code, flags=re.MULTILINE):
+        assert line in printed
     written = re.findall(r"(?:save\w*|animate_exploration|export_scene)\(.*?\"([^\"]+)\"\)", code)
     for name in written:
         path = tmp_path / name

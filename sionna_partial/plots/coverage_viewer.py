@@ -12,8 +12,8 @@ import numpy as np
 import xarray as xr
 from matplotlib import colormaps
 from matplotlib.colors import ListedColormap, Normalize, to_hex
-from numpy.typing import ArrayLike
 
+from sionna_partial.arrays import Floats
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION, transmitters_of
 from sionna_partial.plots.coverage_plot import (
     Layer,
@@ -162,7 +162,7 @@ def server_codes(count: int) -> list[str]:
 
 def level_codes(below: int, above: int) -> list[str]:
     """Return CSS colours for steps below and above a threshold, with a break between them."""
-    return _viridis([*np.linspace(0.0, 0.3, below), *np.linspace(0.6, 1.0, above)])
+    return _viridis(np.append(np.linspace(0.0, 0.3, below), np.linspace(0.6, 1.0, above)))
 
 
 def step_codes(count: int) -> list[str]:
@@ -170,7 +170,7 @@ def step_codes(count: int) -> list[str]:
     return _viridis(np.linspace(0.0, 1.0, count))
 
 
-def _viridis(parts: ArrayLike) -> list[str]:
+def _viridis(parts: Floats) -> list[str]:
     return [to_hex(colour) for colour in colormaps["viridis"](parts)]
 
 

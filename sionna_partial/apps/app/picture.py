@@ -24,12 +24,15 @@ _UNSELECT = "points.selection_manager.clear()"
 
 _STROKE = """
 const is_area = mode.value == encloses
-if (mode.value == "" || name == "doubletap" && !is_area) return
-const {x, y} = cb_obj, data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
+if (mode.value == "" || name == "doubletap" && !(is_area && live.data.x.length)) return
+const {x, y} = cb_obj, near_m = (range.end - range.start) / 100
+const again = is_area && name == "tap" && live.data.x.length > 2 &&
+    Math.hypot(live.data.x.at(-1) - x, live.data.y.at(-1) - y) < near_m // a slow double click is two of them
+const data = name == "panstart" || name == "tap" && !is_area ? {x: [], y: []} : live.data
 const [xs, ys] = [data.x, data.y].map(each => [...each].slice(0, straight.includes(mode.value) ? 1 : Infinity))
 xs.push(x); ys.push(y)
 const drawn = {x: xs, y: ys, r: xs.map(() => wide.includes(mode.value) ? brush.value / 2 : 0)}
-const is_done = name == "panend" || name == (is_area ? "doubletap" : "tap")
+const is_done = name == "panend" || again || name == (is_area ? "doubletap" : "tap")
 live.data = is_done ? {x: [], y: [], r: []} : drawn
 if (is_done) stroke.data = drawn
 """
@@ -71,8 +74,7 @@ _MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
 
 class Picture:
     def __init__(self) -> None:
-        from bokeh.models import ColumnDataSource, DataRange1d, FixedTicker, LinearColorMapper
-        from bokeh.plotting import figure
+        from bokeh.models import ColumnDataSource, FixedTicker, LinearColorMapper
 
         self.ground = ColumnDataSource({"cells": [], "x": [], "y": [], "dw": [], "dh": []})
         of_values = ("x", "y", "dw", "dh", *LAYERS, *_HOVERED)
@@ -88,22 +90,7 @@ class Picture:
         self.routes = ColumnDataSource({"xs": [], "ys": []})
         self.measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
         self.poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
-        plot: Any = figure(
-            x_range=DataRange1d(range_padding=0.02),
-            y_range=DataRange1d(range_padding=0.02),
-            match_aspect=True,
-            sizing_mode="stretch_both",
-            x_axis_label="x [m]",
-            y_axis_label="y [m]",
-            title="Map\n ",
-            tools="pan,wheel_zoom,box_zoom,reset",
-            active_drag=None,
-            active_scroll=None,
-            min_border_bottom=_BELOW_PIXELS,
-            background_fill_color="#d9dce0",
-        )
-        self.plot = plot
-        plot.toolbar.logo, plot.grid.visible, plot.title.text_font_size = None, False, "12px"
+        plot = self.plot = _empty_plot()
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
         self._mappers = LinearColorMapper(palette=[*_GROUND], low=-0.5), LinearColorMapper(palette=[*_WALLS], low=-0.5)
         greys = [f"#{shade:02x}{shade:02x}{shade:02x}" for shade in range(256)]
@@ -185,7 +172,7 @@ class Picture:
         from bokeh.models import CustomJS
 
         given = {"mode": mode, "brush": brush, "stroke": self.stroke, "live": self._live}
-        given |= {"straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
+        given |= {"range": self.plot.x_range, "straight": [*STRAIGHT], "wide": [*BRUSHES], "encloses": AREA}
         for name in ("panstart", "pan", "panend", "tap", "doubletap"):
             self.plot.js_on_event(name, CustomJS(args=given | {"name": name}, code=_STROKE))
         code = f"area.visible = mode.value == '{AREA}'; live.data = {{x: [], y: [], r: []}}"
@@ -279,6 +266,28 @@ class Picture:
             "angle": [math.radians(view.heading_deg - 90.0) for view in shown],
             "rank": [str(number) for number in range(1, len(shown) + 1)],
         }
+
+
+def _empty_plot() -> Any:
+    from bokeh.models import DataRange1d
+    from bokeh.plotting import figure
+
+    plot: Any = figure(
+        x_range=DataRange1d(range_padding=0.02),
+        y_range=DataRange1d(range_padding=0.02),
+        match_aspect=True,
+        sizing_mode="stretch_both",
+        x_axis_label="x [m]",
+        y_axis_label="y [m]",
+        title="Map\n ",
+        tools="pan,wheel_zoom,box_zoom,reset",
+        active_drag=None,
+        active_scroll=None,
+        min_border_bottom=_BELOW_PIXELS,
+        background_fill_color="#d9dce0",
+    )
+    plot.toolbar.logo, plot.grid.visible, plot.title.text_font_size = None, False, "12px"
+    return plot
 
 
 def hatched_pixels(partial: PartialMap) -> NDArray[np.uint8]:

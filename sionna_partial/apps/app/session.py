@@ -536,8 +536,13 @@ class Session(WindowJobs):
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.2, "planning channels")
             powers_dbm = network.attrs["tx_power_dbm"]
-            given = {"bandwidth_hz": settings.bandwidth_hz, "standard": settings.schemes[0] or None}
-            found = predict_network(answer.coverage, tx_power_dbm=powers_dbm, channels=channels, **given)
+            found = predict_network(
+                answer.coverage,
+                tx_power_dbm=powers_dbm,
+                bandwidth_hz=settings.bandwidth_hz,
+                channels=channels,
+                standard=settings.schemes[0] or None,
+            )
             yield functools.partial(take, found)
 
         self.begin(work)
