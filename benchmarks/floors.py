@@ -1,9 +1,10 @@
-"""Predictors on the links of a data set: all and short ones, floor by floor, those in the unseen, and certain ones.
+r"""Predictors on the links of a data set: all and short ones, floor by floor, those in the unseen, and certain ones.
 
-The data set is one of `sionna-partial dataset`, as in docs/results.md. Further predictors are `.keras` files, such as
-the paper's networks that `make predictor` fits to the same data as `map` (build/predictor/paper/predictor.keras). Run
+The data set is one of `sionna-partial dataset`. Further predictors are `.keras` files. Run
 
-    python benchmarks/floors.py floors build/predictor/paper/predictor.keras
+    sionna-partial dataset floors --homes 0 --map ../shared/floors --field-of-view 360 --range 12 \
+        --stage 0 --stage 0.25 --stage 0.5 --stage 0.75 --short-links 0.5
+    python benchmarks/floors.py floors
 """
 
 import argparse

@@ -7,10 +7,10 @@ function around each parameter's value. On complete maps the prediction is the t
 both predictors.
 
 Receivers are left out at which paths of more than 0.002 % of the power appear or vanish between the outermost values,
-which derivatives do not include, or which pass the centre of a cell of the map network's window, where the slope is
-discontinuous; the column "kept" has the fraction of the others. Sionna RT computes in single precision, so that
-differences can be inaccurate by more than 1 % of a small slope: errors are given as they are, with three standard
-errors allowed, and for the receivers where the standard error is below 0.3 % of the slope. Run it with
+which derivatives do not include; the column "kept" has the fraction of the others. Sionna RT computes in single
+precision, so that differences can be inaccurate by more than 1 % of a small slope: errors are given as they are, with
+three standard errors allowed, and for the receivers where the standard error is below 0.3 % of the slope.
+`one_prediction.py` compares slopes with differences of `LinkModel.predict`. Run it with
 
     python benchmarks/gradient.py
 """
@@ -27,7 +27,6 @@ from stock import peak_memory_gb
 import sionna_partial as sp
 from sionna_partial.differentiable import DifferentiableLinks, DifferentiableScene
 from sionna_partial.prediction.paper_networks import import_keras
-from sionna_partial.prediction.unobserved import CELLS_M
 from sionna_partial.tracing.path_set import PathSet
 
 import_keras()
@@ -75,7 +74,7 @@ def main() -> None:
             rx = grid[np.sort(rng.choice(len(grid), min(arguments.receivers, len(grid)), replace=False))]
             for predictor in ("paper", "map") if steps else ("trace",):
                 scene = DifferentiableScene(partial, predictor=None if predictor == "trace" else predictor)
-                for key, errors in compare(scene, tx, rx, skip_centres=predictor == "map"):
+                for key, errors in compare(scene, tx, rx):
                     found.setdefault((predictor, *key), []).append(errors)
                 cost(scene, tx, grid, f"home {seed}, {steps or 'all'} steps, {predictor}")
     print(f"\n{'':8}{'':14}{'':24}{'kept':>7}{'<= 1 %':>9}{'or noise':>9}{'where sure':>17}{'median':>10}{'noise':>10}")
@@ -84,7 +83,7 @@ def main() -> None:
 
 
 def compare(
-    scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64], *, skip_centres: bool
+    scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.float64]
 ) -> Iterator[tuple[tuple[str, str], Errors]]:
     """Yield the errors of the derivatives of every output with respect to every parameter."""
     paths = scene.simulation.paths(tx, rx)
@@ -96,10 +95,6 @@ def compare(
         steps = np.linspace(-width, width, POINTS)
         answers = [links(**{field_of(name): moved(links, name, step)}) for step in steps]
         left_out = changes(scene, paths, name, width)
-        if skip_centres and name in ("x", "y"):
-            axis = "xy".index(name)
-            for cell_m in CELLS_M:
-                left_out |= np.abs((rx - tx)[:, axis] / cell_m % 1.0 - 0.5) * cell_m <= width
         for output in outputs:
             values = np.stack([getattr(answer, output).numpy() for answer in answers])
             errors = differences(steps, values, exact[output, name])

@@ -6,8 +6,8 @@ gradients:
 
 - Paths, link states and the completeness of links are taken from the trace. A path that would appear elsewhere is
   missing; one that becomes invalid loses its power in a step, which has no derivative. `smoothed` includes both.
-- When the transmitter moves, lengths in unknown cells and in walls are the traced lengths times the ratio of
-  `SmoothLengths`, as exact lengths have derivatives that jump; a length of 0 remains 0.
+- Derivatives of lengths in unknown cells and in walls are differences over 2 mm: they jump where a line passes the
+  corner of a cell.
 - Map features, exposure and routes are bilinear between cells of 0.3 m, and range noise between cells of the map.
 - On a complete map probabilities are constant. TensorFlow refuses second derivatives.
 """
@@ -17,17 +17,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require, require_number
-from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
@@ -55,13 +54,7 @@ from sionna_partial.prediction.paper_networks import (
 from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.rule import GATE_NETWORK, Parts, doubt, over_materials, predicted, traced_parts
 from sionna_partial.prediction.space import MapSpace
-from sionna_partial.prediction.unobserved import (
-    Segment,
-    enter_grid,
-    leave_cells,
-    lengths_in_unknown_m,
-    segment_between,
-)
+from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.prediction.unseen_walls import (
     DirectLines,
     UnseenWalls,
@@ -70,7 +63,6 @@ from sionna_partial.prediction.unseen_walls import (
     by_mean_losses,
 )
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
-from sionna_partial.process import njit
 from sionna_partial.scene.scene import power_laws
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
@@ -79,14 +71,14 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 from sionna_partial.tracing.power import mean_loss_db, wall_loss_db
 from sionna_partial.tracing.simulation import Simulation, nearest_m
 
-_BORDER_CELLS = 1e-6
-"""Distance from a border of patches at which a segment runs along it [cells]."""
-
-STEEPEST = 4.0
-"""Largest ratio of the growth of a length and its smooth surrogate, for lines that touch a corner."""
-
 _NEAREST_M = 1e-6
 """Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
+
+_LENGTH_STEP_M = 1e-3
+"""Step of central differences of lengths in cells [m]: their derivatives jump where a line passes a corner."""
+
+_STEEPEST = 30.0
+"""Largest derivative of a length: lines along the border of cells have none."""
 
 _RELATIVE_STEP = 1e-5
 """Step of central differences, relative to the value or to itself."""
@@ -103,128 +95,6 @@ _LIMITS = {
 }
 
 _Numbers: TypeAlias = NDArray[np.integer[Any]]
-
-
-class SmoothLengths:
-    """Length of segments in cells of one kind, with continuous derivatives by their ends.
-
-    The mask of the cells is interpolated bilinearly between cell centres before it is integrated along the segment.
-    Across a straight edge lengths remain equal. They differ by a fraction of a cell at corners and ends near an edge,
-    and by up to half of the length along an edge. Everything outside the grid is unknown.
-    """
-
-    def __init__(self, partial: PartialMap, kind: CellState) -> None:
-        mask = np.pad(partial.state == kind, 1, constant_values=kind == CellState.UNKNOWN)
-        self._mask = mask.astype(np.int8)
-        self._even = _even_patches(mask)
-        self._first_centre_m = np.array(partial.origin_m) - 0.5 * partial.resolution_m
-        self._resolution_m = partial.resolution_m
-
-    def __call__(self, start_m: Floats, end_m: Floats) -> Floats:
-        """Return the lengths (N,) [m] between ends (N, 3) or (3,) [m]; NaN for NaN."""
-        start_m, end_m = np.broadcast_arrays(start_m, end_m)
-        return self._integrals(start_m, end_m)[:, 0] * np.linalg.norm(end_m - start_m, axis=1)
-
-    def slopes(self, start_m: Floats, end_m: Floats) -> tuple[Floats, Floats]:
-        """Return the derivatives (N, 3) by start and end; 0 where they coincide."""
-        start_m, end_m = np.broadcast_arrays(start_m, end_m)
-        integrals, step_m = self._integrals(start_m, end_m), end_m - start_m
-        distance_m = np.linalg.norm(step_m, axis=1, keepdims=True)
-        stretch = integrals[:, :1] * np.divide(step_m, distance_m, out=np.zeros(step_m.shape), where=distance_m != 0.0)
-        start, end = -stretch, stretch
-        start[:, :2] += distance_m / self._resolution_m * integrals[:, 1:3]
-        end[:, :2] += distance_m / self._resolution_m * integrals[:, 3:5]
-        return start, end
-
-    def _integrals(self, start_m: Floats, end_m: Floats) -> Floats:
-        starts, ends = ((points[:, :2] - self._first_centre_m) / self._resolution_m for points in (start_m, end_m))
-        integrals = np.zeros((len(starts), 5))
-        _fill_integrals(self._mask, self._even, starts, ends, integrals)
-        return integrals
-
-
-def _even_patches(mask: Bools) -> NDArray[np.int32]:
-    """Return the distance to the next uneven patch, diagonals included; 0 in uneven patches.
-
-    A patch lies between four cell centres, and is even if their cells have one state.
-    """
-    around = mask[:-1, :-1].astype(np.int8) + mask[:-1, 1:] + mask[1:, :-1] + mask[1:, 1:]
-    even = around % 4 == 0
-    if even.all():
-        return np.full(even.shape, max(even.shape), dtype=np.int32)
-    return np.asarray(ndimage.distance_transform_cdt(even, "chessboard"), dtype=np.int32)
-
-
-@njit(cache=True)
-def _fill_integrals(
-    mask: NDArray[np.int8], even: NDArray[np.int32], starts: Floats, ends: Floats, integrals: Floats
-) -> None:
-    """Integrate the interpolated mask u over the parameter t of segments, from 0 at the start to 1 at the end.
-
-    Points (N, 2) are in cells from the centre of the first cell; `integrals` (N, 5) become the integrals of u,
-    (1 - t) du/dx, (1 - t) du/dy, t du/dx and t du/dy.
-    """
-    for i in range(len(ends)):
-        start_x, start_y, end_x, end_y = starts[i, 0], starts[i, 1], ends[i, 0], ends[i, 1]
-        if not np.isfinite(start_x + start_y + end_x + end_y):
-            integrals[i] = np.nan
-            continue
-        aside_x, aside_y = _aside(start_x, end_x), _aside(start_y, end_y)
-        if aside_x == 0.0 and aside_y == 0.0:
-            _integrate(mask, even, segment_between(start_x, start_y, end_x, end_y), integrals[i])
-        else:
-            for x in (-aside_x, aside_x):
-                for y in (-aside_y, aside_y):
-                    segment = segment_between(start_x + x, start_y + y, end_x + x, end_y + y)
-                    _integrate(mask, even, segment, integrals[i])
-            integrals[i] *= 0.25
-        integrals[i, 0] = min(max(integrals[i, 0], 0.0), 1.0)
-        integrals[i, 1:3] -= integrals[i, 3:5]
-
-
-@njit(cache=True)
-def _aside(start: float, end: float) -> float:
-    """Return the step to either side of a border along which a segment runs, else 0."""
-    along = abs(end - start) < _BORDER_CELLS and abs(start - np.round(start)) < _BORDER_CELLS
-    return 2.0 * _BORDER_CELLS if along else 0.0
-
-
-@njit(cache=True)
-def _integrate(mask: NDArray[np.int8], even: NDArray[np.int32], segment: Segment, sums: Floats) -> None:
-    ny, nx = even.shape
-    here, leave, line_x, line_y = enter_grid(segment, ny, nx)
-    sums[0] += mask[0, 0] * (1.0 - max(0.0, leave - here))
-    while here < leave:
-        column = line_x - 1 if segment.step_x > 0.0 else line_x
-        row = line_y - 1 if segment.step_y > 0.0 else line_y
-        within = 0 <= row < ny and 0 <= column < nx
-        skip = max(0, even[row, column] - 1) if within else 0
-        there, line_x, line_y = leave_cells(segment, line_x, line_y, skip, here, leave)
-        if not within:
-            sums[0] += mask[0, 0] * (there - here)
-        elif even[row, column]:
-            sums[0] += mask[row, column] * (there - here)
-        else:
-            _add_patch(mask[row : row + 2, column : column + 2], row, column, segment, here, there, sums)
-        here = there
-
-
-@njit(cache=True)
-def _add_patch(
-    corners: NDArray[np.int8], row: int, column: int, segment: Segment, here: float, there: float, sums: Floats
-) -> None:
-    """Add the integrals over a part of a segment in one patch by Simpson's rule, which is exact."""
-    corner, right, up = corners[0, 0], corners[0, 1], corners[1, 0]
-    twist = corners[1, 1] - right - up + corner
-    width = there - here
-    for t, weight in ((here, width / 6.0), (0.5 * (here + there), width / 1.5), (there, width / 6.0)):
-        x, y = segment.x + t * segment.step_x - column, segment.y + t * segment.step_y - row
-        slope_x, slope_y = right - corner + twist * y, up - corner + twist * x
-        sums[0] += weight * (corner + slope_x * x + (up - corner) * y)
-        sums[1] += weight * slope_x
-        sums[2] += weight * slope_y
-        sums[3] += weight * t * slope_x
-        sums[4] += weight * t * slope_y
 
 
 @dataclass(frozen=True, eq=False)
@@ -430,10 +300,6 @@ class DifferentiableScene:
         return float(value), tape.gradient(value, tx_m, unconnected_gradients="zero").numpy()
 
     @cached_property
-    def _smooth(self) -> dict[CellState, SmoothLengths]:
-        return {kind: SmoothLengths(self.partial, kind) for kind in (CellState.UNKNOWN, CellState.WALL)}
-
-    @cached_property
     def _walls(self) -> WallDensity:
         walls = UnseenWalls.shipped().of_map(self.partial)
         return walls._replace(lines=UnseenWalls.keras_lines())
@@ -469,8 +335,9 @@ class DifferentiableLinks:
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
         self._phi = scene.model.features(paths.base.tx_m, paths.rx_m)
-        if not scene.model.by_mean_losses and doubt(feature_values(self._phi)).any():
-            assert scene.networks  # loaded here: a tape would watch variables that are made under it
+        self._is_certain = not doubt(feature_values(self._phi)).any()
+        # before any call, as a tape would watch variables that are made under it
+        self._networks = {} if self._is_certain or scene.model.by_mean_losses else scene.networks
 
     def __call__(
         self,
@@ -504,7 +371,7 @@ class DifferentiableLinks:
         through_walls = self._scene.simulation.trace_settings.through_walls
         traces, prior = self._traces(moved[0], given)
         found = [traced_parts(trace.link_state, trace.gain_db, ops) for trace in traces]
-        if doubt(feature_values(self._phi)).any():
+        if not self._is_certain:
             found = self._by_rule(traces, given, *moved)
         distribution = over_materials(found, prior, RESIDUAL_DB, ops) if through_walls else found[0]
         return LinkDistribution.of_parts(*distribution, ops=ops)
@@ -572,8 +439,8 @@ class DifferentiableLinks:
             experts = self._by_mean_losses(traces, given)
         else:
             values["free_db"], expert = self._by_networks(values, given)
-            if LINK_NETWORK in scene.networks:
-                return [predicted(values, expert, _doubled(scene.networks[GATE_NETWORK]), ops)] * len(traces)
+            if LINK_NETWORK in self._networks:
+                return [predicted(values, expert, _doubled(self._networks[GATE_NETWORK]), ops)] * len(traces)
             experts = [expert] * len(traces)
         under = [{"gain_db": trace.gain_db, "link_state": trace.link_state} for trace in traces]
         return [predicted(values | own, expert, ops=ops) for own, expert in zip(under, experts, strict=True)]
@@ -588,7 +455,7 @@ class DifferentiableLinks:
 
     def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:
         """Return the free-space gain (N,) [dB], and the distribution of the networks."""
-        ops, networks = import_keras().ops, self._scene.networks
+        ops, networks = import_keras().ops, self._networks
         tx_m, frequency_hz = given.get("tx_m"), self._scene.predictor.settings.frequency_hz
         carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
         shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / frequency_hz)
@@ -607,7 +474,7 @@ class DifferentiableLinks:
 
     def _map_features(self) -> Any:
         """Return the features (H, W, F) of the map, which depend on the weights, or None."""
-        networks, image = self._scene.networks, MapSpace.of(self._scene.partial).image
+        networks, image = self._networks, MapSpace.of(self._scene.partial).image
         return networks[MAP_NETWORK](image[None])[0] if MAP_NETWORK in networks else None
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
@@ -616,10 +483,9 @@ class DifferentiableLinks:
         numeric = feature_values(phi) | {"gain_db": gain_db}
         if tx_m is None:
             return numeric
-        first, ends = np.broadcast_to(self.base.tx_m, rx_m.shape), (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
-        scene, base = self._scene, (first, self._paths.rx_m)
+        scene, ends = self._scene, (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
         distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(scene._smooth[CellState.UNKNOWN], numeric["unobserved_distance_m"], base, ends)
+        unobserved_m = moved_lengths_m(partial(unobserved_lengths_m, scene.partial), ends)
         ops, space, base_m = import_keras().ops, MapSpace.of(scene.partial), self.base.tx_m
         exposed = space.exposure_at(tx_m[None], ops) - space.exposure_at(base_m[None])
         noise = by_differences(lambda at: scene.partial.noise_near(at["tx_m"][None]), {"tx_m": tx_m})
@@ -630,14 +496,14 @@ class DifferentiableLinks:
             "wall_noise": numeric["wall_noise"] + 0.5 * (noise - scene.partial.noise_near(base_m[None])),
             "distance_m": distance_m,
             "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
-            "walled_m": moved_lengths_m(scene._smooth[CellState.WALL], numeric["walled_m"], base, ends),
+            "walled_m": moved_lengths_m(partial(walled_lengths_m, scene.partial), ends),
         }
 
     def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
         legs, context, indirect = self._legs, context_of(self._phi), self._paths.power[self._legs.paths]
         unobserved_m = tf.constant(legs.unobserved_m)
         if tx_m is not None:
-            unobserved_m = legs.moved_m(self._scene._smooth[CellState.UNKNOWN], tx_m, vertices_m)
+            unobserved_m = legs.moved_m(tx_m, vertices_m)
         gains_db = []
         for column, length_m in enumerate(ATTENUATION_LENGTHS_M):
             first = attenuation(legs.unobserved_m, length_m)
@@ -659,7 +525,7 @@ class _Legs:
     receivers, vertices path by path.
     """
 
-    def __init__(self, partial: PartialMap, paths: PathSet) -> None:
+    def __init__(self, on_map: PartialMap, paths: PathSet) -> None:
         self.paths = np.flatnonzero(~paths.is_direct)
         self.rx = paths.path_rx[self.paths]
         self._rx_m = paths.rx_m
@@ -671,19 +537,19 @@ class _Legs:
         of_path, nodes = np.nonzero(exists)[0], np.hstack([first, numbers, 1 + self.rx[:, None]])[exists]
         same = of_path[:-1] == of_path[1:]
         self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
-        self._base = nodes_m[self._start], nodes_m[self._end]
-        self._exact_m = lengths_in_unknown_m(partial, *self._base)
-        self.unobserved_m = np.bincount(self._of_path, weights=self._exact_m, minlength=len(self.rx)).astype(np.float64)
+        self._lengths_m = partial(unobserved_lengths_m, on_map)
+        exact_m = self._lengths_m(nodes_m[self._start], nodes_m[self._end])
+        self.unobserved_m = np.bincount(self._of_path, weights=exact_m, minlength=len(self.rx)).astype(np.float64)
         self.strongest = np.full(len(paths.rx_m), -1)
         weakest_first = np.argsort(paths.power[self.paths], kind="stable")
         self.strongest[self.rx[weakest_first]] = weakest_first
 
-    def moved_m(self, lengths: SmoothLengths, tx_m: Any, vertices_m: Any) -> Any:
+    def moved_m(self, tx_m: Any, vertices_m: Any) -> Any:
         """Return the lengths (Q,) [m] for a transmitter at `tx_m` and vertices (P, D, 3) [m]."""
         vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
         nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
         ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
-        moved_m = moved_lengths_m(lengths, self._exact_m, self._base, ends)
+        moved_m = moved_lengths_m(self._lengths_m, ends)
         return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
 
 
@@ -764,16 +630,21 @@ def _once_only(slopes: Any) -> Any:
     return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
 
 
-def moved_lengths_m(lengths: SmoothLengths, exact_m: Floats, base: tuple[Floats, Floats], ends: tuple[Any, Any]) -> Any:
-    """Return lengths (N,) [m] that change from `exact_m` in proportion to smooth ones when the segments move."""
+def moved_lengths_m(lengths_m: Callable[[Floats, Floats], Floats], ends_m: tuple[Any, Any]) -> Any:
+    """Return lengths (N,) [m] of segments between two tensors (N, 3) [m], with derivatives by differences."""
 
     @tf.custom_gradient
-    def smooth_m(start: Any, end: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
+    def evaluate(*tensors: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
+        ends = np.stack([tensor.numpy() for tensor in tensors])
+
         def pull_back(upstream: Any) -> list[Any]:
-            return [_once_only(upstream[:, None] * slopes) for slopes in lengths.slopes(start.numpy(), end.numpy())]
+            slopes = np.zeros(ends.shape)
+            for end, axis in np.ndindex(len(ends), ends.shape[2]):
+                step = np.zeros((len(ends), 1, ends.shape[2]))
+                step[end, 0, axis] = _LENGTH_STEP_M
+                slopes[end, :, axis] = (lengths_m(*(ends + step)) - lengths_m(*(ends - step))) / (2.0 * _LENGTH_STEP_M)
+            return [_once_only(upstream[:, None] * slope) for slope in np.clip(slopes, -_STEEPEST, _STEEPEST)]
 
-        return tf.constant(lengths(start.numpy(), end.numpy())), pull_back
+        return tf.constant(lengths_m(*ends)), pull_back
 
-    first_m = lengths(*base)
-    pace = np.divide(exact_m, first_m, out=np.full_like(exact_m, STEEPEST), where=first_m > exact_m / STEEPEST)
-    return tf.maximum(exact_m + np.where(exact_m > 0.0, pace, 0.0) * (smooth_m(*ends) - first_m), 0.0)
+    return evaluate(*ends_m)

@@ -12,7 +12,7 @@ from scipy import stats
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
-from sionna_partial.differentiable import STEEPEST, LinkDistribution, SmoothLengths, moved_lengths_m, moved_paths
+from sionna_partial.differentiable import LinkDistribution, moved_lengths_m, moved_paths
 from sionna_partial.errors import SettingsError
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
@@ -321,9 +321,6 @@ class TestErrors:
             outer.gradient(slope, tx_m)
 
 
-TX = np.array([1.1, 1.7, 1.4])
-
-
 @pytest.fixture(scope="module")
 def paths() -> PathSet:
     return sp.Simulation(small_room(), sp.TraceSettings(max_depth=1)).paths(TX_M, PILLAR_RX_M)
@@ -350,38 +347,34 @@ class TestMovedPaths:
             np.testing.assert_allclose(each, slopes[name][[3, 5]].sum(axis=0), rtol=1e-9)
 
 
-@pytest.fixture(scope="module")
-def partial():
-    """Return a map that is known up to a slanting line."""
-    x, y = np.meshgrid(np.arange(60), np.arange(40))
-    state = np.where(x + 0.4 * y > 38, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
-    return sp.PartialMap(state, 0.1)
-
-
 class TestMovedLengths:
-    def test_what_was_seen_stays_so(self, partial):
-        first, rx_m, tx_m = TX[None], np.array([[2.1, 0.4, 1.5]]), tf.constant(TX + np.array([3.4, 1.0, 0.0]))
-        exact_m, lengths = unobserved_lengths_m(partial, first, rx_m), SmoothLengths(partial, CellState.UNKNOWN)
-        assert exact_m == 0.0 < unobserved_lengths_m(partial, tx_m.numpy(), rx_m)
+    def test_slopes(self):
+        ends_m = [(1.03, 1.02, 1.5), (4.96, 2.53, 1.2)]
+        lengths_m, ends = self.lengths_and_ends(0.4, ends_m)
         with tf.GradientTape() as tape:
-            tape.watch(tx_m)
-            found_m = moved_lengths_m(lengths, exact_m, (first, rx_m), (tx_m[None], tf.constant(rx_m)))
-        assert found_m.numpy().tolist() == [0.0]
-        assert tape.gradient(found_m, tx_m).numpy().tolist() == [0.0, 0.0, 0.0]
+            found_m = moved_lengths_m(lengths_m, (ends[0] + 0.0, ends[1] + 0.0))
+        here = np.array(ends_m)[:, None]
+        assert found_m.numpy() == lengths_m(*here)
+        for end, slope in enumerate(tape.gradient(found_m, ends)):
+            for axis in range(3):
+                there = here.copy()
+                there[end, 0, axis] += 1e-4
+                grown_m = (lengths_m(*there) - lengths_m(*here)).item()
+                assert slope.numpy()[0, axis] == pytest.approx(grown_m / 1e-4, abs=1e-2)
 
-    def test_steepest(self, partial):
-        """Where the exact length is larger by far than the smooth one, it grows `STEEPEST` times as fast."""
-        lengths = SmoothLengths(partial, CellState.UNKNOWN)
-        start, end = np.array([[1.0, 1.0, 1.5]]), np.array([[4.5, 1.0, 1.5]])
-        smooth_m = lengths(start, end)
-        for step_m in (0.25, -3.0):
-            moved = tf.constant(end + np.array([step_m, 0.0, 0.0]))
-            grown_m = lengths(start, moved.numpy()) - smooth_m
-            assert abs(grown_m) > 0.2
-            for times, pace in ((0.5, 0.5), (2.0, 2.0), (3.9, 3.9), (4.1, STEEPEST), (100.0, STEEPEST)):
-                exact_m = times * smooth_m
-                found_m = moved_lengths_m(lengths, exact_m, (start, end), (tf.constant(start), moved))
-                np.testing.assert_allclose(found_m, np.maximum(exact_m + pace * grown_m, 0.0), rtol=1e-12, atol=1e-12)
+    def test_along_a_border_of_cells(self):
+        lengths_m, ends = self.lengths_and_ends(0.0, [(3.8, 1.0, 1.5), (3.8, 3.0, 1.5)])
+        with tf.GradientTape() as tape:
+            found_m = moved_lengths_m(lengths_m, (ends[0] + 0.0, ends[1] + 0.0))
+        assert [np.abs(slope).max() for slope in tape.gradient(found_m, ends)] == [30.0, 30.0]
+
+    @staticmethod
+    def lengths_and_ends(slant, ends_m):
+        """Return unobserved lengths on a map that is known up to a line, and ends."""
+        x, y = np.meshgrid(np.arange(60), np.arange(40))
+        state = np.where(x + slant * y >= 38, CellState.UNKNOWN, CellState.FREE).astype(np.uint8)
+        lengths_m = functools.partial(unobserved_lengths_m, sp.PartialMap(state, 0.1))
+        return lengths_m, [tf.Variable(np.array([point])) for point in ends_m]
 
 
 THRESHOLD_DB = -100.0

@@ -45,8 +45,21 @@ def test_no_walls_are_expected_in_what_is_known():
     assert walls[0] == 0.0
     assert (np.diff(walls) > 0.0).all()
     seen = UnseenWalls.shipped().of_map(sp.PartialMap(np.zeros((40, 40), dtype=np.uint8), 0.1))
-    first_x, first_y = np.round(-seen.origin_m / CELL_M).astype(int)
-    assert not np.any(seen.per_m[0, first_y : first_y + 13, first_x : first_x + 13])
+    first_x, first_y = np.ceil(-seen.origin_m / CELL_M - 1e-6).astype(int)
+    assert not np.any(seen.per_m[0, first_y : first_y + 12, first_x : first_x + 12])
+    assert np.any(seen.per_m)
+
+
+def test_turned_maps_have_turned_walls():
+    def walls(state, origin_m=(0.0, 0.0)):
+        return UnseenWalls.shipped().of_map(sp.PartialMap(state.copy(), 0.1, origin_m)).per_m[0]
+
+    state = np.kron(np.random.default_rng(0).integers(0, 3, (4, 7)), np.ones((9, 9))).astype(np.uint8)
+    expected = walls(state)
+    np.testing.assert_allclose(walls(state, (3.21, -8.765)), expected, atol=1e-6)
+    np.testing.assert_allclose(walls(state[:, ::-1]), expected[:, ::-1], atol=1e-5)
+    np.testing.assert_allclose(walls(np.rot90(state)), np.rot90(expected)[..., ::-1], atol=1e-5)
+    assert np.ptp(expected) > 0.1
 
 
 def test_the_number_of_walls_is_negative_binomial():

@@ -49,7 +49,7 @@ _FIRST, _LEAST = -1.5, -4.0
 
 _BORDER_M, _BLURRED_CELLS, _POOLED = 7.2, 8, 2 ** (len(_WIDTHS) - 1)
 """Width of the unknown border around known cells [m]; cells at the border of an image that are blurred, and left out;
-cells joined by pooling. Images are aligned to the world by such groups, so that the result does not depend on the grid.
+cells joined by pooling. Images are centred on the mean known cell, so that grid, origin and far cells do not matter.
 """
 
 _LINES_AT_ONCE = 4096
@@ -166,13 +166,15 @@ class UnseenWalls(NamedTuple):
     def of_map(self, partial: PartialMap) -> WallDensity:
         known = _known_part(partial)
         x0, y0, x1, y1 = known.bounds_m
-        corner_m, pooled_m = np.array([x0, y0]), _POOLED * CELL_M
-        first = np.floor(np.round((corner_m - _BORDER_M) / pooled_m, 6))
-        last = np.ceil(np.round((np.array([x1, y1]) + _BORDER_M) / pooled_m, 6))
-        nx, ny = ((last - first) * _POOLED).astype(int).tolist()
-        start_m = first * pooled_m
+        corner_m, end_m, cells = np.array([x0, y0]), np.array([x1, y1]), np.argwhere(known.state != CellState.UNKNOWN)
+        middle = cells.mean(axis=0) + 0.5 if len(cells) else 0.5 * np.array(known.shape)
+        middle_m = corner_m + known.resolution_m * middle[::-1]
+        half_m = np.maximum(middle_m - corner_m, end_m - middle_m) + _BORDER_M
+        pools = np.ceil(np.round(half_m / (_POOLED * CELL_M), 6))
+        nx, ny = (2 * pools * _POOLED).astype(int).tolist()
+        start_m = middle_m - _POOLED * CELL_M * pools
         image = map_image(known, (ny, nx), np.round((start_m - corner_m) / known.resolution_m, 6))
-        per_m = walls_per_m(self.cells, image[None].astype(np.float32))
+        per_m = _symmetric_walls(self.cells, image[None].astype(np.float32))
         inner = slice(_BLURRED_CELLS, -_BLURRED_CELLS)
         return WallDensity(per_m[:, inner, inner], start_m + _BLURRED_CELLS * CELL_M, self.lines)
 
@@ -228,6 +230,16 @@ def walls_per_m(cells: Any, images: Any, ops: Any = array_ops, *, training: bool
     unknown = ops.maximum(1.0 - ops.sum(known, axis=-1, keepdims=True), 0.0)  # fractions are rounded
     options = {"training": True} if training else {}
     return cells(ops.concatenate([known, unknown], axis=-1), **options) * unknown
+
+
+def _symmetric_walls(cells: Any, images: Floats) -> Floats:
+    """Return the mean walls per metre over the eight turned and mirrored images."""
+    total = np.zeros((*images.shape[:3], 2), dtype=np.float32)
+    for turned, up, right in itertools.product((False, True), (1, -1), (1, -1)):
+        view = images[:, ::up, ::right]
+        found = walls_per_m(cells, np.ascontiguousarray(view.swapaxes(1, 2) if turned else view))
+        total += (found.swapaxes(1, 2)[..., ::-1] if turned else found)[:, ::up, ::right]
+    return total / 8.0
 
 
 def walls_met(per_m: Any, start: Any, end: Any, ops: Any = array_ops) -> Any:
