@@ -1,7 +1,7 @@
 """Fields of the known and unknown space of a map: exposure to unobserved space, routes between points, images.
 
-Fields live on cells of 0.3 m that are centred on the known part of the map, so that neither the grid of the map nor its
-origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
+Fields live on cells of 0.3 m that are centred on the mean known cell of the map, so that neither the grid of the map
+nor its origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
 
 - exposure: probability that a walk from a point, of mean length `WALK_M`, ends in unobserved space.
 - route: negative logarithm of the density of walks between two points, which grows like the length of the way around
@@ -72,15 +72,15 @@ class MapSpace:
         known = np.argwhere(partial.state != CellState.UNKNOWN)
         self._is_empty = len(known) == 0
         ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
-        centre = 0.5 * (ends[0] + ends[1])
+        centre = known.mean(axis=0) + 0.5 if len(known) else np.zeros(2)  # one more cell hardly moves it
         self._cells = CELL_M / partial.resolution_m
-        half = 0.5 * (ends[1] - ends[0]) / self._cells + MARGIN_CELLS
-        half_counts = (np.ceil(half / (POOLED_CELLS / 2) - 1e-9) * (POOLED_CELLS / 2)).astype(int)
+        half = np.maximum(centre - ends[0], ends[1] - centre) / self._cells + MARGIN_CELLS
+        half_counts = (np.ceil(half / POOLED_CELLS - 1e-9) * POOLED_CELLS).astype(int)
         self.shape = tuple((2 * half_counts).tolist())
         first = centre - half_counts * self._cells
         self.corner_m = np.array(partial.origin_m) + partial.resolution_m * first[::-1]
-        state = partial.state
-        entered = _entered(state)
+        state, walls = partial.state, _without_gaps(partial.state == CellState.WALL)
+        entered = _entered(state, walls)
         masks = (state == CellState.FREE, state == CellState.WALL, entered)
         edges = [first[axis] + np.arange(self.shape[axis] + 1) * self._cells for axis in (0, 1)]
         rows, columns = (overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
@@ -88,8 +88,8 @@ class MapSpace:
         inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
         fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
         self.image = np.stack(fractions, axis=-1).astype(np.float32)
-        walls = _sampled_walls(state == CellState.WALL, first, self._cells, self.shape)
-        self._conductances = _conductances(walls, self.shape)
+        sampled = _sampled_walls(walls, first, self._cells, self.shape)
+        self._conductances = _conductances(sampled, self.shape)
 
     @classmethod
     def of(cls, partial: PartialMap) -> "MapSpace":
@@ -181,9 +181,15 @@ class MapSpace:
         return ops.sum(ops.take(flat, cells, axis=0) * ops.cast(weights, flat.dtype)[..., None], axis=-2)
 
 
-def _entered(state: NDArray[np.uint8]) -> Bools:
-    """Return the unknown cells that can be entered from free ones without crossing known walls."""
-    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+def _without_gaps(wall: Bools) -> Bools:
+    """Return walls with gaps of up to two cells closed."""
+    closed = ndimage.binary_closing(np.pad(wall, 2), np.ones((3, 3), dtype=bool))
+    return np.asarray(closed[2:-2, 2:-2])
+
+
+def _entered(state: NDArray[np.uint8], walls: Bools) -> Bools:
+    """Return the unknown cells that can be entered from free ones without crossing walls."""
+    unknown = np.pad((state == CellState.UNKNOWN) & ~walls, 1, constant_values=True)
     labels, count = ndimage.label(unknown)
     free = np.pad(state == CellState.FREE, 1)
     beside = ndimage.binary_dilation(free) & unknown
