@@ -79,7 +79,7 @@ scenes: $(READY) ## Make the demo scenes again (scenes/)
 predictor: $(READY) ## Train predictors like the shipped ones, and put them there (sionna_partial/predictors/)
 	@rm -rf build/predictor
 	@$(DATASET)/camera --homes 300 --first-seed 330000 --links 160
-	@$(DATASET)/mixed --homes 184 --first-seed 320000 --mixed-sensors $(STAGES)
+	@$(DATASET)/mixed --homes 154 --first-seed 320000 --mixed-sensors $(STAGES)
 	@$(DATASET)/lidar --homes 30 --first-seed 340000 --field-of-view 360 --range 12 $(STAGES)
 	@$(DATASET)/large --homes 54 --first-seed 350000 --mixed-sensors $(STAGES) $(LARGE)
 	@$(DATASET)/large_lidar --homes 65 --first-seed 360000 --field-of-view 360 --range 20 $(STAGES) $(LARGE)

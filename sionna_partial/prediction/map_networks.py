@@ -76,8 +76,8 @@ BATCH_STATISTICS = 0.6
 Batches have maps of similar size, and so other statistics than all maps together.
 """
 
-_WIDTHS = (12, 24, 32, 48)
-_HIDDEN_UNITS, _GATE_UNITS = 96, 24
+_WIDTHS = (16, 32, 48, 64)
+_HIDDEN_UNITS, _GATE_UNITS = 160, 24
 _LOS_MOST_DB = 10.0
 """Largest mean gain given LOS over free space [dB]: other paths add at most this power."""
 
