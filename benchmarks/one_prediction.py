@@ -277,7 +277,7 @@ def draws(case: Case) -> Iterator[Row]:
     """Yield the differences of draws from the prediction."""
     model = case.model()
     expected = model.predict(case.tx, case.rx)
-    gain_db = sp.sample_channels(model, case.tx, case.rx, n=1000, seed=case.seed).gain_db
+    gain_db = sp.channels.sample_channels(model, case.tx, case.rx, n=1000, seed=case.seed).gain_db
     yield "draws, mean", f"{np.mean(gain_db.mean(axis=0) - expected.gain_mean_db):+.2f}"
     yield "draws, std", f"{np.mean(gain_db.std(axis=0) - expected.gain_std_db):+.2f}"
 

@@ -155,7 +155,7 @@ def _links(
                 traced = model.simulation.links(tx_m, rx_m[stands], polarisations=1)
                 phi = link_features(model.partial, traced)
                 assert phi.context is not None
-                yield step, phi, model.predict_features(phi, phi.context.complete), true_db[stands]
+                yield step, phi, model.predict_features(phi), true_db[stands]
 
 
 def calibration_error(prediction: LinkPrediction, true_db: np.ndarray, threshold_db: float) -> float:

@@ -37,9 +37,10 @@ from sionna_partial.prediction.map_networks import (
     MAP_NETWORK,
     expert_parts,
     feature_values,
-    line_points_m,
     link_inputs,
     link_outputs,
+    of_image,
+    read_features,
 )
 from sionna_partial.prediction.paper_networks import (
     GAIN_INPUTS,
@@ -463,19 +464,14 @@ class DifferentiableLinks:
         if LINK_NETWORK not in networks:
             inputs = {name: values[name][:, None] for name in GAIN_INPUTS}
             return free_db, distribution_by_paper(networks, inputs, self._phi.link_state, shift_db, ops)
-        inputs, points = tf.cast(link_inputs(values, frequency_hz, shift_db, ops), tf.float32), None
-        features = self._map_features()
-        if features is not None:
+        inputs, of_map = tf.cast(link_inputs(values, frequency_hz, shift_db, ops), tf.float32), None
+        if MAP_NETWORK in networks:
+            space = MapSpace.of(self._scene.partial)
             ends_m = self.base.tx_m if tx_m is None else tx_m, self._paths.rx_m
             ends_m = tuple(tf.broadcast_to(end_m, self._paths.rx_m.shape) for end_m in ends_m)
-            points = MapSpace.of(self._scene.partial).read(features, line_points_m(*ends_m), ops)
-        outputs = tf.cast(link_outputs(networks, inputs, points, ops), tf.float64)
+            of_map = read_features(space, of_image(networks, space.image, ops), *ends_m, ops)
+        outputs = tf.cast(link_outputs(networks, inputs, of_map, ops), tf.float64)
         return free_db, expert_parts(outputs, free_db, context_of(self._phi).possible, ops)
-
-    def _map_features(self) -> Any:
-        """Return the features (H, W, F) of the map, which depend on the weights, or None."""
-        networks, image = self._networks, MapSpace.of(self._scene.partial).image
-        return networks[MAP_NETWORK](image[None])[0] if MAP_NETWORK in networks else None
 
     def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
         """Return the features that depend on transmitter position (None: as traced) and gain alone."""

@@ -223,7 +223,7 @@ def _tell_of_compilations() -> None:
         number = 0
 
         def on_start(self, event: Any) -> None:
-            if not event.data["dispatcher"].py_func.__module__.startswith("numba."):
+            if not (event.data["dispatcher"].py_func.__module__ or "").startswith("numba."):
                 self.number += 1
                 for tell in _told[:1]:
                     tell(self.number)

@@ -23,10 +23,10 @@ DENSE = "layers/functional/layers/dense/vars"
 
 
 def example(shape):
-    """Images in [0, 255], lengths or gains, or scaled inputs of links."""
+    """Images in [0, 1], lengths or gains, or scaled inputs of links."""
     size = [3, *(length or 24 for length in shape[1:])]
     if len(size) == 4:
-        return RNG.integers(0, 256, size).astype(np.float32)
+        return RNG.random(size).astype(np.float32)
     return (RNG.normal(0.0, 1.5, size) if size[1] > 1 else RNG.uniform(0.01, 40.0, size)).astype(np.float32)
 
 

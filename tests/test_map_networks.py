@@ -26,6 +26,7 @@ from sionna_partial.prediction.map_networks import (
     fit_context_networks,
     line_points_m,
     link_outputs,
+    mean_features,
     predict_by_context,
     scaled_inputs,
     symmetric,
@@ -112,10 +113,17 @@ def test_points_of_links_and_what_is_read_there():
     np.testing.assert_allclose(points[0, 2:].mean(axis=0), [2.5, 0.0])
     back = line_points_m(rx_m, tx_m)
     np.testing.assert_allclose(back[0, 2:][::-1], points[0, 2:], atol=1e-12)
-    of_map = np.random.default_rng(2).normal(size=(1, 2 + LINE_POINTS, 3))
-    found = link_outputs({LINK_NETWORK: lambda x: x}, np.array([[7.0]]), of_map)
-    ends, line = of_map[0, :2], of_map[0, 2:]
-    np.testing.assert_allclose(found[0], [7.0, *ends.sum(axis=0), *ends.prod(axis=0), *line.mean(axis=0)])
+    of_points, mean = np.random.default_rng(2).normal(size=(1, 2 + LINE_POINTS, 3)), np.array([[4.0, 5.0, 6.0]])
+    found = link_outputs({LINK_NETWORK: lambda x: x}, np.array([[7.0]]), (of_points, mean))
+    ends, line = of_points[0, :2], of_points[0, 2:]
+    np.testing.assert_allclose(found[0], [7.0, *ends.sum(axis=0), *ends.prod(axis=0), *line.mean(axis=0), *mean[0]])
+
+
+def test_mean_features_are_of_known_cells():
+    known = np.array([[[0.0, 0.0, 1.0], [0.5, 0.5, 0.0]], [[1.0, 0.0, 0.0], [0.0, 0.5, 0.5]]])[None]
+    features = np.array([[[9.0], [1.0]], [[2.0], [3.0]]])[None]
+    np.testing.assert_allclose(mean_features(features, known), [[(1.0 + 2.0 + 0.5 * 3.0) / 2.5]])
+    assert mean_features(features, 0.0 * known) == 0.0
 
 
 class TestMapNetwork:
@@ -130,14 +138,15 @@ class TestMapNetwork:
 
     def test_features_turn_with_the_map(self, networks, home):
         features_of = MapFeatures(networks)
-        found = features_of(MapSpace(home))
+        found, mean = features_of(MapSpace(home))
         assert found.shape[-1] == MAP_FEATURES
         for turned, back in (
             (np.rot90(home.state), lambda x: np.rot90(x, -1)),
             (home.state[:, ::-1], lambda x: x[:, ::-1]),
             (home.state.T, lambda x: x.transpose(1, 0, 2)),
         ):
-            other = features_of(MapSpace(PartialMap(np.ascontiguousarray(turned), 1.0, (3.7, 0.2))))
+            other, other_mean = features_of(MapSpace(PartialMap(np.ascontiguousarray(turned), 1.0, (3.7, 0.2))))
+            np.testing.assert_allclose(other_mean, mean, rtol=1e-4, atol=1e-4)
             np.testing.assert_allclose(back(other), found, rtol=1e-4, atol=1e-4)
         assert np.ptp(found, axis=(0, 1)).min() > 0.1
 
@@ -243,7 +252,7 @@ def test_examples_are_passes_of_all_maps_with_points_in_their_images():
     numbers = -np.arange(60.0)  # as gains
     examples, seen = module._Examples(phi, np.ones(60, np.uint8), numbers, PredictorSettings("map")), []
     assert len(examples) == 3
-    for columns, images, cells, weights in examples.batches(4, np.random.default_rng(4)):
+    for columns, images, image, cells, weights in examples.batches(4, np.random.default_rng(4)):
         drawn = -columns["true_gain_db"].astype(int)
         seen.append(sorted(drawn.tolist()))
         np.testing.assert_array_equal(columns["inputs"], scaled_inputs(phi, FREQUENCY_HZ)[drawn])
@@ -252,6 +261,8 @@ def test_examples_are_passes_of_all_maps_with_points_in_their_images():
         for number in drawn:
             space, points = phi.context.spaces[index[number]], line_points_m(phi.context.tx_m[[number]], rx_m[[number]])
             np.testing.assert_allclose(found[drawn == number], space.read(space.image, points), atol=1e-5)
+            ny, nx, _ = space.image.shape
+            np.testing.assert_array_equal(images[image[drawn == number]][:, :ny, :nx], space.image[None])
     whole = [links for links in seen if len(links) == 60]
     assert whole
     assert {number for links in seen for number in links} == set(range(60))

@@ -88,7 +88,7 @@ def test_map_features_turn_with_the_map(turn: Callable[[Any], Any]) -> None:
     partial = sp.load_map(scenes_folder() / "apartment" / "step100")
     turned = sp.PartialMap(np.ascontiguousarray(turn(partial.state)), partial.resolution_m, (3.21, -1.7))
     features_of = MapFeatures(shipped().network.layers)
-    expected, found = (features_of(MapSpace(each)) for each in (partial, turned))
+    (expected, _), (found, _) = (features_of(MapSpace(each)) for each in (partial, turned))
     np.testing.assert_allclose(found, turn(expected), atol=1e-3 * np.ptp(expected))
 
 

@@ -3,7 +3,7 @@
 The map network is a U-Net (Ronneberger, Fischer and Brox 2015) on the image of a map (`space.MapSpace`) that returns
 `MAP_FEATURES` numbers per cell, once for a map. Its kernels are symmetric: turned and mirrored maps give turned and
 mirrored features. The link network reads the features of a link, and those of the map at both ends and along the
-direct line, symmetrically in the ends.
+direct line, symmetrically in the ends, and their mean over all known cells, which tells a home from a hall.
 """
 
 import itertools
@@ -161,7 +161,7 @@ LINK_INPUTS: dict[str, Make] = {
 }
 """Inputs of the link network in order, dimensionless, as functions of the features."""
 
-_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + 3 * MAP_FEATURES
+_LINK_INPUTS_WITH_MAP = len(LINK_INPUTS) + 4 * MAP_FEATURES
 _GATE_SHAPES = {GATE_NETWORK: ((None, len(GATE_INPUTS)), (None, GATE_OUTPUTS))}
 
 CONTEXT_SHAPES: tuple[Mapping[str, Shapes], ...] = (
@@ -288,12 +288,24 @@ def line_points_m(tx_m: Any, rx_m: Any) -> Any:
     return tx_m[:, None, :2] * (1.0 - along) + rx_m[:, None, :2] * along
 
 
-def link_outputs(networks: Networks, inputs: Any, points: Any | None, ops: Any = array_ops) -> Any:
-    """Return the outputs (N, LINK_OUTPUTS) for inputs (N, I) and map features (N, 2 + LINE_POINTS, F) of points."""
-    if points is not None:
+def link_outputs(networks: Networks, inputs: Any, of_map: tuple[Any, Any] | None, ops: Any = array_ops) -> Any:
+    """Return the outputs (N, LINK_OUTPUTS) for inputs (N, I).
+
+    `of_map` has the map features (N, 2 + LINE_POINTS, F) of points, and their mean (N, F) over the known cells.
+    """
+    if of_map is not None:
+        points, mean = of_map
         first, last = points[:, 0], points[:, 1]
-        inputs = ops.concatenate([inputs, first + last, first * last, ops.mean(points[:, 2:], axis=1)], axis=1)
+        values = [inputs, first + last, first * last, ops.mean(points[:, 2:], axis=1), mean]
+        inputs = ops.concatenate(values, axis=1)
     return networks[LINK_NETWORK](inputs)
+
+
+def mean_features(features: Any, images: Any, ops: Any = array_ops) -> Any:
+    """Return the mean (B, F) of map features (B, H, W, F) over the known cells of images."""
+    known = images[..., :1] + images[..., 1:2]
+    total = ops.sum(features * known, axis=(1, 2))
+    return total / ops.maximum(ops.sum(known, axis=(1, 2)), 1.0)
 
 
 def expert_parts(outputs: Any, free_db: Any, possible: Any, ops: Any = array_ops) -> Parts:
@@ -311,19 +323,34 @@ def expert_parts(outputs: Any, free_db: Any, possible: Any, ops: Any = array_ops
     )
 
 
+def of_image(networks: Networks, image: Any, ops: Any = array_ops) -> tuple[Any, Any]:
+    """Return the features (H, W, F) of an image (H, W, C), and their mean (F,)."""
+    features = networks[MAP_NETWORK](image[None])
+    return features[0], mean_features(features, image[None], ops)[0]
+
+
 class MapFeatures:
     """Features of the latest maps by a map network."""
 
     def __init__(self, networks: Networks) -> None:
         self._networks, self._kept = networks, dict[bytes, Any]()
 
-    def __call__(self, space: MapSpace) -> Any:
-        """Return the features (H, W, F) of the cells of a map."""
+    def __call__(self, space: MapSpace) -> tuple[Any, Any]:
+        """Return the features (H, W, F) of the cells of a map, and their mean (F,)."""
         key = space.image.tobytes()
         if key not in self._kept:
-            found = self._networks[MAP_NETWORK](space.image[None])[0]
+            found = of_image(self._networks, space.image)
             self._kept = dict([*self._kept.items()][1 - _MAPS_KEPT :]) | {key: found}
         return self._kept[key]
+
+
+def read_features(
+    space: MapSpace, found: tuple[Any, Any], tx_m: Any, rx_m: Any, ops: Any = array_ops
+) -> tuple[Any, Any]:
+    """Return the map features of N links that `link_outputs` takes."""
+    features, mean = found
+    points = space.read(features, line_points_m(tx_m, rx_m), ops)
+    return points, ops.zeros_like(points[:, 0]) + mean
 
 
 def predict_by_context(networks: Networks, phi: LinkFeatures, frequency_hz: float, features: MapFeatures) -> Parts:
@@ -333,11 +360,12 @@ def predict_by_context(networks: Networks, phi: LinkFeatures, frequency_hz: floa
     for index, links in enumerate(_links_by_map(phi)):
         for start in range(0, len(links), _LINKS_AT_ONCE):
             here = links[start : start + _LINKS_AT_ONCE]
-            points = None
+            of_map = None
             if reads_maps(networks):
-                space = context.spaces[index]
-                points = space.read(features(space), line_points_m(context.tx_m[here], context.rx_m[here]))
-            outputs[here] = link_outputs(networks, inputs[here], points)
+                of_map = read_features(
+                    context.spaces[index], features(context.spaces[index]), context.tx_m[here], context.rx_m[here]
+                )
+            outputs[here] = link_outputs(networks, inputs[here], of_map)
     values = rule_values(phi, frequency_hz)
     expert = expert_parts(outputs, values["free_db"], context.possible)
     return predicted(values, expert, networks[GATE_NETWORK])
@@ -410,8 +438,8 @@ class _Examples:
             columns = {name: column[links] for name, column in self._columns.items()}
             yield (columns, *(self._images(maps) if self._ends_m else ()))
 
-    def _images(self, maps: Sequence[tuple[MapSpace, Indices]]) -> tuple[Any, Any, Any]:
-        """Return images (B, H, W, C) of equal size, cells of points (N, P, 4) in them, and weights."""
+    def _images(self, maps: Sequence[tuple[MapSpace, Indices]]) -> tuple[Any, ...]:
+        """Return images (B, H, W, C) of equal size, the image of N links, cells of points (N, P, 4), and weights."""
         assert self._ends_m is not None
         ny, nx = (max(space.shape[axis] for space, _ in maps) for axis in (0, 1))
         images, cells, weights = [], [], []
@@ -424,6 +452,7 @@ class _Examples:
             weights.append(weight)
         return (
             np.stack(images),
+            np.repeat(np.arange(len(maps), dtype=np.int32), [len(links) for _, links in maps]),
             np.concatenate(cells).astype(np.int32),
             np.concatenate(weights).astype(np.float32),
         )
@@ -433,13 +462,16 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer, ops = adam_w(weights, steps), import_keras().ops
 
-    def step(of_batch: bool, columns: Any, images: Any = None, cells: Any = None, point_weights: Any = None) -> Any:
+    def step(of_batch: bool, columns: Any, images: Any = None, image: Any = None, *points: Any) -> Any:
         with tf.GradientTape() as tape:
-            points = None
+            of_map = None
             if images is not None:
-                features = tf.reshape(networks[MAP_NETWORK](images, training=of_batch), (-1, MAP_FEATURES))
-                points = tf.reduce_sum(tf.gather(features, cells) * point_weights[..., None], axis=2)
-            outputs = link_outputs(networks, columns["inputs"], points, ops)
+                cells, point_weights = points
+                features = networks[MAP_NETWORK](images, training=of_batch)
+                mean = tf.gather(mean_features(features, images, ops), image)
+                found = tf.gather(tf.reshape(features, (-1, MAP_FEATURES)), cells)
+                of_map = tf.reduce_sum(found * point_weights[..., None], axis=2), mean
+            outputs = link_outputs(networks, columns["inputs"], of_map, ops)
             expert = expert_parts(outputs, columns["free_db"], columns["possible"], ops)
             mixed = predicted(columns, expert, networks[GATE_NETWORK], ops)
             truth = columns["true_state"], columns["true_gain_db"]
