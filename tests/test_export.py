@@ -153,7 +153,9 @@ class TestSeveralTransmitters:
         save_network(network, tmp_path / "outage.yaml", scene=map_of(PICTURE))
         _, cost = occupancy_of(tmp_path / "outage.yaml")
         assert ((cost >= 0) == (map_of(PICTURE).state == CellState.FREE)).all()
-        assert (cost.max() > 0) == bool((network["p_all_outage"].where(network["observed"] == 1) > 0.005).any())
+        outage = network.assign(p_all_outage=network["p_all_outage"] * 0.0 + 0.4)
+        save_network(outage, tmp_path / "some.yaml", scene=map_of(PICTURE))
+        assert set(np.unique(occupancy_of(tmp_path / "some.yaml")[1])) == {-1, 40}
 
     def test_costs_of_several_are_the_smallest(self, several, tmp_path):
         thresholds_db = [-62.0, -80.0]

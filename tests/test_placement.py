@@ -87,7 +87,8 @@ def test_score_is_that_of_traced_and_predicted_links() -> None:
     found = placed(objective="percentile")
     far = np.linalg.norm(found.rx_m - found.position_m, axis=1) > 0.02
     links = sp.trace_links(found.partial, found.position_m, found.rx_m[far], trace_settings=DIRECT)
-    answer = sp.Predictor.load("paper").predict(sp.link_features(found.partial, links))
+    model = sp.LinkModel(found.partial, predictor="paper", trace_settings=DIRECT)
+    answer = model.predict_features(sp.link_features(found.partial, links))
     np.testing.assert_allclose(found.values[far], link_values(answer, found.settings), atol=1e-3)
 
 
