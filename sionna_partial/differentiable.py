@@ -37,9 +37,9 @@ from sionna_partial.prediction.map_networks import (
     MAP_NETWORK,
     expert_parts,
     feature_values,
+    image_features,
     link_inputs,
     link_outputs,
-    of_image,
     read_features,
 )
 from sionna_partial.prediction.paper_networks import (
@@ -469,7 +469,7 @@ class DifferentiableLinks:
             space = MapSpace.of(self._scene.partial)
             ends_m = self.base.tx_m if tx_m is None else tx_m, self._paths.rx_m
             ends_m = tuple(tf.broadcast_to(end_m, self._paths.rx_m.shape) for end_m in ends_m)
-            of_map = read_features(space, of_image(networks, space.image, ops), *ends_m, ops)
+            of_map = read_features(space, image_features(networks, space.image, ops), *ends_m, ops)
         outputs = tf.cast(link_outputs(networks, inputs, of_map, ops), tf.float64)
         return free_db, expert_parts(outputs, free_db, context_of(self._phi).possible, ops)
 

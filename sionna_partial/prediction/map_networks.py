@@ -323,7 +323,7 @@ def expert_parts(outputs: Any, free_db: Any, possible: Any, ops: Any = array_ops
     )
 
 
-def of_image(networks: Networks, image: Any, ops: Any = array_ops) -> tuple[Any, Any]:
+def image_features(networks: Networks, image: Any, ops: Any = array_ops) -> tuple[Any, Any]:
     """Return the features (H, W, F) of an image (H, W, C), and their mean (F,)."""
     features = networks[MAP_NETWORK](image[None])
     return features[0], mean_features(features, image[None], ops)[0]
@@ -339,7 +339,7 @@ class MapFeatures:
         """Return the features (H, W, F) of the cells of a map, and their mean (F,)."""
         key = space.image.tobytes()
         if key not in self._kept:
-            found = of_image(self._networks, space.image)
+            found = image_features(self._networks, space.image)
             self._kept = dict([*self._kept.items()][1 - _MAPS_KEPT :]) | {key: found}
         return self._kept[key]
 
@@ -362,9 +362,8 @@ def predict_by_context(networks: Networks, phi: LinkFeatures, frequency_hz: floa
             here = links[start : start + _LINKS_AT_ONCE]
             of_map = None
             if reads_maps(networks):
-                of_map = read_features(
-                    context.spaces[index], features(context.spaces[index]), context.tx_m[here], context.rx_m[here]
-                )
+                space = context.spaces[index]
+                of_map = read_features(space, features(space), context.tx_m[here], context.rx_m[here])
             outputs[here] = link_outputs(networks, inputs[here], of_map)
     values = rule_values(phi, frequency_hz)
     expert = expert_parts(outputs, values["free_db"], context.possible)
@@ -462,11 +461,11 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
     weights = [weight for name in sorted(networks) for weight in networks[name].trainable_variables]
     optimizer, ops = adam_w(weights, steps), import_keras().ops
 
-    def step(of_batch: bool, columns: Any, images: Any = None, image: Any = None, *points: Any) -> Any:
+    def step(of_batch: bool, columns: Any, *of_images: Any) -> Any:
         with tf.GradientTape() as tape:
             of_map = None
-            if images is not None:
-                cells, point_weights = points
+            if of_images:
+                images, image, cells, point_weights = of_images
                 features = networks[MAP_NETWORK](images, training=of_batch)
                 mean = tf.gather(mean_features(features, images, ops), image)
                 found = tf.gather(tf.reshape(features, (-1, MAP_FEATURES)), cells)

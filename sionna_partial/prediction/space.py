@@ -24,7 +24,7 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.evaluate import array_ops
-from sionna_partial.prediction.unobserved import overlaps
+from sionna_partial.prediction.unobserved import centred_grid, overlaps
 
 CELL_M = 0.3
 WALK_M = 2.0
@@ -71,13 +71,8 @@ class MapSpace:
     def __init__(self, partial: PartialMap) -> None:
         known = np.argwhere(partial.state != CellState.UNKNOWN)
         self._is_empty = len(known) == 0
-        ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
-        centre = known.mean(axis=0) + 0.5 if len(known) else np.zeros(2)  # one more cell hardly moves it
         self._cells = CELL_M / partial.resolution_m
-        half = np.maximum(centre - ends[0], ends[1] - centre) / self._cells + MARGIN_CELLS
-        half_counts = (np.ceil(half / POOLED_CELLS - 1e-9) * POOLED_CELLS).astype(int)
-        self.shape = tuple((2 * half_counts).tolist())
-        first = centre - half_counts * self._cells
+        self.shape, first = centred_grid(known, self._cells, MARGIN_CELLS, POOLED_CELLS)
         self.corner_m = np.array(partial.origin_m) + partial.resolution_m * first[::-1]
         state, walls = partial.state, _without_gaps(partial.state == CellState.WALL)
         entered = _entered(state, walls)

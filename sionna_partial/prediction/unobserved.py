@@ -214,6 +214,20 @@ def _freest(state: States, x: float, y: float) -> int:
     return found
 
 
+def centred_grid(known: Indices, cells: float, border_cells: float, multiple: int) -> tuple[tuple[int, int], Floats]:
+    """Return the shape of a grid of coarse cells around the known ones, and its first corner (row, column) [map cells].
+
+    It is centred on the mean of the indices `known` (K, 2), which one more cell hardly moves. An edge of a coarse cell
+    has `cells` map cells, and half a side of the grid a multiple of `multiple` coarse ones.
+    """
+    ends = (known.min(axis=0), known.max(axis=0) + 1) if len(known) else (np.zeros(2), np.zeros(2))
+    centre = known.mean(axis=0) + 0.5 if len(known) else np.zeros(2)
+    half = np.maximum(centre - ends[0], ends[1] - centre) / cells + border_cells
+    half_counts = np.ceil(np.round(half / multiple, 6)).astype(int) * multiple
+    ny, nx = (2 * half_counts).tolist()
+    return (ny, nx), centre - half_counts * cells
+
+
 def overlaps(edges: Floats, count: int) -> Floats:
     """Return the fractions (K, count) of intervals between `edges` (K + 1,) covered by unit cells."""
     cells = np.arange(count)

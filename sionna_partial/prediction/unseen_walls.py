@@ -28,7 +28,7 @@ from sionna_partial.prediction.map_networks import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.rule import RARE, Parts
-from sionna_partial.prediction.unobserved import overlaps
+from sionna_partial.prediction.unobserved import centred_grid, overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import TraceSettings
 
@@ -164,16 +164,12 @@ class UnseenWalls(NamedTuple):
             np.savez_compressed(stream, **arrays)
 
     def of_map(self, partial: PartialMap) -> WallDensity:
-        known = _known_part(partial)
-        x0, y0, x1, y1 = known.bounds_m
-        corner_m, end_m, cells = np.array([x0, y0]), np.array([x1, y1]), np.argwhere(known.state != CellState.UNKNOWN)
-        middle = cells.mean(axis=0) + 0.5 if len(cells) else 0.5 * np.array(known.shape)
-        middle_m = corner_m + known.resolution_m * middle[::-1]
-        half_m = np.maximum(middle_m - corner_m, end_m - middle_m) + _BORDER_M
-        pools = np.ceil(np.round(half_m / (_POOLED * CELL_M), 6))
-        nx, ny = (2 * pools * _POOLED).astype(int).tolist()
-        start_m = middle_m - _POOLED * CELL_M * pools
-        image = map_image(known, (ny, nx), np.round((start_m - corner_m) / known.resolution_m, 6))
+        part = _known_part(partial)
+        known, border = part.state != CellState.UNKNOWN, _BORDER_M / CELL_M
+        known |= not known.any()
+        shape, first = centred_grid(np.argwhere(known), CELL_M / part.resolution_m, border, _POOLED)
+        start_m = np.array(part.origin_m) + part.resolution_m * first[::-1]
+        image = map_image(part, shape, np.round(first[::-1], 6))
         per_m = _symmetric_walls(self.cells, image[None].astype(np.float32))
         inner = slice(_BLURRED_CELLS, -_BLURRED_CELLS)
         return WallDensity(per_m[:, inner, inner], start_m + _BLURRED_CELLS * CELL_M, self.lines)
