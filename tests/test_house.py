@@ -95,8 +95,12 @@ ROOMS = {
     ),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "lab.reports"),
+    "apps": ("refining",),
     "apps.live": ("answers", "coverage", "topics"),
-    "apps.app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
+    "apps.app": (
+        *("jobs", "radio", "files", "drawing", "answer", "state", "predicting", "maps", "planning"),
+        *("session", "picture", "page", "server"),
+    ),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }
