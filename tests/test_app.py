@@ -44,7 +44,7 @@ from sionna_partial.apps.app.server import AppServer
 from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
-from sionna_partial.maps.partial_map import cell_centres_m
+from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.plots.coverage_plot import report_figure
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)

@@ -49,6 +49,8 @@ ROOMS = {
             "environment",
             "wall_cells",
             "import_report",
+            "layers",
+            "grid",
             "partial_map",
             "mesh.cells",
             "mesh.upright",

@@ -16,7 +16,7 @@ from sionna_partial.checks import Progress, require, require_choice
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError
 from sionna_partial.exploration.next_views import NextViews, next_views
-from sionna_partial.maps.partial_map import cell_centres_m, nearest_free_m
+from sionna_partial.maps.grid import cell_centres_m, nearest_free_m
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.placement.several import NetworkPlacement, place_transmitters
 

@@ -35,8 +35,10 @@ from sionna_partial.coverage.job import grid_axes, predict_map
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
+from sionna_partial.maps.grid import nearest_free_m, with_height
 from sionna_partial.maps.importers.bags import map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
+from sionna_partial.maps.layers import grid_array
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
