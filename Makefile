@@ -13,9 +13,10 @@ ONE_THREAD := OMP_NUM_THREADS=1 NUMBA_NUM_THREADS=1 TF_NUM_INTRAOP_THREADS=1 TF_
 CORE := $(patsubst %,tests/test_%.py,arrays cli coverage features files house link_model map_files measurements metrics \
 	network outlines partial_map predictor ros_map scene settings slab trace unobserved)
 DATASET = $(BIN)/sionna-partial dataset build/predictor
-LEARNED_FROM := build/predictor/{camera,mixed,lidar,large,large_lidar}
+LEARNED_FROM := build/predictor/{camera,mixed,lidar,large,large_lidar,floors,floors_lidar}
 STAGES := --stage 0 --stage 0.3 --stage 0.6 --stage 0.9 --stage 1 --links 120
-LARGE := --kind hall --kind warehouse --kind floor --short-links 0.5
+FLOORS := --kind floor --short-links 0.5
+LARGE := --kind hall --kind warehouse $(FLOORS)
 
 CHECKSUMS := cd sionna_partial/predictors && sha256sum *.json *.keras *.npz > SHA256SUMS
 
@@ -83,9 +84,11 @@ predictor: $(READY) ## Train predictors like the shipped ones, and put them ther
 	@$(DATASET)/lidar --homes 30 --first-seed 340000 --field-of-view 360 --range 12 $(STAGES)
 	@$(DATASET)/large --homes 54 --first-seed 350000 --mixed-sensors $(STAGES) $(LARGE)
 	@$(DATASET)/large_lidar --homes 65 --first-seed 360000 --field-of-view 360 --range 20 $(STAGES) $(LARGE)
+	@$(DATASET)/floors --homes 36 --first-seed 371000 --mixed-sensors $(STAGES) $(FLOORS)
+	@$(DATASET)/floors_lidar --homes 50 --first-seed 370000 --field-of-view 360 --range 12 $(STAGES) $(FLOORS)
 	@for networks in paper map; do \
 		TF_ENABLE_ONEDNN_OPTS=1 $(BIN)/sionna-partial train $(LEARNED_FROM) \
-			--networks $$networks --passes 12 --test-fraction 0.1 --out build/predictor/$$networks; \
+			--networks $$networks --passes 13 --test-fraction 0.1 --out build/predictor/$$networks; \
 		for suffix in keras json; do \
 			cp build/predictor/$$networks/predictor.$$suffix sionna_partial/predictors/$$networks.$$suffix; done; done
 	@cp build/predictor/map/distance.* build/predictor/map/majority.json sionna_partial/predictors/
