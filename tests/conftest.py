@@ -63,7 +63,13 @@ def short_search() -> Iterator[None]:
     from sionna_partial.calibration import material_fit
 
     with pytest.MonkeyPatch.context() as patch:
-        for name, value in {"COARSE_CELLS": 8, "MOST_FRINGES": 1, "MOST_CELLS": 60, "FEW_FRINGES": 1}.items():
+        for name, value in {
+            "FRINGE_CELLS": 7,
+            "COARSE_CELLS": 8,
+            "MOST_FRINGES": 1,
+            "MOST_CELLS": 60,
+            "FEW_FRINGES": 1,
+        }.items():
             patch.setattr(material_fit, name, value)
         yield
 

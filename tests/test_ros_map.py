@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy.typing import NDArray
@@ -319,6 +319,7 @@ def test_neither_file_without_the_other(tmp_path: Path, blocked: str) -> None:
 grids = arrays(np.uint8, array_shapes(min_dims=2, max_dims=2, max_side=12), elements=st.integers(0, 2))
 
 
+@settings(max_examples=50)
 @given(grids, st.integers(-4, 4))
 def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns: int) -> None:
     yaw = turns * math.pi / 2
@@ -329,6 +330,7 @@ def test_quarter_turns_move_every_cell_by_the_rotation(state: np.ndarray, turns:
     assert np.array_equal(partial.state_at(np.stack([x, y], axis=-1)), state)
 
 
+@settings(max_examples=50)
 @given(grids, st.floats(-6.28, 6.28))
 def test_any_turn_keeps_the_state_of_places(state: np.ndarray, yaw: float) -> None:
     """New cells have the state of the old grid at their centre; only a free one may have become wall."""

@@ -307,7 +307,7 @@ class LiveCoverage:
     def _warm_up(self) -> None:
         """Load libraries, networks and kernels before the first map comes."""
         room = PartialMap(np.array([[1, 1, 1, 1], [1, 0, 0, 2], [1, 1, 1, 1]], dtype=np.uint8), 1.0)
-        predict_map(LinkModel(room, **self._model_settings), (1.5, 1.5, 1.5), spacing_m=0.5, progress=False)
+        predict_map(LinkModel(room, **self._model_settings), (1.5, 1.5, 1.5), spacing_m=0.5)
 
     def start(self) -> threading.Thread:
         """Call `run` in a thread."""
