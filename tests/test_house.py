@@ -83,7 +83,7 @@ ROOMS = {
         *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
         "wall_materials",
     ),
-    "measurements": ("surveys", "measurements", "recordings", "walks", "assimilation", "localisation"),
+    "measurements": ("surveys", "measurements", "recordings", "walks", "evidence", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
     "channels": ("files", "joint", "samples"),
     "networks": ("coverage.network",),
