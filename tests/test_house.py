@@ -49,7 +49,6 @@ ROOMS = {
             "environment",
             "wall_cells",
             "import_report",
-            "layers",
             "grid",
             "partial_map",
             "mesh.cells",

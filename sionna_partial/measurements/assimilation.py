@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats, read_only
-from sionna_partial.checks import float_array, require, require_number, require_type
+from sionna_partial.checks import float_array, position_array, require, require_number, require_type
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
-from sionna_partial.maps.grid import position_array
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.measurements.evidence import (
     FREE_P_POWERS,

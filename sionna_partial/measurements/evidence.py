@@ -163,7 +163,7 @@ class LinkGeometry:
 
     @property
     def tx_seen(self) -> bool:
-        """Whether the transmitter is in a free cell."""
+        """True if the transmitter is in a free cell."""
         return bool(self.walks.partial.state_at(self.tx_m[None])[0] == CellState.FREE)
 
     def free_space_db(self, rx_m: Floats) -> Floats:
