@@ -36,7 +36,7 @@ HEAD = f"\n| {' | '.join(_COLUMNS)} |\n|{'---|' * len(_COLUMNS)}"
 def main() -> None:
     """Measure, and print a table for each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", choices=["receivers", "segments", "buildings", "limit"])
+    parser.add_argument("--only", choices=["receivers", "segments", "buildings"])
     parser.add_argument("--maps", type=Path, nargs="+", default=[], help="of buildings, or of robots")
     arguments = parser.parse_args()
     only = arguments.only
@@ -46,8 +46,6 @@ def main() -> None:
         growth("segments", [(f"pillars {side}", 3_000) for side in (10, 20, 35, 50)])
     if only in (None, "buildings"):
         buildings(path for path in arguments.maps if path.exists())
-    if only in (None, "limit"):
-        limits()
 
 
 def growth(what: str, cases: list[tuple[str, int]]) -> None:
@@ -70,23 +68,6 @@ def buildings(maps: Iterable[Path]) -> None:
     for name in ("hall", "half hall", *maps):
         for frequency_hz in FREQUENCIES_HZ:
             isolated(measure, str(name), RECEIVERS, frequency_hz)
-    row = isolated(placement)
-    print(f"\nplace_transmitter on half the hall: {row['seconds']:.1f} s, {row['memory_gb']:.2f} GB")
-
-
-def placement() -> dict:
-    """Time the placement of a transmitter on half the hall."""
-    start = time.perf_counter()
-    sp.place_transmitter(hall(half=True))
-    return {"seconds": time.perf_counter() - start, "memory_gb": peak_memory_gb()}
-
-
-def limits() -> None:
-    """Show that a job which does not fit is refused at once."""
-    try:
-        sp.predict_map(hall(), (12.0, 9.0), spacing_m=0.05, memory_gb=0.9)
-    except sp.SionnaPartialError as error:
-        print(f"\nrefused: {error}")
 
 
 def measure(name: str, count: int, frequency_hz: float = FREQUENCIES_HZ[0]) -> dict:

@@ -1,7 +1,7 @@
 """Our paths against the truth on complete and partial maps of homes, with every disagreement named.
 
 Truth is stock Sionna RT in tiles of at most 100 receivers, with 1e6 rays and a table of 3e7 entries. What counts, and
-how paths that only one side has are checked, is stated in `agreement.py`. Run it with
+how paths that only one side has are checked, is stated by `agreement` in `stock.py`. Run it with
 
     python benchmarks/trace_truth.py --seeds 20000 20001 --receivers 60
 
@@ -16,9 +16,20 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
-from agreement import agreement, is_real, link, meant, pair_paths, paths_of
 from numpy.typing import NDArray
-from stock import Paths, is_bent, isolated, trace_stock, true_paths
+from stock import (
+    Paths,
+    agreement,
+    is_bent,
+    is_real,
+    isolated,
+    link,
+    meant,
+    pair_paths,
+    paths_of,
+    trace_stock,
+    true_paths,
+)
 
 import sionna_partial as sp
 from sionna_partial.scene.scene import SceneGeometry, build_scene

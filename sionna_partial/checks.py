@@ -9,7 +9,8 @@ from numbers import Integral, Real
 from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
-from sionna_partial.errors import SettingsError, SionnaPartialError
+from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.errors import PositionError, SettingsError, SionnaPartialError
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -137,6 +138,23 @@ def are_stages(value: Any) -> bool:
     numbers = all(isinstance(stage, Real) and not isinstance(stage, bool) for stage in stages)
     rising = bool(stages) and numbers and all(low < high for low, high in itertools.pairwise(stages))
     return rising and (all(map(is_whole, stages)) or (stages[0] >= 0 and stages[-1] <= 1))
+
+
+def position_array(name: str, points_m: object, *, least: int = 1) -> "NDArray[Any]":
+    """Return positions (3,) or (N, 3) [m] as a float64 array; a PositionError names them."""
+    points = float_array(name, points_m, PositionError, "give x, y, z in metres.")
+    if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
+        raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
+    if points.size < 3 * least:
+        raise PositionError(f"{name} has shape {points.shape}: give at least {least} position.")
+    return points
+
+
+def with_height(points_m: "NDArray[Any]") -> "NDArray[Any]":
+    """Return positions (..., 3) [m]; positions (..., 2) get the default height."""
+    import numpy as np
+
+    return np.insert(points_m, 2, DEFAULT_HEIGHT_M, axis=-1) if points_m.shape[-1:] == (2,) else points_m
 
 
 def settings_or_default(name: str, value: _Settings | None, kind: type[_Settings]) -> _Settings:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.errors import MeasurementError, PositionError
-from sionna_partial.measurements.assimilation import MOST_POINTS, Assimilation, positive
+from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.evidence import MOST_POINTS, positive
 
 HOUSE = drawn(
     """

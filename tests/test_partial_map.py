@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps import partial_map
+from sionna_partial.maps import environment
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
 
@@ -145,7 +145,7 @@ def test_positions_in_other_units(point: tuple[float, float, float]) -> None:
 
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(partial_map, "MAX_CELLS", 11)
+    monkeypatch.setattr(environment, "MAX_CELLS", 11)
     with pytest.raises(MapError, match="state has 3 x 4 cells, more than 11: cut the map to the building or coarsen"):
         PartialMap(PLAN.state, 0.5)
 

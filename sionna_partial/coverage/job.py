@@ -26,6 +26,7 @@ from sionna_partial.checks import (
     require_names,
     require_number,
     transmitter_names,
+    with_height,
 )
 from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
 from sionna_partial.coverage.dataset import (
@@ -43,9 +44,9 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
-from sionna_partial.maps.grid import with_height
 from sionna_partial.maps.partial_map import PartialMap, require_height
-from sionna_partial.measurements.assimilation import GAIN_OFFSET_STD_DB, Assimilation
+from sionna_partial.measurements.assimilation import Assimilation
+from sionna_partial.measurements.evidence import GAIN_OFFSET_STD_DB
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (
     Measurements,

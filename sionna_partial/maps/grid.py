@@ -1,6 +1,5 @@
 """Cells and positions of a grid: states, free-standing walls, unknown rooms, polygons, the nearest free cells."""
 
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Protocol
@@ -12,8 +11,8 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, States, largest_by_area
 from sionna_partial.checks import float_array, real_array, shown
-from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
-from sionna_partial.errors import MapError, PositionError
+from sionna_partial.constants import CellState
+from sionna_partial.errors import MapError
 
 FREE_STANDING_M = 2.5
 """Extent along x and y up to which free-standing walls are furniture [m]."""
@@ -26,11 +25,6 @@ FAR_EXTENTS = 2.0
 
 POCKET_M = 0.4
 """Edge of a square in unknown regions that a robot would look into [m]."""
-
-_BORDER_CELLS = 1e-6
-
-_FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
-_RANK = np.argsort(_FREEST)
 
 
 class Grid(Protocol):
@@ -50,36 +44,6 @@ class Grid(Protocol):
     def origin_m(self) -> tuple[float, float]:
         """World x and y of the lower-left corner [m]."""
         ...
-
-
-def state_at(
-    state: States, resolution_m: float, origin_m: tuple[float, float], points_m: NDArray[np.floating]
-) -> States:
-    """Return the states of `PartialMap.state_at`."""
-    cells = (np.asarray(points_m, dtype=float)[..., :2] - origin_m) / resolution_m
-    padded = np.pad(state, 1, constant_values=CellState.UNKNOWN)
-    ny, nx = state.shape
-    freest = np.full(cells.shape[:-1], _RANK[CellState.WALL])
-    for shift_x, shift_y in itertools.product((-_BORDER_CELLS, _BORDER_CELLS), repeat=2):
-        column = np.clip(np.floor(cells[..., 0] + shift_x) + 1, 0, nx + 1).astype(np.intp)
-        row = np.clip(np.floor(cells[..., 1] + shift_y) + 1, 0, ny + 1).astype(np.intp)
-        freest = np.minimum(freest, _RANK[padded[row, column]])
-    return _FREEST[freest]
-
-
-def position_array(name: str, points_m: object, *, least: int = 1) -> Floats:
-    """Return positions (3,) or (N, 3) [m] as a float64 array; a PositionError names them."""
-    points = float_array(name, points_m, PositionError, "give x, y, z in metres.")
-    if points.shape[-1:] != (3,) or points.ndim not in (1, 2):
-        raise PositionError(f"{name} has shape {points.shape}: give x, y, z in metres, (3,) or (N, 3).")
-    if points.size < 3 * least:
-        raise PositionError(f"{name} has shape {points.shape}: give at least {least} position.")
-    return points
-
-
-def with_height(points_m: Floats) -> Floats:
-    """Return positions (..., 3) [m]; positions (..., 2) get the default height."""
-    return np.insert(points_m, 2, DEFAULT_HEIGHT_M, axis=-1) if points_m.shape[-1:] == (2,) else points_m
 
 
 def area_polygon(name: str, corners_m: ArrayLike) -> shapely.Polygon:
@@ -107,23 +71,6 @@ def nearest_free_m(grid: Grid, at_m: ArrayLike, count: int = 1) -> Floats:
     """Return the centres (K, 2) of the free cells nearest to a position (2,) [m], at most `count`."""
     free_m = cell_centres_m(grid, np.argwhere(grid.state == CellState.FREE))
     return free_m[np.hypot(*(free_m - np.asarray(at_m, dtype=np.float64)).T).argsort(kind="stable")[:count]]
-
-
-def frontier_cells(state: States) -> Bools:
-    """Return free cells that share an edge with an unknown one, or the grid's border."""
-    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
-    touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
-    return np.asarray(touches & (state == CellState.FREE))
-
-
-def uniform_cells(state: States) -> NDArray[np.int32]:
-    """Return the number of cells in every direction, corners included, with the state of each cell."""
-    uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
-    for kind in CellState:
-        cells = state == kind
-        if cells.any() and not cells.all():
-            uniform[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
-    return uniform
 
 
 def unknown_pockets(state: States, resolution_m: float) -> Bools:
@@ -212,16 +159,6 @@ def states_by_height(state: States, obstacle: States, heights_m: Sequence[float]
         other = np.where(state == CellState.UNKNOWN, CellState.UNKNOWN, CellState.FREE)
         found.append((heights_m[number - 1], np.where(obstacle == number, CellState.WALL, other)))
     return found
-
-
-def turned_hint(grid: Grid, points_m: Floats) -> str:
-    """Suggest transposed states if positions (N, 3), at least three, would all be free."""
-    turns = {"upside down (numpy.flipud)": grid.state[::-1], "with rows and columns swapped (.T)": grid.state.T}
-    can_tell = len(points_m) >= 3 and bool((np.abs(points_m) < 1e8).all())
-    for name, state in turns.items() if can_tell else ():
-        if (state_at(state, grid.resolution_m, grid.origin_m, points_m) == CellState.FREE).all():
-            return f" All {len(points_m)} are free on the map {name}."
-    return ""
 
 
 def unit_hint(bounds_m: Sequence[float], point_m: Floats, can_stand: Callable[[Floats], Bools]) -> str:

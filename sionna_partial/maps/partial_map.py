@@ -1,5 +1,6 @@
 """PartialMap: the observed part of a floor plan, cell by cell."""
 
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -11,31 +12,33 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
-from sionna_partial.checks import float_array, is_whole, number_of, require, require_number, shown
+from sionna_partial.checks import float_array, is_whole, number_of, position_array, require, require_number, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.display import Pictured
 from sionna_partial.errors import MapError, PositionError
-from sionna_partial.maps.environment import FloorPlan, SceneMesh, equal_fields, fractions_by_material
-from sionna_partial.maps.grid import (
-    cells_within,
-    free_standing,
-    frontier_cells,
-    has_unknown_room,
-    position_array,
-    state_at,
-    states_by_height,
-    turned_hint,
-    uniform_cells,
-    unit_hint,
-    window,
+from sionna_partial.maps.environment import (
+    LAYERS,
+    FloorPlan,
+    SceneMesh,
+    checked_state,
+    equal_fields,
+    fractions_by_material,
+    layer_cells,
+    layer_values,
+    metres,
 )
+from sionna_partial.maps.grid import cells_within, free_standing, has_unknown_room, states_by_height, unit_hint, window
 from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
 from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.layers import LAYERS, checked_state, layer_cells, layer_values, metres
-from sionna_partial.maps.wall_cells import noise_field, thick_walls, wall_noise
+from sionna_partial.maps.wall_cells import frontier_cells, noise_field, thick_walls, uniform_cells, wall_noise
 from sionna_partial.settings import Material
 
 MAX_INTERIOR_CELLS = 2**53
+
+_BORDER_CELLS = 1e-6
+
+_FREEST = np.array([CellState.FREE, CellState.UNKNOWN, CellState.WALL], dtype=np.uint8)
+_RANK = np.argsort(_FREEST)
 
 OUTLINE_M = 0.3
 """Largest distance of an outline from the cells of its wall [m]."""
@@ -386,7 +389,15 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
         A point on a border is FREE before UNKNOWN before WALL: planners put radios on corners of cells beside walls.
         """
-        return state_at(self.state, self.resolution_m, self.origin_m, points_m)
+        cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m
+        padded = np.pad(self.state, 1, constant_values=CellState.UNKNOWN)
+        ny, nx = self.shape
+        freest = np.full(cells.shape[:-1], _RANK[CellState.WALL])
+        for shift_x, shift_y in itertools.product((-_BORDER_CELLS, _BORDER_CELLS), repeat=2):
+            column = np.clip(np.floor(cells[..., 0] + shift_x) + 1, 0, nx + 1).astype(np.intp)
+            row = np.clip(np.floor(cells[..., 1] + shift_y) + 1, 0, ny + 1).astype(np.intp)
+            freest = np.minimum(freest, _RANK[padded[row, column]])
+        return _FREEST[freest]
 
     @cached_property
     def wall_levels(self) -> tuple[tuple[float, "PartialMap"], ...]:
@@ -426,10 +437,18 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
                 index = int(np.argmax(fault))
                 which = name if points.ndim == 1 else names[index] if names else f"{name}[{index}]"
                 more = f" (and {int(fault.sum()) - 1} more)" if fault.sum() > 1 else ""
-                turned = turned_hint(self, flat) if self.environment.is_extruded else ""
-                remedy += turned or unit_hint(self.bounds_m, flat[index], self.radios_can_stand)
+                remedy += self._turned_hint(flat) or unit_hint(self.bounds_m, flat[index], self.radios_can_stand)
                 raise PositionError(f"{which} = {tuple(flat[index].tolist())}{more} {what}: {remedy}")
         return points
+
+    def _turned_hint(self, points_m: Floats) -> str:
+        """Suggest transposed states if positions (N, 3), at least three, would all be free."""
+        turns = {"upside down (numpy.flipud)": self.state[::-1], "with rows and columns swapped (.T)": self.state.T}
+        can_tell = len(points_m) >= 3 and self.environment.is_extruded and bool((np.abs(points_m) < 1e8).all())
+        for name, state in turns.items() if can_tell else ():
+            if (PartialMap(state, self.resolution_m, self.origin_m).state_at(points_m) == CellState.FREE).all():
+                return f" All {len(points_m)} are free on the map {name}."
+        return ""
 
     def radios_can_stand(self, points_m: Floats) -> Bools:
         """Return whether radios can be at points (N, 3) [m]."""

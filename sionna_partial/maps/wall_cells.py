@@ -319,6 +319,23 @@ def turned_grid(grid: NDArray[Any], transpose: bool, flips: tuple[bool, bool]) -
     return np.ascontiguousarray(grid[:: -1 if flips[1] else 1, :: -1 if flips[0] else 1])
 
 
+def frontier_cells(state: States) -> Bools:
+    """Return free cells that share an edge with an unknown one, or the grid's border."""
+    unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
+    touches = unknown[2:, 1:-1] | unknown[:-2, 1:-1] | unknown[1:-1, 2:] | unknown[1:-1, :-2]
+    return np.asarray(touches & (state == CellState.FREE))
+
+
+def uniform_cells(state: States) -> NDArray[np.int32]:
+    """Return the number of cells in every direction, corners included, with the state of each cell."""
+    uniform = np.full(state.shape, max(state.shape), dtype=np.int32)
+    for kind in CellState:
+        cells = state == kind
+        if cells.any() and not cells.all():
+            uniform[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
+    return uniform
+
+
 def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
     """Return row, first and end column of horizontal runs of True, in reading order."""
     step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)

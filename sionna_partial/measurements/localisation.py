@@ -18,7 +18,7 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.assimilation import (
+from sionna_partial.measurements.evidence import (
     FREE_P_POWERS,
     LIKELY_NOISE_DB,
     Kind,

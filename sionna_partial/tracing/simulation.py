@@ -19,6 +19,7 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.checks import (
     Progress,
     no_progress,
+    position_array,
     require,
     require_choice,
     require_memory,
@@ -29,7 +30,6 @@ from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S,
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
-from sionna_partial.maps.grid import position_array
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import material_is_unknown, scene_settings_of

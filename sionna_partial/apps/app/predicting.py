@@ -27,7 +27,7 @@ from sionna_partial.measurements.measurements import Measurements
 
 @dataclass(frozen=True)
 class _Request:
-    """Copies of what a window predicts for, as the window may change during the job."""
+    """Contents of a window when its prediction was requested: the window may change during the job."""
 
     partial: PartialMap
     home: PartialMap | None

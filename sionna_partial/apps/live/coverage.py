@@ -28,6 +28,7 @@ from sionna_partial.checks import (
     require,
     settings_or_default,
     shown,
+    with_height,
 )
 from sionna_partial.constants import COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
@@ -35,9 +36,9 @@ from sionna_partial.coverage.job import grid_axes, predict_map
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
-from sionna_partial.maps.grid import nearest_free_m, with_height
+from sionna_partial.maps.environment import grid_array
+from sionna_partial.maps.grid import nearest_free_m
 from sionna_partial.maps.importers.bags import map_of_percent, occupancy_parts
-from sionna_partial.maps.layers import grid_array
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
@@ -469,7 +470,7 @@ class LiveCoverage:
     def _receivers(
         self, partial: PartialMap, coverage: xr.Dataset, tx_m: Floats | None
     ) -> tuple[tuple[Floats, Floats], float, Floats]:
-        """Return axes, spacing and P(too small a gain) of receivers; with `tx_m` bounds for those of a final grid."""
+        """Return axes, spacing and P(too small a gain) of receivers; with `tx_m` bounds for a final grid."""
         axes_m, spacing_m = (coverage["y"].to_numpy(), coverage["x"].to_numpy()), float(coverage.attrs["spacing_m"])
         if tx_m is None:
             return axes_m, spacing_m, 1.0 - probability_above(coverage, self.settings.threshold_db)

@@ -1,9 +1,9 @@
-"""What counts as one wall: the loss behind thin, thick and hollow walls, blocks and furniture, as a picture.
+"""Loss of walls: of each material as a table; of thin, thick and hollow walls, blocks and furniture as a picture.
 
-Straight paths alone at 5 GHz, through walls of brick, from a transmitter before each part, for three depths of one wall
-(`TraceSettings.wall_depth_m`).
+The picture has straight paths alone at 5 GHz through brick, from a transmitter before each part, for three depths of
+one wall (`TraceSettings.wall_depth_m`).
 
-    python benchmarks/one_wall.py [--out docs/one_wall.png]
+    python benchmarks/walls.py [--out docs/one_wall.png]
 """
 
 import argparse
@@ -15,8 +15,13 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.errors import SettingsError
+from sionna_partial.scene.scene import constants_of
+from sionna_partial.settings import WALL_MATERIALS
+from sionna_partial.tracing.power import transmission_coefficients
 
 CELL_M, WIDTH_M, DEPTH_M, FACE_M, HEIGHT_M = 0.1, 15.0, 6.0, 2.5, 1.5
+BANDS_GHZ = 2.4, 5.0, 28.0, 60.0
 FREQUENCY_HZ, DEPTHS_M = 5e9, (0.0, 0.3, 0.6)
 PARTS = {
     "thin wall\n0.1 m": (0.5, 0.1, None),
@@ -87,11 +92,31 @@ def show(axes: Axes, partial: sp.PartialMap, depth_m: float) -> object:
     return image
 
 
+def print_losses() -> None:
+    """Print the loss of walls at normal incidence, of the materials that `Material.named` has."""
+    print(f"| material | thickness [cm] | {' | '.join(f'{band:g} GHz' for band in BANDS_GHZ)} |")
+    print("|---|---|---|---|---|---|")
+    for name, material in WALL_MATERIALS.items():
+        losses = []
+        for band in BANDS_GHZ:
+            try:
+                material.require_frequency(band * 1e9)
+            except SettingsError:
+                losses.append("no model")
+                continue
+            constants = *constants_of(material, band * 1e9), material.thickness_m
+            te, _ = transmission_coefficients(*constants, band * 1e9, 1.0)  # type: ignore[call-arg]
+            loss_db = -20.0 * np.log10(max(float(np.abs(te)), 1e-10))
+            losses.append(f"{loss_db:.1f}" if loss_db < 150.0 else "> 150")
+        print(f"| {name} | {100.0 * material.thickness_m:g} | {' | '.join(losses)} |")
+
+
 def main() -> None:
-    """Draw all depths."""
+    """Print the table, and draw all depths."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", default="docs/one_wall.png")
     out, partial = parser.parse_args().out, parts_map()
+    print_losses()
     figure, rows = plt.subplots(len(DEPTHS_M), 1, figsize=(9, 11), layout="constrained", sharex=True)
     images = [show(axes, partial, depth_m) for axes, depth_m in zip(rows, DEPTHS_M, strict=True)]
     rows[-1].set_xlabel("x [m]")
