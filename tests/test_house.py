@@ -93,10 +93,13 @@ ROOMS = {
         *("datasets.shards", "datasets.home_links", "datasets.dataset", "evaluation"),
         *("training.predictor", "training.paths", "training.walls"),
     ),
-    "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
+    "plots": ("style", "logo", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "lab.reports"),
     "apps.live": ("answers", "coverage", "topics"),
-    "apps.app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
+    "apps.app": (
+        *("jobs", "radio", "files", "drawing", "survey", "marks"),
+        *("answer", "session", "picture", "page", "server"),
+    ),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }

@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from sionna_partial.apps.app.drawing import Plan
+from sionna_partial.apps.app.marks import Marks
 from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Checked, require_choice
@@ -156,14 +157,20 @@ class Answer:
 
 
 def answer_png(
-    answer: Answer, view: View, threshold_dbm: float, partial: PartialMap, title: str, plan: Plan | None = None
+    answer: Answer,
+    view: View,
+    threshold_dbm: float,
+    partial: PartialMap,
+    title: str,
+    plan: Plan | None = None,
+    marks: Marks | None = None,
 ) -> bytes:
-    """Return the picture of the page as PNG, with the floor plan that it shows."""
+    """Return the picture of the page as PNG, with the floor plan and the marks that it shows."""
     name = view.transmitter
     one = answer.layers_of(name, threshold_dbm, truth=view.truth)
     layer, scale = LAYERS[view.layer], answer.scale(view.layer, name, threshold_dbm)
     layer = scale.of(layer) if scale else layer
     layer = replace(layer, title=answer.title(view, threshold_dbm))
     outline, drawn = answer.outline(view, one, threshold_dbm), None if plan is None else (plan.shade, plan.size_m)
-    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn)
+    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn, marks and marks.draw)
     return figure_png(figure)

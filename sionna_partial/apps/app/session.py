@@ -3,7 +3,6 @@
 import functools
 import itertools
 import math
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path, PurePath
@@ -25,6 +24,7 @@ from sionna_partial.apps.app.files import (
     uploaded_project,
 )
 from sionna_partial.apps.app.jobs import Status, WindowJobs, collected_warnings
+from sionna_partial.apps.app.marks import Marks, aims_m
 from sionna_partial.apps.app.radio import (
     MOST_TRANSMITTERS,
     PRESETS,
@@ -35,9 +35,11 @@ from sionna_partial.apps.app.radio import (
     require_name,
     usual_height_m,
 )
+from sionna_partial.apps.app.survey import Survey
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress, require, require_choice
 from sionna_partial.constants import COARSER, GAIN_FLOOR_DB, CellState
+from sionna_partial.coverage.dataset import OFFSET
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.coverage.network import predict_network
 from sionna_partial.display import part_of
@@ -52,12 +54,12 @@ from sionna_partial.measurements.measurements import (
     SAME_TX_M,
     Measurements,
     can_be_used,
-    load_measurements,
     measurements_of_each,
     nearest_transmitters,
 )
 from sionna_partial.placement.placement import place_transmitter
 from sionna_partial.placement.several import NetworkPlacement, place_transmitters
+from sionna_partial.plots.logo import read_logo
 from sionna_partial.resources import demo_homes, scenes_folder
 
 ROUNDING_M = 0.006
@@ -87,7 +89,9 @@ class Session(WindowJobs):
         self.transmitters: dict[str, Transmitter] = {}
         self.chosen = ""
         self.settings, self.view = RadioSettings(), View()
+        self.survey: Survey | None = None
         self.measured: Measurements | None = None
+        self.logo: tuple[str, bytes] | None = None
         self.answer: Answer | None = None
         self._is_outdated = False
         self.views: NextViews | None = None
@@ -135,11 +139,8 @@ class Session(WindowJobs):
     def _enter(self, name: str, home: PartialMap, seed: int, tx_m: Sequence[float]) -> None:
         self.title, self.home, self.steps, self._seed, self.source, self.strokes = name, home, 0, seed, None, ()
         x_m, y_m, z_m = tx_m
-        self.transmitters, self.chosen, self.measured = (
-            {"tx1": Transmitter(x_m, y_m, z_m, self.settings.eirp_dbm)},
-            "tx1",
-            None,
-        )
+        self.transmitters, self.chosen = {"tx1": Transmitter(x_m, y_m, z_m, self.settings.eirp_dbm)}, "tx1"
+        self.survey, self.measured = None, None
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
@@ -190,7 +191,7 @@ class Session(WindowJobs):
         def take() -> None:
             self._take_map(bare, project.title, [_SAVED_MAP], warnings, source, strokes)
             self.settings, self.view = project.settings or self.settings, view
-            self.measured = project.measured if project.transmitters else None
+            self.measured, self.logo = project.measured if project.transmitters else None, project.logo
             self._take_transmitters(found)
 
         return take
@@ -246,7 +247,7 @@ class Session(WindowJobs):
     def _forget_map(self) -> None:
         self._warnings, self._job_warnings = {"map": [], "act": []}, []
         self.transmitters, self.chosen, self.measured, self.views, self.answer = {}, "", None, None, None
-        self.source, self.strokes, self.home = None, (), None
+        self.source, self.strokes, self.home, self.survey = None, (), None, None
 
     def _take_map(
         self,
@@ -374,8 +375,12 @@ class Session(WindowJobs):
 
     def _are_ours(self, measured: Measurements) -> Bools:
         """Return which measured links (N,) are of a transmitter of this window."""
+        return self._of_each(measured).any(axis=0)
+
+    def _of_each(self, measured: Measurements) -> Bools:
+        """Return which measured links are of each transmitter (T, N)."""
         sources_m = [np.array([transmitter.position_m]) for transmitter in self.transmitters.values()]
-        return np.asarray(nearest_transmitters(measured.tx, sources_m).any(axis=0))
+        return np.asarray(nearest_transmitters(measured.tx, sources_m))
 
     def measured_points(self) -> tuple[Floats, Bools]:
         """Return the measured receivers (N, 3) [m], and which of them are used (N,)."""
@@ -385,8 +390,23 @@ class Session(WindowJobs):
         used = can_be_used(self.partial, tx_m, measured.rx, self.settings.frequency_hz)
         return measured.rx, used & self._are_ours(measured)
 
+    def measured_names(self) -> list[str]:
+        """Return the transmitter of each measured link, "" for others."""
+        if self.measured is None:
+            return []
+        of_each, names = self._of_each(self.measured), [*self.transmitters, ""]
+        return [names[at] for at in np.where(of_each.any(axis=0), of_each.argmax(axis=0), -1)]
+
+    def measured_powers(self) -> list[tuple[str, float]]:
+        """Return the power that fits the measured powers of each measured transmitter [dBm]."""
+        coverage = None if self.answer is None else self.answer.coverage
+        if self.measured is None or coverage is None or OFFSET not in coverage.coords:
+            return []
+        powers = zip(coverage["tx"].to_numpy(), coverage[OFFSET].to_numpy().tolist(), strict=True)
+        return [(str(name), power_dbm) for name, power_dbm in powers if math.isfinite(power_dbm)]
+
     def forget_measurements(self, *warnings: str) -> None:
-        self.measured, self._warnings["act"] = None, [*warnings]
+        self.survey, self.measured, self._warnings["act"] = None, None, [*warnings]
         self.predict()
 
     def _new_name(self, taken: Sequence[str]) -> str:
@@ -564,22 +584,33 @@ class Session(WindowJobs):
         self.begin(work)
 
     def learn(self, content: bytes, name: str = "measured.csv") -> None:
-        """Take measurements; those without transmitter are of the chosen one."""
+        """Take a survey; powers without transmitter are of the chosen one."""
+        all_m, plan = self._tx_m(), self.plan
+        self._learn_from(lambda: Survey.read(name, content, plan, all_m))
+
+    def assign(self, access_point: str) -> None:
+        """Give the chosen transmitter an access point of the survey, or none of them for ""."""
+        survey, tx_m = self.survey, self._tx_m()[self.chosen]
+        assert survey is not None
+        self._learn_from(lambda: survey.with_access_point(access_point, tx_m))
+
+    def _learn_from(self, read: Callable[[], Survey]) -> None:
         partial, all_m, tx_m = self._map(), self._tx_m(), self._tx_m()[self.chosen]
         frequency_hz = self.settings.frequency_hz
 
-        def take(measured: Measurements) -> None:
-            self.measured, self._warnings["act"] = measured, []
+        def take(survey: Survey, measured: Measurements | None, *warnings: str) -> None:
+            self.survey, self.measured, self._warnings["act"] = survey, measured, [*warnings]
             self.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, "reading measurements")
-            with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-                path = Path(folder) / file_name(name, "measured.csv")
-                path.write_bytes(content)
-                measured = load_measurements(path)
-                if not measured.tx_known.any():
-                    measured = load_measurements(path, tx=tx_m)
+            survey = read()
+            if survey.has_several and not survey.positions_m:
+                count = len(survey.access_points)
+                what = f'{survey.name} has {count} access points: choose them in "Access point of the survey".'
+                yield functools.partial(take, survey, None, what)
+                return
+            measured = survey.measurements(tx_m)
             if not self._are_ours(measured).any():
                 position = ", ".join(f"{each:g}" for each in measured.tx[0])
                 raise MeasurementError(
@@ -587,7 +618,7 @@ class Session(WindowJobs):
                     "the first position in the file."
                 )
             measurements_of_each(partial, [np.array([each_m]) for each_m in all_m.values()], measured, frequency_hz)
-            yield functools.partial(take, measured)
+            yield functools.partial(take, survey, measured)
 
         self.begin(work)
 
@@ -627,9 +658,16 @@ class Session(WindowJobs):
         text = answer.settings.text(self._map())
         if kind == "png":
             title = f"{PurePath(self.title).name}\n{text}"
-            return answer_png(answer, self.shown_view, threshold_dbm, self._map(), title, self.plan)
-        heading = self.title, f"{answer.made:%Y-%m-%d}", text
-        return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=self._map())
+            marks = Marks(*self.measured_points(), aims_m(self.partial, self.transmitters.values()), self.views)
+            return answer_png(answer, self.shown_view, threshold_dbm, self._map(), title, self.plan, marks)
+        heading = PurePath(self.title).name, f"{answer.made:%Y-%m-%d}", text
+        of_window: dict[str, Any] = {"scene": self._map(), "logo": self.logo and self.logo[1]}
+        return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, **of_window)
+
+    def take_logo(self, content: bytes, name: str) -> None:
+        """Take a picture for the report; none for no content."""
+        self.logo = (file_name(name, "logo"), content) if content and len(read_logo(content)) else None
+        self._show()
 
     def python(self) -> str:
         if self.partial is None or not self.transmitters:
@@ -640,4 +678,4 @@ class Session(WindowJobs):
         source = self.source and (self.source.name, self.source.content, self.source.settings)
         strokes = [asdict(each) for each in self.strokes] if source else []
         of_window = self._map(), self.title, self.transmitters, self.settings, self.measured
-        return Project(*of_window, asdict(self.view), source or None, strokes)
+        return Project(*of_window, asdict(self.view), source or None, strokes, self.logo)
