@@ -155,3 +155,16 @@ class TestLogo:
         assert "tx at (1.00, 1.00, 1.50) m, 23 dBm" in figure.axes[-1].texts[0].get_text()
         with pytest.raises(SettingsError, match=r"eirp_dbm = \[1, 2, 3\] is not allowed: give one power, or 2\."):
             plot_report(window.answer.coverage, eirp_dbm=[1, 2, 3], threshold_dbm=-67.0)
+
+
+def test_one_inside_and_one_outside_of_a_complete_map() -> None:
+    """A map is complete for the transmitter that nothing unknown can reach, and not for the other one."""
+    partial = sp.map_from_array([[1, 1, 1, 1, 2, 2], [1, 0, 0, 1, 2, 2], [1, 0, 0, 1, 2, 2], [1, 1, 1, 1, 2, 2]], 1.0)
+    tx_m = {"inside": (1.5, 1.5, 1.5), "outside": (5.5, 1.5, 1.5)}
+    alone = [sp.predict_map(partial, each_m, spacing_m=0.5).attrs for each_m in tx_m.values()]
+    assert [each["map_complete"] for each in alone] == [1, 0]
+    coverage = sp.predict_map(partial, tx_m, spacing_m=0.5)
+    for name in ("map_complete", "predictor", "predictor_sha256"):
+        assert coverage.attrs[name] == alone[1][name]
+    figure = plot_report(coverage, eirp_dbm=23.0, threshold_dbm=-67.0)
+    assert "a distribution learned from other buildings" in figure.axes[-1].texts[0].get_text()
