@@ -15,6 +15,7 @@ from test_app import PARTIAL, Window, picture
 
 import sionna_partial as sp
 from sionna_partial.apps.app import answer as answer_module
+from sionna_partial.apps.app.answer import measured_powers_dbm
 from sionna_partial.apps.app.server import _take_upload
 from sionna_partial.errors import SettingsError
 from sionna_partial.files import unzipped
@@ -29,11 +30,11 @@ BOTH = "x,y,bssid,ssid,rssi\n" + "".join(
 @pytest.fixture
 def window() -> Iterator[Window]:
     made = Window()
-    made.session.open_map(PARTIAL, "room.yaml")
+    made.session.maps.open_map(PARTIAL, "room.yaml")
     made.session.settings = replace(made.session.settings, spacing_m=0.5)
     made.put((1.0, 1.0), (3.0, 1.0))
     yield made
-    made.session.close()
+    made.session.jobs.close()
 
 
 def png(columns: int, rows: int) -> bytes:
@@ -53,27 +54,27 @@ class TestSurveys:
         assert session.warnings == ['survey.csv has 2 access points: choose them in "Access point of the survey".']
         for name, access_point in (("tx1", "02:0a"), ("tx2", "02:0b")):
             session.chosen = name
-            session.assign(access_point)
+            session.surveys.assign(access_point)
             assert window.settle() == "Ready."
         assert session.measured.tx.tolist() == [[1.0, 1.0, 1.5]] * 2 + [[3.0, 1.0, 1.5]]
         assert session.measured.gain_db.tolist() == [-40.0, -50.0, -55.0]
         assert window.answer.coverage.attrs["measured_links"] == 3
         assert session.measured_names() == ["tx1", "tx1", "tx2"]
-        assert [name for name, _ in session.measured_powers()] == ["tx1", "tx2"]
-        session.assign("02:0a")  # an access point is at one place
+        assert [name for name, _ in measured_powers_dbm(window.answer)] == ["tx1", "tx2"]
+        session.surveys.assign("02:0a")  # an access point is at one place
         window.settle()
         assert session.measured.tx.tolist() == [[3.0, 1.0, 1.5]] * 2
         csv = unzipped(session.file("project"), 10**7)["measured.csv"].decode()
         assert csv.splitlines()[:2] == ["tx_x,tx_y,tx_z,rx_x,rx_y,rx_z,gain_db", "3.0,1.0,1.5,1.5,2.0,1.5,-40.0"]
-        session.assign("")
+        session.surveys.assign("")
         window.settle()
         assert (session.measured, session.survey.positions_m) == (None, {})
-        session.forget_measurements()
+        session.surveys.forget_measurements()
         assert session.survey is None
 
     def test_transmitters_that_are_named_as_access_points(self, window: Window) -> None:
-        window.session.change("tx2", new_name="Attic")
-        window.session.learn(b"x,y,ssid,rssi\n1.5,2.0,attic,-40\n3.0,2.5,cellar,-50\n", "survey.csv")
+        window.session.radios.change("tx2", new_name="Attic")
+        window.session.surveys.learn(b"x,y,ssid,rssi\n1.5,2.0,attic,-40\n3.0,2.5,cellar,-50\n", "survey.csv")
         window.settle()
         assert window.session.measured.tx.tolist() == [[3.0, 1.0, 1.5]]
 
@@ -83,12 +84,12 @@ class TestSurveys:
         survey = json.dumps({"img_path": "/home/me/flat.png", "survey_points": points}).encode()
         _take_upload(session, "map", [("survey.json", survey)])
         assert "'survey.json' has powers at pixels of a floor plan: open the plan as a picture" in window.settle()
-        assert session.status.is_error
-        session.upload_map([("flat.png", picture())])
+        assert session.jobs.status.is_error
+        session.maps.upload_map([("flat.png", picture())])
         window.settle()
-        session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+        session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
         window.settle()
-        session.set(spacing_m=0.5)
+        session.radios.set(spacing_m=0.5)
         window.put((1.0, 1.0))
         _take_upload(session, "map", [("survey.json", survey)])
         assert window.settle() == "Ready."
@@ -97,8 +98,8 @@ class TestSurveys:
     def test_points_antennas_and_views_are_on_the_png(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
         session, figures = window.session, list[Figure]()
         session.chosen = "tx1"
-        session.change("tx1", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        session.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
+        session.radios.change("tx1", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+        session.surveys.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
         window.settle()
         monkeypatch.setattr(answer_module, "figure_png", lambda figure: figures.append(figure) or b"")
         session.file("png")
@@ -116,15 +117,15 @@ class TestLogo:
         bare = session.file("pdf")
         _take_upload(session, "logo", [("acme.png", png(300, 100))])
         assert session.file("pdf") == session.file("pdf") != bare
-        other.session.upload_map([("mine.zip", session.file("project"))])
+        other.session.maps.upload_map([("mine.zip", session.file("project"))])
         other.settle()
         assert other.session.logo == session.logo == ("acme.png", png(300, 100))
         _take_upload(session, "logo", [("acme.txt", b"acme")])
-        assert "give a PNG or JPEG of up to 1,000,000 bytes" in session.status.message
+        assert "give a PNG or JPEG of up to 1,000,000 bytes" in session.jobs.status.message
         assert session.logo == ("acme.png", png(300, 100))
         session.take_logo(b"", "")
         assert session.file("pdf") == bare
-        other.session.close()
+        other.session.jobs.close()
 
     def test_it_is_beside_the_title(self, window: Window, tmp_path: Path) -> None:
         (tmp_path / "acme.png").write_bytes(png(300, 100))

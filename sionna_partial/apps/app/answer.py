@@ -14,6 +14,7 @@ from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Checked, require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.coverage.dataset import OFFSET
 from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import Outline, Scale, plot_layer
@@ -154,6 +155,15 @@ class Answer:
         if not here.any():
             return None
         return float((states[0] == states[1]).mean()), math.sqrt(float(np.mean((gains_db[0] - gains_db[1]) ** 2)))
+
+
+def measured_powers_dbm(answer: Answer | None) -> list[tuple[str, float]]:
+    """Return the power that fits the measured powers of each measured transmitter [dBm]."""
+    if answer is None or OFFSET not in answer.coverage.coords:
+        return []
+    powers_dbm = answer.coverage[OFFSET].to_numpy().tolist()
+    pairs = zip(map(str, answer.coverage["tx"].to_numpy()), powers_dbm, strict=True)
+    return [(name, power_dbm) for name, power_dbm in pairs if math.isfinite(power_dbm)]
 
 
 def answer_png(
