@@ -13,6 +13,7 @@ import itertools
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -91,8 +92,10 @@ def main() -> None:
     command = [sys.executable, "-m", "sionna_partial", "app", "--no-browser"]
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server,
+        ExitStack() as stack,
         tempfile.TemporaryDirectory() as folder,
     ):
+        stack.callback(server.terminate)  # also after a failure: the server would be waited for
         assert server.stdout is not None
         with chromium(Path(folder)) as open_tab:
             tab = open_tab(server.stdout.readline().split()[1], WIDTH, HEIGHT)
@@ -114,7 +117,6 @@ def main() -> None:
             tab.wait(READY, WAIT_S)
             tab.run("new Promise(done => setTimeout(done, 1000))")
             tab.screenshot(given.out)
-        server.terminate()
 
 
 if __name__ == "__main__":

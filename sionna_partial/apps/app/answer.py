@@ -182,5 +182,5 @@ def answer_png(
     layer = scale.of(layer) if scale else layer
     layer = replace(layer, title=answer.title(view, threshold_dbm))
     outline, drawn = answer.outline(view, one, threshold_dbm), None if plan is None else (plan.shade, plan.size_m)
-    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn, marks and marks.draw)
+    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn, marks.draw if marks else None)
     return figure_png(figure)

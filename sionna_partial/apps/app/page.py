@@ -539,7 +539,7 @@ class Page:
     def _show_points(self) -> None:
         (rx_m, used), measured = self.session.measured_points(), self.session.measured
         colours = [USED if each else UNUSED for each in used]
-        values = [] if measured is None else measured.gain_db
+        values: Any = [] if measured is None else measured.gain_db
         of_points = {"x": rx_m[:, 0], "y": rx_m[:, 1], "value": values, "name": self.session.measured_names()}
         self.picture.measured.data = of_points | {"colour": colours}
         unused = f", {(~used).sum()} of them not used (white)" if not used.all() else ""

@@ -117,7 +117,7 @@ class WindowState:
 
     def are_ours(self, measured: Measurements) -> Bools:
         """Return which measured links (N,) are of a transmitter of this window."""
-        return self._of_each(measured).any(axis=0)
+        return np.asarray(self._of_each(measured).any(axis=0))
 
     def _of_each(self, measured: Measurements) -> Bools:
         """Return which measured links are of each transmitter (T, N)."""
