@@ -13,6 +13,7 @@ import itertools
 import subprocess
 import sys
 import tempfile
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -62,6 +63,7 @@ def shot(tab: Any, folder: Path) -> Image.Image:
 def record(tab: Any, folder: Path, path: Path) -> None:
     """Drag the transmitter of the page, and write what it shows as an animation."""
     tab.run(f"{MODEL}('layer').value = 'gain_mean_db', 0")
+    tab.wait(f"{MODEL}('picture').title.text.includes('gain')", WAIT_S)
     tab.run(f"{MODEL}('picture').toolbar.tools.filter(t => t.type == 'HoverTool').forEach(t => t.active = false), 0")
     frames: list[tuple[Image.Image, int]] = []
     for start_m, stop_m in itertools.pairwise(PLACES_M):
@@ -91,8 +93,10 @@ def main() -> None:
     command = [sys.executable, "-m", "sionna_partial", "app", "--no-browser"]
     with (
         subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as server,
+        ExitStack() as stack,
         tempfile.TemporaryDirectory() as folder,
     ):
+        stack.callback(server.terminate)  # also after a failure: the server would be waited for
         assert server.stdout is not None
         with chromium(Path(folder)) as open_tab:
             tab = open_tab(server.stdout.readline().split()[1], WIDTH, HEIGHT)
@@ -114,7 +118,6 @@ def main() -> None:
             tab.wait(READY, WAIT_S)
             tab.run("new Promise(done => setTimeout(done, 1000))")
             tab.screenshot(given.out)
-        server.terminate()
 
 
 if __name__ == "__main__":

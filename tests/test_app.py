@@ -45,7 +45,7 @@ from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.plots.coverage_plot import report_figure
+from sionna_partial.plots.coverage_plot import plot_report
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -290,7 +290,7 @@ def test_rooms_are_listed_with_their_coverage(window: Window) -> None:
     page.session.settings = window.session.settings
     page.show()
     assert re.search(r"Rooms, the least covered first: &lt;east&gt; \d+%, west \d+%\.", page.summary.text)
-    text = report_figure(window.answer.coverage, [23.0], -20.0).axes[-1].texts[0].get_text()
+    text = plot_report(window.answer.coverage, eirp_dbm=23.0, threshold_dbm=-20.0).axes[-1].texts[0].get_text()
     assert re.search(r"Rooms above -20 dBm, the least covered first: <east> \d+%, west \d+%", text)
     page.session.jobs.close()
 

@@ -18,7 +18,7 @@ from sionna_partial.maps.importers.bags import map_from_bag, map_from_occupancy
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.measurements.measurements import measurements_of
-from sionna_partial.measurements.recordings import measurements_from_bag, poses_from_bag
+from sionna_partial.measurements.recordings import load_survey, measurements_from_bag, poses_from_bag
 
 EARLY, LATE, SIDE = [[-1, -1, -1], [-1, 0, 100]], [[100, 0, 0], [0, 0, 100]], [[0, 100]]
 TIMES = np.arange(0.0, 10.01, 0.5)
@@ -163,6 +163,13 @@ class TestPowers:
         measured = measurements_of(table)
         np.testing.assert_allclose(measured.rx, np.column_stack([x, y, 0 * x + 1.5]), atol=1e-5)
         np.testing.assert_allclose(measured.tx, np.tile(self.TX, (20, 1)))
+
+    def test_the_only_topic_of_powers_as_any_survey(self, drive: Path) -> None:
+        with pytest.warns(MapWarning, match="1 of 21 powers"):
+            measured = load_survey(drive, self.TX)
+        np.testing.assert_allclose(measured.gain_db, -50.0 - TIMES[:-1], atol=1e-4)
+        with pytest.raises(MeasurementError, match=r"access_point is not for a rosbag \('.*drive.*'\), which has one"):
+            load_survey(drive, access_point="home")
 
     def test_by_stamps(self, drive: Path, tmp_path: Path) -> None:
         options = {"field": "temperature", "pose_topic": "/odom", "rx_height_m": 0.4}

@@ -267,7 +267,9 @@ class TestPredict:
             (["--tx"], "is not a position: give --tx X Y or --tx X Y Z in metres."),
             ([*AT, "--material", "cheese"], "error: material = 'cheese' is not allowed: choose one of drywall, brick"),
             ([*AT, "--material", "2,3"], "--material '2,3' is neither a name nor permittivity,conductivity,thickness"),
-            ([*AT, "--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html, .yaml."),
+            ([*AT, "--format", "jpg"], "--format 'jpg' is not known: choose from .nc, .tif, .csv, .png, .html,"),
+            ([*AT, "--logo", "acme.png"], "--logo is for the report: give --format pdf as well."),
+            ([*AT, "--format", "pdf", "--logo", "acme.png"], "error: logo = 'acme.png' cannot be read (No such file"),
             ([*AT, "--memory", "0.1"], "error: memory_gb = 0.1 is too little"),
             ([*AT, "--power", "1e9"], "error: --power = 1000000000.0 is not allowed: give a number in [-200, 200]."),
         ],
@@ -288,10 +290,11 @@ class TestPredict:
         assert len(full.stderr.splitlines()) == len(blocked.stderr.splitlines()) == 1
         assert not out.exists()
         files_that_fit(99)
-        formats = ("--format", "nc", "--format", ".CSV", "--format", "nc")
-        result = run("predict", map_path, *words, "--out", out, *formats)
-        assert sorted(path.name for path in out.iterdir()) == ["coverage.csv", "coverage.nc"]
-        assert result.stdout == f"wrote {out / 'coverage.nc'}\nwrote {out / 'coverage.csv'}\n"
+        formats = ("--format", "nc", "--format", ".CSV", "--format", "nc", "--format", "pdf")
+        Image.new("L", (30, 10)).save(tmp_path / "acme.png")
+        result = run("predict", map_path, *words, "--out", out, *formats, "--logo", tmp_path / "acme.png")
+        assert sorted(path.name for path in out.iterdir()) == ["coverage.csv", "coverage.nc", "coverage.pdf"]
+        assert result.stdout == "".join(f"wrote {out / f'coverage.{kind}'}\n" for kind in ("nc", "csv", "pdf"))
 
 
 def test_texts_of_files_do_not_reach_the_terminal_raw() -> None:

@@ -14,7 +14,7 @@ from sionna_partial.constants import LinkState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage, report_figure
+from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage, plot_report
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
 
 LOS, NLOS, OUTAGE = (
@@ -139,7 +139,7 @@ def test_several_transmitters_have_a_row_each(several, figure):
 
 
 def test_the_report_has_names_any_transmitter_uncertainty_and_material(several):
-    figure = report_figure(several, [20.0, 30.0], -67.0, ("flat_2.png", "2026-11-25"))
+    figure = plot_report(several, eirp_dbm=[20.0, 30.0], threshold_dbm=-67.0, heading=("flat_2.png", "2026-11-25"))
     (text,) = [text.get_text() for axis in figure.axes for text in axis.texts if "Uncertainty" in text.get_text()]
     rows = text.split("\n\n")[0].splitlines()
     assert [row.split(" ")[0] for row in rows] == ["Observed", *several["tx"].to_numpy(), "any"]
@@ -147,7 +147,8 @@ def test_the_report_has_names_any_transmitter_uncertainty_and_material(several):
     assert [row.count("%") for row in rows] == [0, 8, 8, 8]
     assert re.search(r"Material of the walls: \w+", text)
     assert "flat_2.png" in figure.get_suptitle()
-    assert len([axis for axis in report_figure(several.isel(y=slice(8)), 20.0, -67.0).axes if axis.get_title()]) == 3
+    low = plot_report(several.isel(y=slice(8)), eirp_dbm=20.0, threshold_dbm=-67.0)
+    assert len([axis for axis in low.axes if axis.get_title()]) == 3
 
 
 def test_the_outside_is_blank_on_a_complete_map_alone(coverage):

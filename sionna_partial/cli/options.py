@@ -27,7 +27,7 @@ GROUPS = {
     ),
     "Walls": ("material", "through_walls", "material_of", "wall_layer", "wall_height", "obstacle_height"),
     "Map": ("strict", "resolution", "unit", "up", "height_band", "storey"),
-    "Output": ("out", "formats", "memory"),
+    "Output": ("out", "formats", "logo", "memory"),
 }
 """Groups of options in the help of a command."""
 
@@ -140,8 +140,8 @@ ThroughWalls = Annotated[
 Measured = Annotated[
     Path | None,
     typer.Option(
-        metavar="CSV|JSON|VWM",
-        help="Measured gains, or powers as a phone (x, y, rssi), wifi-survey-heatmap or Valeronoi (.vwm) writes them.",
+        metavar="CSV|JSON|VWM|BAG",
+        help="Measured gains; powers of a phone (x, y, rssi), wifi-survey-heatmap, Valeronoi (.vwm), or a rosbag.",
         show_default=False,
     ),
 ]
@@ -266,6 +266,8 @@ def read_measurements(
     pixel_m: float | None = None,
 ) -> Any:
     """Read the file of --measurements with the headers of --column; `tx` is the default position."""
+    from sionna_partial.measurements.recordings import load_survey  # imports SciPy
+
     pairs = [text.partition("=") for text in column or ()]
     wrong = next((name for name, _, header in pairs if not name or not header), None)
     if wrong is not None:
@@ -274,10 +276,8 @@ def read_measurements(
         return None
     options: dict[str, Any] = {"columns": {name: header for name, _, header in pairs} or None}
     options |= {"access_point": access_point, "pixel_m": pixel_m}
-    measured = sp.load_measurements(path, **options)
-    if tx is not None and not measured.tx_known.any():
-        return sp.load_measurements(path, **options, tx=tx)
-    return measured
+    measured = load_survey(path, **options)
+    return load_survey(path, tx=tx, **options) if tx is not None and not measured.tx_known.any() else measured
 
 
 def parse_antenna(text: str, azimuth_deg: float, downtilt_deg: float) -> Any:

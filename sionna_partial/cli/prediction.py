@@ -27,6 +27,9 @@ from sionna_partial.settings import Policy, SceneSettings
 
 FORMATS = (".nc", ".tif", ".csv", ".png", ".html", ".yaml")
 
+REPORT = ".pdf"
+"""Format of the report, which is written on request."""
+
 FRAMES = 50
 """Approximate number of frames of an animation."""
 
@@ -83,14 +86,21 @@ def predict(
     partial: opt.PartialMap,
     memory: opt.Memory = MEMORY_GB,
     formats: Annotated[list[str], typer.Option("--format", help="Format; may be repeated.")] = list(FORMATS),  # noqa: B006
+    logo: Annotated[
+        Path | None, typer.Option(help="PNG or JPEG for the report (--format pdf).", show_default=False)
+    ] = None,
 ) -> None:
     """Predict the coverage of a transmitter on a partial map."""
     position, antenna = opt.parse_position(tx) if tx else None, opt.parse_antenna(tx_antenna, azimuth, tilt)
     suffixes = [_parse_format(name) for name in formats]
     budget = _budget(power, threshold)
-    with opt.reporting_to(out, "loading the predictor") as report:
-        from sionna_partial.plots.style import figure_png
+    if logo is not None and REPORT not in suffixes:
+        raise typer.BadParameter("--logo is for the report: give --format pdf as well.")
+    if logo is not None:
+        from sionna_partial.plots.logo import read_logo
 
+        read_logo(logo)  # a wrong one is refused before the prediction
+    with opt.reporting_to(out, "loading the predictor") as report:
         coverage = sp.predict_map(
             partial,
             position,
@@ -108,17 +118,27 @@ def predict(
         with atomic_files(out) as folder:
             for index, name in enumerate(names):
                 report(0.9 + 0.1 * index / len(names), f"writing {name}")
-                if name == PICTURE and budget:
-                    figure = sp.plots.plot_coverage(coverage, threshold_db=budget.gain_db)
-                    (folder / name).write_bytes(figure_png(figure))
-                else:
-                    threshold_db = budget.gain_db if budget else COST_THRESHOLD_DB
-                    sp.save_coverage(coverage, folder / name, scene=partial, threshold_db=threshold_db)
+                _write(coverage, folder / name, partial, budget, logo)
     if "wall_material" in coverage.attrs:
         typer.echo(f"walls: {coverage.attrs['wall_material']}, mean loss {coverage.attrs['wall_loss_db']:.1f} dB")
     opt.print_files(out, names)
     if budget:
         typer.echo(_covered(coverage, budget) + (f"; open {out / PICTURE}" if PICTURE in names else ""))
+
+
+def _write(coverage: Any, path: Path, partial: Any, budget: "_Budget | None", logo: Path | None) -> None:
+    """Write one file of a coverage map."""
+    from sionna_partial.plots.coverage_plot import report_pdf
+    from sionna_partial.plots.style import figure_png
+
+    if path.suffix == REPORT:
+        power_dbm, threshold_dbm = budget or (POWER_DBM, THRESHOLD_DBM)
+        given = {"eirp_dbm": power_dbm, "threshold_dbm": threshold_dbm}
+        path.write_bytes(report_pdf(coverage, **given, scene=partial, logo=logo))
+    elif path.name == PICTURE and budget:
+        path.write_bytes(figure_png(sp.plots.plot_coverage(coverage, threshold_db=budget.gain_db)))
+    else:
+        sp.save_coverage(coverage, path, scene=partial, threshold_db=budget.gain_db if budget else COST_THRESHOLD_DB)
 
 
 class _Budget(NamedTuple):
@@ -247,8 +267,8 @@ def info(*, partial: opt.PartialMapIfGiven) -> None:
 
 def _parse_format(name: str) -> str:
     suffix = "." + name.lower().lstrip(".")
-    if suffix not in FORMATS:
-        raise typer.BadParameter(f"--format {name!r} is not known: choose from {', '.join(FORMATS)}.")
+    if suffix not in (*FORMATS, REPORT):
+        raise typer.BadParameter(f"--format {name!r} is not known: choose from {', '.join((*FORMATS, REPORT))}.")
     return suffix
 
 

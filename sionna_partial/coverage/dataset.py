@@ -40,8 +40,11 @@ TX_COORDINATES = ("tx_x", "tx_y", "tx_z")
 ROOM = "room"
 """Variable with the room of each receiver: flags, 0 for none."""
 
-ANTENNA = "tx_antenna"
-"""Antenna: attribute for one transmitter, coordinate along "tx" for several."""
+WALLS = "wall_material"
+"""Attribute: probabilities of unknown materials."""
+
+ANTENNA, OFFSET = "tx_antenna", "measured_offset_db"
+"""Antenna, offset of measured powers [dB]: attributes for one transmitter, coordinates along "tx" for several."""
 
 FLOORS = ("observed", "all")
 """Floors of `radio.area` besides the rooms of the map."""
@@ -159,10 +162,26 @@ def join_transmitters(maps: list[xr.Dataset], names: list[str]) -> xr.Dataset:
         name: ("tx", column, {"units": "m"}) for name, column in zip(TX_COORDINATES, positions_m.T, strict=True)
     }
     of_all = [name for name in _OF_ALL if name in maps[0]]
+    measured = [each.attrs.pop("measured_links", 0) for each in maps]
+    offsets_db = "tx", [each.attrs.pop(OFFSET, np.nan) for each in maps], {"units": "dB"}
+    # for a transmitter that nothing unknown can reach, the map is complete
+    predicted = next((each.attrs for each in maps if not each.attrs["map_complete"]), maps[0].attrs)
+    of_any = {name: predicted[name] for name in ("map_complete", "predictor", "predictor_sha256")}
+    walls = [*dict.fromkeys(each.attrs[WALLS] for each in maps if WALLS in each.attrs)]
+    of_any |= {WALLS: "; ".join(walls)} if walls else {}
     joined = xr.concat([each.drop_vars(of_all) for each in maps], "tx", combine_attrs="drop_conflicts")
+    joined = joined.assign_attrs(of_any)
+    if any(measured):
+        joined, coordinates = joined.assign_attrs(measured_links=sum(measured)), coordinates | {OFFSET: offsets_db}
     return joined.assign({name: maps[0][name] for name in of_all}).assign_coords(
         {"tx": names, ANTENNA: antennas, **coordinates}
     )
+
+
+def named_transmitter(coverage: xr.Dataset, name: str) -> xr.Dataset:
+    """Return the coverage of one transmitter as that of several, with one name."""
+    bare = require_coverage(coverage).copy()
+    return join_transmitters([bare.drop_dims([each for each in ("tx_x", "tx_y") if each in bare.dims])], [name])
 
 
 def require_coverage(coverage: xr.Dataset) -> xr.Dataset:

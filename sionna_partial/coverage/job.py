@@ -33,6 +33,7 @@ from sionna_partial.coverage.dataset import (
     ANTENNA,
     ATTRIBUTES,
     DISTRIBUTION,
+    OFFSET,
     ROOM,
     WALL_PARTS,
     flags,
@@ -494,7 +495,7 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
     return {
         "measured_links": len(measured),
         "measured_noise_db": float(noise_db),
-        "measured_offset_db": float(offset_db),
+        OFFSET: float(offset_db),
         "measured_shadow_scale": float(shadow_scale),
     }
 

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -14,16 +15,17 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
 from sionna_partial.checks import number_of, shown
-from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_HEIGHT_M
 from sionna_partial.errors import MeasurementError
+from sionna_partial.files import is_path
 from sionna_partial.maps.importers.bags import GRID, Message, Recording, open_recording
 from sionna_partial.maps.partial_map import MapWarning
-from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.measurements import Measurements, load_measurements, measurements_of
 
 if TYPE_CHECKING:
     import xarray as xr
 
-TF, _STATIC = "TFMessage", "_static"
+TF, _STATIC, _POWERS = "TFMessage", "_static", "Float32"
 
 POSES = ("PoseWithCovarianceStamped", "PoseStamped", "Odometry")
 
@@ -87,7 +89,7 @@ def poses_from_bag(path: str | os.PathLike[str], *, topic: str | None = None, fr
 
 def measurements_from_bag(
     path: str | os.PathLike[str],
-    topic: str,
+    topic: str | None = None,
     tx: ArrayLike | None = None,
     *,
     tx_power_dbm: float,
@@ -105,8 +107,8 @@ def measurements_from_bag(
     ----------
     path : path-like
         A .bag, .mcap, .db3, or folder.
-    topic : str
-        Topic of the received powers [dBm].
+    topic : str, optional
+        Topic of the received powers [dBm], by default the only one of `std_msgs/Float32`.
     tx : (3,) array-like, optional
         Transmitter [m]; NaN in the table if unknown.
     tx_power_dbm : float
@@ -142,7 +144,8 @@ def measurements_from_bag(
         if not math.isfinite(number_of(value)):
             raise MeasurementError(f"{name} = {shown(value)} is not allowed: give a number of {unit}.")
     with open_recording(path, MeasurementError) as recording:
-        messages = [*recording.messages(recording.topic_of(topic, ()))]
+        topic = recording.topic_of(topic, () if topic else (_POWERS,))
+        messages = [*recording.messages(topic)]
         powers = np.array([_power(each, field, topic) for each in messages])
         stamped = bool(messages) and all(each.stamp_s for each in messages)
         track = _robot_track(recording, pose_topic, frame, stamped=stamped)
@@ -165,6 +168,17 @@ def measurements_from_bag(
     columns = {f"{end}_{axis}": getattr(measured, end)[:, at] for end in ("tx", "rx") for at, axis in enumerate("xyz")}
     columns |= {"gain_db": measured.gain_db, "time_s": times_s[used] - start_s}
     return xr.Dataset({name: ("link", values) for name, values in columns.items()})
+
+
+def load_survey(path: str | os.PathLike[str], tx: Any = None, **options: Any) -> Measurements:
+    """Read powers of a rosbag's only topic of them, or any file of `load_measurements` with its options."""
+    if not is_path(path) or not (Path(path).suffix.lower() in BAG_SUFFIXES or Path(path).is_dir()):
+        return load_measurements(path, tx=tx, **options)
+    given = [name for name, value in options.items() if value is not None]
+    if given or isinstance(tx, Mapping):
+        name = given[0] if given else "tx of several"
+        raise MeasurementError(f"{name} is not for a rosbag ('{path}'), which has one transmitter: leave it out.")
+    return measurements_of(measurements_from_bag(path, tx=tx, tx_power_dbm=0.0))
 
 
 def _pose_table(track: _Track) -> xr.Dataset:

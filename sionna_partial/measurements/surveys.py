@@ -130,7 +130,7 @@ def read_survey(
     """Read a survey file; `tx_power_dbm` is subtracted from received powers, `pixel_m` is the plan's pixel [m]."""
     source = input_path(path, "measurements", MeasurementError, GIVE)
     suffix = source.suffix.lower()
-    is_json = suffix != ".vwm" and (suffix == ".json" or _head(source).lstrip()[:1] in (b"{", b"["))
+    is_json = suffix != ".vwm" and is_plan_survey(source)
     for name, value, used in (("columns", columns, suffix != ".vwm" and not is_json), ("pixel_m", pixel_m, is_json)):
         if value is not None and not used:
             kind = "a CSV" if name == "columns" else "a survey on the pixels of a plan (JSON)"
@@ -147,6 +147,11 @@ def read_survey(
     if absent:
         raise MeasurementError(f"measurements '{source.name}' has no column {absent[0]!r}: check columns.")
     return _of_columns(source.name, found, tx_power_dbm)
+
+
+def is_plan_survey(source: Path) -> bool:
+    """Return whether a survey is a JSON, with powers at pixels of a plan."""
+    return source.suffix.lower() == ".json" or _head(source).lstrip()[:1] in (b"{", b"[")
 
 
 def _head(source: Path) -> bytes:

@@ -4,6 +4,7 @@ import io
 import itertools
 import json
 import math
+import os
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -27,6 +28,7 @@ from sionna_partial.coverage.dataset import (
     FLOORS,
     TX_COORDINATES,
     WALL_PARTS,
+    named_transmitter,
     probability_above,
     require_coverage,
     transmitter_text,
@@ -35,6 +37,7 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.coverage.network import require_network
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import likely_region
+from sionna_partial.plots.logo import read_logo
 from sionna_partial.plots.style import (
     FAILS,
     INK,
@@ -62,6 +65,7 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
+_ONLY, _LOGO_IN, _TITLE_BESIDE_LOGO = "tx", (1.8, 0.55), 62
 _REPORT_LINE_IN, _REPORT_WIDTH, _MOST_ROOMS, _BESIDE_IN, _BELOW_IN = 0.14, 124, 12, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
 
@@ -447,10 +451,12 @@ def plot_layer(
     partial: PartialMap,
     title: str,
     plan: tuple[States, tuple[float, float]] | None = None,
+    draw_marks: Callable[[Axes], Sequence[Line2D | Patch]] | None = None,
 ) -> Figure:
     """Draw a layer of `one` (y, x) with all transmitters of `coverage`, as on the page of the app.
 
-    `plan` has shades (rows, columns) of a floor plan, and its width and height [m].
+    `plan` has shades (rows, columns) of a floor plan, and its width and height [m]; `draw_marks` draws on the axes, and
+    returns handles of the legend.
     """
     aspect = one.sizes["x"] / one.sizes["y"]
     figure, ((axis,),) = _panels(1, 1, aspect, keys_in=1.2)
@@ -467,6 +473,7 @@ def plot_layer(
     handles += outline.draw(axis, one) if outline else []
     if _hatched(one).any():
         handles.append(_not_observed())
+    handles += draw_marks(axis) if draw_marks else []
     _draw_names(axis, coverage)
     bar = figure.colorbar(ScalarMappable(layer.norm, layer.cmap), ax=axis, label=layer.label, panchor=False)
     if layer.ticks is not None:
@@ -512,40 +519,87 @@ def _not_observed() -> Patch:
     return Patch(facecolor="0.55", hatch=2 * _HATCH, edgecolor="white", linewidth=0.0, label="not observed")
 
 
-def report_pdf(
-    coverage: xr.Dataset,
-    eirp_dbm: ArrayLike,
-    threshold_dbm: float,
-    heading: Sequence[str] = (),
-    partial: PartialMap | None = None,
-) -> bytes:
-    """Return `report_figure` as PDF; equal maps give equal bytes."""
-    figure, stream = report_figure(coverage, eirp_dbm, threshold_dbm, heading, partial), io.BytesIO()
+def report_pdf(coverage: xr.Dataset, **given: Any) -> bytes:
+    """Return `plot_report` as PDF; equal arguments give equal bytes."""
+    figure, stream = plot_report(coverage, **given), io.BytesIO()
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
 
 
-def report_figure(
+def plot_report(
     coverage: xr.Dataset,
+    *,
     eirp_dbm: ArrayLike,
     threshold_dbm: float,
     heading: Sequence[str] = (),
-    partial: PartialMap | None = None,
+    scene: PartialMap | None = None,
+    logo: str | os.PathLike[str] | bytes | None = None,
 ) -> Figure:
-    """Draw a page on named transmitters: maps, covered area, uncertainty; `partial` has the materials of walls."""
-    maps, powers_dbm = transmitters_of(coverage), np.broadcast_to(eirp_dbm, coverage.sizes["tx"])
+    """Draw a report of one page: maps, covered area of transmitters and rooms, uncertainty, materials of walls.
+
+    Parameters
+    ----------
+    coverage : xarray.Dataset
+        From `predict_map`, of up to about ten transmitters.
+    eirp_dbm : float or (T,) array-like
+        Power of each transmitter, with its antenna [dBm].
+    threshold_dbm : float
+        Received power that a receiver needs [dBm].
+    heading : sequence of str
+        Parts of the title, such as a name and a date.
+    scene : PartialMap, optional
+        The map, which has the materials of walls.
+    logo : path-like or bytes, optional
+        PNG or JPEG of up to 1 MB, for the upper right corner.
+
+    Raises
+    ------
+    SettingsError
+        For anything but a coverage map, a wrong number of powers, or a file that is no such logo.
+
+    Examples
+    --------
+    >>> import sionna_partial as sp
+    >>> home = sp.make_home(3)
+    >>> coverage = sp.predict_map(home, {"hall": (2.0, 3.0, 1.5)}, spacing_m=0.5)
+    >>> figure = sp.plots.plot_report(coverage, eirp_dbm=23.0, threshold_dbm=-67.0, scene=home)
+    >>> figure.savefig("report.pdf")
+    """
+    maps, picture = transmitters_of(coverage), None if logo is None else read_logo(logo)
+    if "tx" not in coverage.dims:
+        maps = {_ONLY: next(iter(maps.values()))}
+        coverage = named_transmitter(coverage, _ONLY)
+    count = np.size(eirp_dbm)
+    require(count in (1, len(maps)), "eirp_dbm", eirp_dbm, f"give one power, or {len(maps)}.")
+    powers_dbm, partial = np.broadcast_to(np.asarray(eirp_dbm, dtype=np.float64), len(maps)), scene
     notes = (textwrap.fill(note, _REPORT_WIDTH) for note in _report_notes(coverage, partial))
     text = "\n\n".join([_report_table(coverage, maps, powers_dbm, threshold_dbm), *notes])
     text_in = _REPORT_LINE_IN * (text.count("\n") + 2)
     figure = Figure(figsize=_A4_IN, layout="constrained")
     parts: Any = figure.subfigures(2, 1, height_ratios=(_A4_IN[1] - text_in, text_in))
     _draw_report(parts[0], coverage, maps, powers_dbm, threshold_dbm, _A4_IN[1] - text_in - 0.6, partial)
-    title = textwrap.fill(" \N{MIDDLE DOT} ".join(["Radio coverage", *heading]), _TITLE_WIDTH)
-    figure.suptitle(f"{title}\n{headline('Prediction', maps)}", fontsize="medium", parse_math=False)
+    lines = " \N{MIDDLE DOT} ".join(["Radio coverage", *heading]), headline("Prediction", maps)
+    width = _TITLE_WIDTH if picture is None else _TITLE_BESIDE_LOGO
+    look: dict[str, Any] = {} if picture is None else {"x": 0.02, "ha": "left"}
+    title = "\n".join(textwrap.fill(line, width) for line in lines)
+    figure.suptitle(title, fontsize="medium", parse_math=False, **look)
+    if picture is not None:
+        _draw_logo(figure, picture)
     axis = parts[1].subplots()
     axis.set_axis_off()
     axis.text(0.02, 1.0, text, va="top", family="monospace", fontsize=7.5, parse_math=False, transform=axis.transAxes)
     return figure
+
+
+def _draw_logo(figure: Figure, picture: States) -> None:
+    """Draw a logo in the upper right corner, beside the title."""
+    rows, columns = picture.shape[:2]
+    scale = min(_LOGO_IN[0] / columns, _LOGO_IN[1] / rows)
+    width, height = columns * scale / _A4_IN[0], rows * scale / _A4_IN[1]
+    axis = figure.add_axes((0.98 - width, 0.99 - height, width, height))
+    axis.set_in_layout(False)
+    axis.imshow(picture, aspect="auto", interpolation="antialiased")
+    axis.set_axis_off()
 
 
 def _report_grid(most: int, aspect: float, height_in: float) -> tuple[int, int]:
@@ -651,6 +705,8 @@ def _report_notes(coverage: xr.Dataset, partial: PartialMap | None) -> list[str]
         f"The hatched side of a line is not above the threshold with a probability of {_LIKELY:g}. Unobserved floor "
         "counts with the probability that it is indoors."
     ]
+    if "measured_links" in attributes:
+        notes[0] += f" {attributes['measured_links']:,} measured powers correct the prediction."
     std_db = coverage["gain_std_db"].to_numpy()
     observed = np.broadcast_to(coverage["observed"].to_numpy() == 1, std_db.shape) & np.isfinite(std_db)
     spreads = [

@@ -9,10 +9,12 @@ import numpy as np
 import xarray as xr
 
 from sionna_partial.apps.app.drawing import Plan
+from sionna_partial.apps.app.marks import Marks
 from sionna_partial.apps.app.radio import MOST_TRANSMITTERS, RadioSettings
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Checked, require_choice
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
+from sionna_partial.coverage.dataset import OFFSET
 from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import Outline, Scale, plot_layer
@@ -155,15 +157,30 @@ class Answer:
         return float((states[0] == states[1]).mean()), math.sqrt(float(np.mean((gains_db[0] - gains_db[1]) ** 2)))
 
 
+def measured_powers_dbm(answer: Answer | None) -> list[tuple[str, float]]:
+    """Return the power that fits the measured powers of each measured transmitter [dBm]."""
+    if answer is None or OFFSET not in answer.coverage.coords:
+        return []
+    powers_dbm = answer.coverage[OFFSET].to_numpy().tolist()
+    pairs = zip(map(str, answer.coverage["tx"].to_numpy()), powers_dbm, strict=True)
+    return [(name, power_dbm) for name, power_dbm in pairs if math.isfinite(power_dbm)]
+
+
 def answer_png(
-    answer: Answer, view: View, threshold_dbm: float, partial: PartialMap, title: str, plan: Plan | None = None
+    answer: Answer,
+    view: View,
+    threshold_dbm: float,
+    partial: PartialMap,
+    title: str,
+    plan: Plan | None = None,
+    marks: Marks | None = None,
 ) -> bytes:
-    """Return the picture of the page as PNG, with the floor plan that it shows."""
+    """Return the picture of the page as PNG, with the floor plan and the marks that it shows."""
     name = view.transmitter
     one = answer.layers_of(name, threshold_dbm, truth=view.truth)
     layer, scale = LAYERS[view.layer], answer.scale(view.layer, name, threshold_dbm)
     layer = scale.of(layer) if scale else layer
     layer = replace(layer, title=answer.title(view, threshold_dbm))
     outline, drawn = answer.outline(view, one, threshold_dbm), None if plan is None else (plan.shade, plan.size_m)
-    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn)
+    figure = plot_layer(answer.coverage, one, layer, outline, partial, title, drawn, marks.draw if marks else None)
     return figure_png(figure)

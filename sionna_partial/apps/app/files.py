@@ -34,6 +34,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.plots.coverage_plot import report_pdf
+from sionna_partial.plots.logo import read_logo
 from sionna_partial.tracing.antennas import Antenna
 
 MOST_BYTES = 200_000_000
@@ -60,7 +61,8 @@ FILES = {
 }
 """Downloads: kind and file name."""
 
-_MAP, _TEXT, _SOURCE, _VERSION, _MOST_TEXT = "map.npz", "project.json", "source", 1, 20_000_000
+_MAP, _TEXT, _SOURCE, _LOGO, _MEASURED = "map.npz", "project.json", "source", "logo", "measured.csv"
+_VERSION, _MOST_TEXT = 1, 20_000_000
 _ARRAYS = ("tx", "rx", "gain_db", "std_db")
 
 
@@ -117,10 +119,15 @@ def coverage_file(
     heading: Sequence[str] = (),
     *,
     scene: PartialMap | None = None,
+    logo: bytes | None = None,
 ) -> bytes:
-    """Return the content of one of `FILES`; a ROS map is a zip. `heading` is for the report, `scene` for both."""
+    """Return the content of one of `FILES`; a ROS map is a zip.
+
+    `heading` and `logo` are for the report, `scene` for both.
+    """
     if kind == "pdf":
-        return report_pdf(coverage, eirp_dbm, threshold_dbm, heading, scene)
+        given: dict[str, Any] = {"eirp_dbm": eirp_dbm, "threshold_dbm": threshold_dbm, "heading": heading}
+        return report_pdf(coverage, **given, scene=scene, logo=logo)
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         path = Path(folder) / f"coverage.{kind}"
         save_coverage(coverage, path, scene=scene, threshold_db=np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0))
@@ -140,6 +147,7 @@ class Project:
     view: Mapping[str, Any] = field(default_factory=dict)
     source: tuple[str, bytes, Mapping[str, Any]] | None = None
     strokes: Sequence[Mapping[str, Any]] = ()
+    logo: tuple[str, bytes] | None = None
 
 
 def project_file(project: Project) -> bytes:
@@ -154,11 +162,14 @@ def project_file(project: Project) -> bytes:
         "view": {**project.view},
         "source": None,
         "strokes": [*project.strokes],
+        "logo": project.logo and project.logo[0],
     }
-    files: dict[str, bytes] = {}
+    files = {_LOGO: project.logo[1]} if project.logo else dict[str, bytes]()
+    if measured is not None:
+        files[_MEASURED] = _measured_csv(measured)
     if project.source is not None:
         name, content, values = project.source
-        record["source"], files = [PurePath(name).name, {**values}], {_SOURCE: content}
+        record["source"], files[_SOURCE] = [PurePath(name).name, {**values}], content
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         save_map(project.partial, Path(folder) / _MAP)
         files |= {_MAP: (Path(folder) / _MAP).read_bytes(), _TEXT: json.dumps(record, indent=1).encode()}
@@ -185,10 +196,13 @@ def uploaded_project(files: Sequence[tuple[str, bytes]]) -> Project | None:
         with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
             (Path(folder) / _MAP).write_bytes(contents[_MAP])
             partial = load_map(Path(folder) / _MAP)
-        return _project(partial, record, contents.get(_SOURCE))
+        return _project(partial, record, contents)
 
 
-def _project(partial: PartialMap, record: dict[str, Any], content: bytes | None) -> Project:
+def _project(partial: PartialMap, record: dict[str, Any], contents: Mapping[str, bytes]) -> Project:
+    content, logo = contents.get(_SOURCE), contents.get(_LOGO)
+    if logo is not None:
+        read_logo(logo)
     title, settings, measured, transmitters = str(record["title"])[:100], record["settings"], record["measured"], {}
     require(
         len(record["transmitters"]) <= MOST_TRANSMITTERS, "transmitters", len(record["transmitters"]), "give fewer."
@@ -209,6 +223,7 @@ def _project(partial: PartialMap, record: dict[str, Any], content: bytes | None)
         record.get("view", {}),
         (str(record["source"][0]), content, record["source"][1]) if content and record.get("source") else None,
         record.get("strokes", ()),
+        None if logo is None else (str(record["logo"])[:100], logo),
     )
 
 
@@ -216,6 +231,15 @@ def _measured_record(measured: Measurements) -> dict[str, Any]:
     arrays = {name: getattr(measured, name) for name in _ARRAYS}
     listed = {name: None if values is None else values.tolist() for name, values in arrays.items()}
     return {**listed, "sensitivity_db": measured.sensitivity_db}
+
+
+def _measured_csv(measured: Measurements) -> bytes:
+    """Return the measurements as a CSV for `load_measurements`."""
+    columns = {f"{end}_{axis}": getattr(measured, end)[:, at] for end in ("tx", "rx") for at, axis in enumerate("xyz")}
+    columns |= {"gain_db": measured.gain_db}
+    columns |= {} if measured.std_db is None else {"std_db": measured.std_db}
+    rows = zip(*(values.tolist() for values in columns.values()), strict=True)
+    return "".join(",".join(map(str, row)) + "\n" for row in [columns, *rows]).encode()
 
 
 def script(project: Project, python_map: Sequence[str]) -> str:
@@ -227,7 +251,8 @@ def script(project: Project, python_map: Sequence[str]) -> str:
     given = [f"rx_height_m={settings.rx_height_m!r}", f"spacing_m={settings.spacing_m!r}"]
     given += ["receivers='inside'", f"trace_settings=sp.TraceSettings({', '.join(trace)})"]
     given += [f"scene_settings=sp.SceneSettings(material={settings.material!r})"] if settings.material else []
-    given += ['measurements="measured.csv"'] if project.measured is not None else []
+    measured = f'measurements="{_MEASURED}"'  # as in the file of "Save the project"
+    given += [measured] if project.measured is not None else []
     power = [f"eirp_dbm={powers!r}"]
     if settings.both_ways:
         power.append(f"client_dbm={[settings.uplink_dbm(each) for each in transmitters]!r}")

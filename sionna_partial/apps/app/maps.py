@@ -61,7 +61,7 @@ class Maps:
         state, (x_m, y_m, z_m) = self._state, tx_m
         state.title, state.home, state.steps, state.seed, state.source, state.strokes = name, home, 0, seed, None, ()
         state.transmitters = {"tx1": Transmitter(x_m, y_m, z_m, state.settings.eirp_dbm)}
-        state.chosen, state.measured = "tx1", None
+        state.chosen, state.survey, state.measured = "tx1", None, None
         self.explore_more(FIRST_STEPS)
 
     def explore_more(self, steps: int = MORE_STEPS) -> None:
@@ -114,7 +114,7 @@ class Maps:
             state = self._state
             self._take_map(bare, project.title, [SAVED_MAP], warnings, source, strokes)
             state.settings, state.view = project.settings or state.settings, view
-            state.measured = project.measured if project.transmitters else None
+            state.measured, state.logo = project.measured if project.transmitters else None, project.logo
             self._jobs.predict_for(found)
 
         return take

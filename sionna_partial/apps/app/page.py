@@ -2,7 +2,6 @@
 
 import functools
 import html
-import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.apps.app.answer import LAYERS, LIKELY, OUTLINES, Answer
+from sionna_partial.apps.app.answer import LAYERS, LIKELY, OUTLINES, Answer, measured_powers_dbm
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
 from sionna_partial.apps.app.files import FILES
 from sionna_partial.apps.app.maps import MORE_STEPS
+from sionna_partial.apps.app.marks import UNUSED, USED, aims_m
 from sionna_partial.apps.app.picture import Picture
 from sionna_partial.apps.app.planning import ROUNDING_M
 from sionna_partial.apps.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, PRESETS
@@ -27,7 +27,6 @@ from sionna_partial.resources import demo_homes
 from sionna_partial.settings import WALL_MATERIALS, material_name
 
 _ANTENNAS = {"iso": "isotropic", "dipole": "short dipole", "hw_dipole": "dipole", "tr38901": "sector"}
-_AIM = 0.06
 _WALLS = {"": "below 24 GHz", "opaque": "never", "through": "always"}
 _DIRECTIONS = {"": "at the client", "1": "weaker of both ways"}
 _REGIONS = {"ETSI": "Europe (ETSI)", "FCC": "USA (FCC)"}
@@ -230,6 +229,10 @@ class Page:
                 ("client_dbm", "Client's power [dBm]", 1.0, 1, -100, 100),
             )
         }
+        self.access_point = self._on(
+            Select(title="Access point of the survey", name="access_point", value=""),
+            lambda name: self.session.surveys.assign(name),
+        )
         self.measured_text = Div(name="measured_text", sizing_mode="stretch_width")
         self.links = Div(sizing_mode="stretch_width", stylesheets=[_LINKS])
         self.python = TextAreaInput(title="The same in Python", rows=8, stylesheets=[_CODE], name="python")
@@ -239,18 +242,21 @@ class Page:
         from bokeh.models import CustomJS
 
         session = self.session
-        upload_map, upload_csv, copy = (
+        upload_map, upload_csv, upload_logo, copy = (
             self._button(name)
             for name in (
                 "Open a map, floor plan or project\u2026",
-                "Learn from measurements\u2026",
+                "Import a survey\u2026",
+                "Logo for the report\u2026",
                 "Copy as Python",
             )
         )
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
+        upload_logo.js_on_click(CustomJS(args={"id": "logo-file"}, code=_UPLOAD))
         copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
         self.forget = self._button("Forget the measurements", lambda: session.surveys.forget_measurements())
+        self.remove_logo = self._button("Remove the logo", lambda: session.take_logo(b"", ""))
         self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.maps.explore_more())
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing, client = self.radio.values()
@@ -299,10 +305,11 @@ class Page:
                 self.more,
                 self._button("Best next views", lambda: session.searches.find_views()),
                 upload_csv,
+                self.access_point,
                 self.measured_text,
                 self.forget,
             ),
-            "repeat": _wide(self.python, copy),
+            "repeat": _wide(upload_logo, self.remove_logo, self.python, copy),
         }
 
     def _on(self, model: Any, take: Callable[[Any], object], attribute: str = "value") -> Any:
@@ -491,7 +498,8 @@ class Page:
         self.pattern.value, self.pattern.disabled = chosen.antenna.pattern if chosen else "iso", chosen is None
         for field in self.aims.values():  # an isotropic antenna points nowhere
             field.disabled |= self.pattern.value == "iso"
-        aims = self._aimed()
+        lines = aims_m(session.partial, each)
+        aims = {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
         self._once("aims", (repr(aims),), functools.partial(setattr, self.picture.aims, "data", aims))
         self.name.disabled = chosen is None
         self.model.value, self.model.disabled = chosen.model if chosen else "", chosen is None
@@ -519,26 +527,28 @@ class Page:
     def _show_measured(self) -> None:
         session = self.session
         self.measured_text.visible = self.forget.visible = session.measured is not None
-        key = session.measured, session.partial, repr(session.transmitters), session.settings.frequency_hz
+        chosen, options = session.transmitters.get(session.chosen), session.survey.options if session.survey else []
+        self.access_point.options, self.access_point.visible = options, bool(options and chosen)
+        self.access_point.title = f"Access point of the survey for {session.chosen}"
+        if session.survey and chosen:
+            self.access_point.value = session.survey.access_point_at(chosen.position_m)
+        of_map = session.partial, repr(session.transmitters), session.settings.frequency_hz
+        key = session.measured, *of_map, session.answer and session.answer.coverage
         self._once("measured", key, self._show_points)
 
     def _show_points(self) -> None:
-        rx_m, used = self.session.measured_points()
-        colours = [_USED if each else _UNUSED for each in used]
-        self.picture.measured.data = {"x": rx_m[:, 0], "y": rx_m[:, 1], "colour": colours}
+        (rx_m, used), measured = self.session.measured_points(), self.session.measured
+        colours = [USED if each else UNUSED for each in used]
+        values: Any = [] if measured is None else measured.gain_db
+        of_points = {"x": rx_m[:, 0], "y": rx_m[:, 1], "value": values, "name": self.session.measured_names()}
+        self.picture.measured.data = of_points | {"colour": colours}
         unused = f", {(~used).sum()} of them not used (white)" if not used.all() else ""
-        self.measured_text.text = f"{len(used)} measured points{unused}"
-
-    def _aimed(self) -> dict[str, list[list[float]]]:
-        """Return lines [m] along the main directions of antennas."""
-        partial, lines = self.session.partial, []
-        length_m = 0.0 if partial is None else _AIM * partial.resolution_m * max(partial.shape)
-        for each in self.session.transmitters.values():
-            if each.antenna.pattern == "tr38901":
-                angle = math.radians(each.antenna.azimuth_deg)
-                ends = each.x_m + length_m * math.cos(angle), each.y_m + length_m * math.sin(angle)
-                lines.append(([each.x_m, ends[0]], [each.y_m, ends[1]]))
-        return {"xs": [xs for xs, _ in lines], "ys": [ys for _, ys in lines]}
+        fits = [
+            f"{power_dbm:.0f} dBm of {html.escape(name)}"
+            for name, power_dbm in measured_powers_dbm(self.session.answer)
+        ]
+        fitting = f". As received powers, they fit {', '.join(fits)}" if fits else ""
+        self.measured_text.text = f"{len(used)} measured points{unused}{fitting}"
 
     def _options(self) -> list[Any]:
         return [(name, LAYERS[name].title) for name in self.session.layers]
@@ -554,6 +564,8 @@ class Page:
         links = (
             f'<a href="{self._files_url}/{kind}" download="{FILES[kind]}">{_FILE_NAMES[kind]}</a>' for kind in kinds
         )
+        self.remove_logo.visible = session.logo is not None
+        self.remove_logo.label = f"Remove the logo {session.logo[0]}" if session.logo else ""
         self.links.text = " ".join(links) if partial is not None else ""
         title = "Map" if answer is None else answer.title(view, threshold_dbm)
         settings = session.settings if answer is None else answer.settings
@@ -565,8 +577,6 @@ class Page:
         self.picture.show_answer(answer, self.session.shown_view, threshold_dbm)
         self.summary.text = "" if answer is None else _summary(answer, threshold_dbm)
 
-
-_USED, _UNUSED = "#ee6677", "#ffffff"
 
 _CODE = "textarea { font-family: monospace; font-size: 12px; white-space: pre }"
 _LINKS = (

@@ -11,6 +11,7 @@ from scipy import ndimage
 
 from sionna_partial.apps.app.answer import LAYERS, LEVELS, RATE, Answer, View
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, STRAIGHT, Plan
+from sionna_partial.apps.app.marks import VIEW
 from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
@@ -69,7 +70,7 @@ _LABEL: dict[str, Any] = {
     "background_fill_color": "white",
     "background_fill_alpha": 0.75,
 }
-_MARK: dict[str, Any] = {"fill_color": "#ddaa33", "line_color": "black"}
+_MARK: dict[str, Any] = {"fill_color": VIEW, "line_color": "black"}
 
 
 class Picture:
@@ -88,7 +89,7 @@ class Picture:
         self.points = ColumnDataSource({"x": [], "y": [], "name": [], "colour": []}, name="points")
         self.aims = ColumnDataSource({"xs": [], "ys": []})
         self.routes = ColumnDataSource({"xs": [], "ys": []})
-        self.measured = ColumnDataSource({"x": [], "y": [], "colour": []}, name="measured")
+        self.measured = ColumnDataSource({name: [] for name in ("x", "y", "value", "name", "colour")}, name="measured")
         self.poses = ColumnDataSource({"x": [], "y": [], "angle": [], "rank": []})
         plot = self.plot = _empty_plot()
         where = {"x": "x", "y": "y", "dw": "dw", "dh": "dh"}
@@ -147,13 +148,13 @@ class Picture:
             plot.line("x", "y", source=source, line_color=_PEN, line_width=3)
             plot.scatter("x", "y", source=source, fill_color=_PEN, line_color=None)
         self._area = plot.patch("x", "y", source=self._live, fill_color=_PEN, fill_alpha=0.3, line_color=None)
-        plot.scatter("x", "y", source=self.measured, size=7, fill_color="colour", line_color="black")
+        look: dict[str, Any] = {"fill_color": "colour", "line_color": "black"}
+        points = plot.scatter("x", "y", source=self.measured, size=7, **look)
         plot.multi_line("xs", "ys", source=self.routes, line_color="black", line_dash="dashed", line_width=2)
         plot.scatter("x", "y", source=self.poses, marker="triangle", angle="angle", size=15, **_MARK)
         plot.text("x", "y", text="rank", source=self.poses, x_offset=9, **_LABEL)
         plot.multi_line("xs", "ys", source=self.aims, line_color="black", line_width=4)
-        look: dict[str, Any] = {"size": 24, "fill_color": "colour", "line_color": "black", "nonselection_alpha": 1.0}
-        plot.scatter("x", "y", source=self.points, marker="star", **look)
+        plot.scatter("x", "y", source=self.points, marker="star", size=24, nonselection_alpha=1.0, **look)
         plot.text("x", "y", text="name", source=self.points, x_offset=13, **_LABEL)
         handles = plot.scatter("x", "y", source=self.points, size=_HANDLE_PIXELS, alpha=0.0, nonselection_alpha=0.0)
         tool = PointDrawTool(renderers=[handles], empty_value="", description="Put and move transmitters")
@@ -162,9 +163,10 @@ class Picture:
             tooltips=[*_TOOLTIPS],
             formatters={"@link_state": _state_words()},
         )
-        plot.add_tools(hover, tool)
+        measured = HoverTool(renderers=[points], tooltips=[("measured", "@value{0.0} of @name")], attachment="above")
+        plot.add_tools(hover, measured, tool)
         plot.toolbar.active_tap = tool
-        self._tools = tool, hover
+        self._tools = tool, hover, measured
         plot.js_on_event("tap", CustomJS(args={"points": self.points}, code=_UNSELECT))
 
     def follow(self, mode: Any, brush: Any, threshold: Any) -> None:

@@ -89,7 +89,7 @@ class PredictionJobs(WindowJobs):
         self.predict()
 
     def predict_without_measurements(self, *warnings: str) -> None:
-        self._state.measured, self._state.action_warnings = None, [*warnings]
+        self._state.survey, self._state.measured, self._state.action_warnings = None, None, [*warnings]
         self.predict()
 
     def predict(self) -> None:

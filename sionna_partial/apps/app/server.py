@@ -12,8 +12,10 @@ from sionna_partial.apps.app.drawing import Source
 from sionna_partial.apps.app.files import FILES, MOST_BYTES, UPLOADED_SUFFIXES
 from sionna_partial.apps.app.page import TEMPLATE, Page
 from sionna_partial.apps.app.session import Session
+from sionna_partial.apps.app.survey import SURVEY_SUFFIXES, is_survey
 from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.plots.logo import LOGO_SUFFIXES
 
 LOOPBACK = "127.0.0.1"
 
@@ -122,6 +124,8 @@ class AppServer:
                 "files_url": files_url,
                 "most_bytes": MOST_BYTES,
                 "map_suffixes": ",".join(UPLOADED_SUFFIXES),
+                "survey_suffixes": ",".join(SURVEY_SUFFIXES),
+                "logo_suffixes": ",".join(LOGO_SUFFIXES),
             }
         )
 
@@ -139,7 +143,7 @@ class AppServer:
 def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]) -> tuple[int, str] | None:
     """Return HTTP status and reason of an upload that is refused by its headers."""
     size = headers.get("Content-Length", "")
-    if session is None or kind not in ("map", "measurements"):
+    if session is None or kind not in ("map", "measurements", "logo"):
         return _NOTHING_TO_SEND
     if not size.isdecimal():
         return 411, "The size of an upload has to be in its header."
@@ -154,10 +158,13 @@ def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]
 
 def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) -> None:
     try:
-        if kind == "map":
-            session.maps.upload_map(files)
+        name, content = files[0]
+        if kind == "logo":
+            session.take_logo(content, name)
+        elif kind == "measurements" or (len(files) == 1 and is_survey(name, content)):
+            session.surveys.learn(content, name)
         else:
-            session.surveys.learn(files[0][1], files[0][0])
+            session.maps.upload_map(files)
     except SionnaPartialError as error:
         session.jobs.refuse(error)
 

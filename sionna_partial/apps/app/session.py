@@ -1,10 +1,9 @@
 """One window of the app without its page: its state, its jobs, and the parts that change them."""
 
 import functools
-import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path, PurePath
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -15,14 +14,15 @@ from sionna_partial.apps.app.maps import Maps
 from sionna_partial.apps.app.planning import Radios, Searches
 from sionna_partial.apps.app.predicting import PredictionJobs
 from sionna_partial.apps.app.state import WindowState
+from sionna_partial.apps.app.survey import Survey
 from sionna_partial.checks import Progress, require_choice
 from sionna_partial.errors import MeasurementError, SettingsError
 from sionna_partial.measurements.measurements import (
     SAME_TX_M,
     Measurements,
-    load_measurements,
     measurements_of_each,
 )
+from sionna_partial.plots.logo import read_logo
 
 
 class Surveys:
@@ -32,22 +32,33 @@ class Surveys:
         self._state, self._jobs = state, jobs
 
     def learn(self, content: bytes, name: str = "measured.csv") -> None:
-        """Take measurements; those without transmitter are of the chosen one."""
+        """Take a survey; powers without transmitter are of the chosen one."""
+        all_m, plan = self._state.require_positions_m(), self._state.plan
+        self._learn_from(lambda: Survey.read(name, content, plan, all_m))
+
+    def assign(self, access_point: str) -> None:
+        """Give the chosen transmitter an access point of the survey, or none of them for ""."""
+        survey, tx_m = self._state.survey, self._state.require_positions_m()[self._state.chosen]
+        assert survey is not None
+        self._learn_from(lambda: survey.with_access_point(access_point, tx_m))
+
+    def _learn_from(self, read: Callable[[], Survey]) -> None:
         state, partial, all_m = self._state, self._state.require_map(), self._state.require_positions_m()
         tx_m, frequency_hz = all_m[state.chosen], state.settings.frequency_hz
 
-        def take(measured: Measurements) -> None:
-            state.measured, state.action_warnings = measured, []
+        def take(survey: Survey, measured: Measurements | None, *warnings: str) -> None:
+            state.survey, state.measured, state.action_warnings = survey, measured, [*warnings]
             self._jobs.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
             report(0.1, "reading measurements")
-            with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
-                path = Path(folder) / file_name(name, "measured.csv")
-                path.write_bytes(content)
-                measured = load_measurements(path)
-                if not measured.tx_known.any():
-                    measured = load_measurements(path, tx=tx_m)
+            survey = read()
+            if survey.has_several and not survey.positions_m:
+                count = len(survey.access_points)
+                what = f'{survey.name} has {count} access points: choose them in "Access point of the survey".'
+                yield functools.partial(take, survey, None, what)
+                return
+            measured = survey.measurements(tx_m)
             if not state.are_ours(measured).any():
                 position = ", ".join(f"{each:g}" for each in measured.tx[0])
                 raise MeasurementError(
@@ -55,7 +66,7 @@ class Surveys:
                     "the first position in the file."
                 )
             measurements_of_each(partial, [np.array([each_m]) for each_m in all_m.values()], measured, frequency_hz)
-            yield functools.partial(take, measured)
+            yield functools.partial(take, survey, measured)
 
         self._jobs.begin(work)
 
@@ -93,6 +104,11 @@ class Session(WindowState):
         self.view = replace(self.view, **values)
         self.jobs.show()
 
+    def take_logo(self, content: bytes, name: str) -> None:
+        """Take a picture for the report; none for no content."""
+        self.logo = (file_name(name, "logo"), content) if content and len(read_logo(content)) else None
+        self.jobs.show()
+
     def file(self, kind: str) -> bytes:
         """Return the newest answer, or the project, as one of `FILES`."""
         require_choice("kind", kind, FILES)
@@ -107,6 +123,6 @@ class Session(WindowState):
         text = answer.settings.text(partial)
         if kind == "png":
             title = f"{PurePath(self.title).name}\n{text}"
-            return answer_png(answer, self.shown_view, threshold_dbm, partial, title, self.plan)
-        heading = self.title, f"{answer.made:%Y-%m-%d}", text
-        return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=partial)
+            return answer_png(answer, self.shown_view, threshold_dbm, partial, title, self.plan, self.marks)
+        heading, logo = (PurePath(self.title).name, f"{answer.made:%Y-%m-%d}", text), self.logo and self.logo[1]
+        return coverage_file(kind, answer.coverage, answer.eirp_dbm, threshold_dbm, heading, scene=partial, logo=logo)

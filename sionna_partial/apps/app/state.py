@@ -9,7 +9,9 @@ import numpy as np
 from sionna_partial.apps.app.answer import LAYERS, NETWORK_LAYERS, RATE, View
 from sionna_partial.apps.app.drawing import Plan, Source, Stroke, drawn
 from sionna_partial.apps.app.files import Project, script
+from sionna_partial.apps.app.marks import Marks, aims_m
 from sionna_partial.apps.app.radio import RadioSettings, Transmitter, fitted, placed, usual_height_m
+from sionna_partial.apps.app.survey import Survey
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import MapError, PositionError
@@ -39,7 +41,9 @@ class WindowState:
         self.transmitters: dict[str, Transmitter] = {}
         self.chosen = ""
         self.settings, self.view = RadioSettings(), View()
+        self.survey: Survey | None = None
         self.measured: Measurements | None = None
+        self.logo: tuple[str, bytes] | None = None
         self.views: NextViews | None = None
         self.map_warnings: list[str] = []
         self.action_warnings: list[str] = []
@@ -78,7 +82,7 @@ class WindowState:
         """Remove the map and everything on it."""
         self.map_warnings, self.action_warnings = [], []
         self.transmitters, self.chosen, self.measured, self.views = {}, "", None, None
-        self.source, self.strokes, self.home = None, (), None
+        self.source, self.strokes, self.home, self.survey = None, (), None, None
 
     def fit(self, partial: PartialMap, python: list[str]) -> None:
         """Draw the strokes on a map, and fit the settings to it."""
@@ -113,8 +117,24 @@ class WindowState:
 
     def are_ours(self, measured: Measurements) -> Bools:
         """Return which measured links (N,) are of a transmitter of this window."""
+        return np.asarray(self._of_each(measured).any(axis=0))
+
+    def _of_each(self, measured: Measurements) -> Bools:
+        """Return which measured links are of each transmitter (T, N)."""
         sources_m = [np.array([transmitter.position_m]) for transmitter in self.transmitters.values()]
-        return np.asarray(nearest_transmitters(measured.tx, sources_m).any(axis=0))
+        return np.asarray(nearest_transmitters(measured.tx, sources_m))
+
+    def measured_names(self) -> list[str]:
+        """Return the transmitter of each measured link, "" for others."""
+        if self.measured is None:
+            return []
+        of_each, names = self._of_each(self.measured), [*self.transmitters, ""]
+        return [names[at] for at in np.where(of_each.any(axis=0), of_each.argmax(axis=0), -1)]
+
+    @property
+    def marks(self) -> Marks:
+        """Marks on the picture."""
+        return Marks(*self.measured_points(), aims_m(self.partial, self.transmitters.values()), self.views)
 
     def measured_points(self) -> tuple[Floats, Bools]:
         """Return the measured receivers (N, 3) [m], and which of them are used (N,)."""
@@ -128,7 +148,7 @@ class WindowState:
         source = self.source and (self.source.name, self.source.content, self.source.settings)
         strokes = [asdict(each) for each in self.strokes] if source else []
         of_window = self.require_map(), self.title, self.transmitters, self.settings, self.measured
-        return Project(*of_window, asdict(self.view), source or None, strokes)
+        return Project(*of_window, asdict(self.view), source or None, strokes, self.logo)
 
     def python(self) -> str:
         """Return a script that gives the same coverage."""
