@@ -29,7 +29,7 @@ from scipy import ndimage
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
-from sionna_partial.maps.partial_map import cell_centres_m
+from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.settings import Fusion
 

@@ -20,9 +20,6 @@ NO_RECEIVER = 255
 DEFAULT_HEIGHT_M = 1.5
 """Default height of transmitters and receivers [m] (the paper's reference trace)."""
 
-COARSER = 4
-"""Receiver spacing of a first, quick coverage map, as a multiple of the final spacing."""
-
 MEMORY_GB = 2.0
 """Default memory limit of a job [GB]."""
 

@@ -72,6 +72,10 @@ from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, Pat
 from sionna_partial.tracing.power import mean_loss_db, wall_loss_db
 from sionna_partial.tracing.simulation import Simulation, nearest_m
 
+_FINER = 0.1
+"""Tolerance of the paths of derivatives, relative to the tolerance of values: the slope of a gain in dB is less exact
+than the gain where weak paths change fast."""
+
 _NEAREST_M = 1e-6
 """Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
 
@@ -177,6 +181,12 @@ class DifferentiableScene:
             warn_of_other_traces(self.predictor, *self.simulation.resolved)
 
     @cached_property
+    def _finer(self) -> Simulation:
+        settings = self.simulation.trace_settings
+        finer = replace(settings, power_tolerance_db=_FINER * settings.tolerance_db)
+        return Simulation(self.partial, finer, self.simulation.scene_settings)
+
+    @cached_property
     def predictor(self) -> Predictor:
         """The predictor with its networks, which no other object shares."""
         return Predictor.load(self.model.asked)
@@ -217,7 +227,7 @@ class DifferentiableScene:
         PositionError
             As `trace_links`, or for several transmitters.
         """
-        return DifferentiableLinks(self, self.simulation.paths(one_transmitter(tx), rx, progress=progress))
+        return DifferentiableLinks(self, self._finer.paths(one_transmitter(tx), rx, progress=progress))
 
     def smoothed(
         self,

@@ -3,7 +3,7 @@
 import sys
 from base64 import b64encode
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, nullcontext
 from dataclasses import fields, is_dataclass
 from functools import cache
 from html import escape
@@ -83,7 +83,7 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
     """Open the receiver of progress reports: a callable itself, none for False, else a bar.
 
     The bar appears after 2 s in terminals and notebooks; a `command` shows it after 0.1 s, and prints a line a minute
-    without a terminal.
+    without a terminal. A call without a terminal prints one line if kernels compile (`told_of_compilations`).
     """
     if callable(progress):
         with _compilations_reported_to(progress) as report:
@@ -95,7 +95,8 @@ def reporting(progress: Progress | bool | None, *, command: bool = False) -> Ite
             bar.set_description_str(message, refresh=message == _COMPILING.format(1))
             bar.update(fraction - bar.n)
 
-        with _compilations_reported_to(draw) as report:
+        unseen = bar.disable and progress is not False
+        with nullcontext(draw) if unseen else _compilations_reported_to(draw) as report:
             yield report
         bar.update(1.0 - bar.n)
 

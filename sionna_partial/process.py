@@ -9,6 +9,7 @@ import shutil
 import signal
 import socket
 import stat
+import sys
 import tempfile
 import threading
 import time
@@ -31,11 +32,15 @@ NEW_FOLDER = ".new-sionna_partial_"
 UNLOCKED_S = 60.0
 """Age at which an unlocked folder is known to be of a killed process [s]."""
 
+COMPILING_ONCE = "compiling, once: about 40 s"
+"""Announcement where no bar is drawn."""
+
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _cleanups: list[Callable[[], object]] = []
 _told: list[Callable[[int], None]] = []
+_announced = threading.Event()
 
 
 @contextmanager
@@ -207,7 +212,10 @@ class _Kernel:
 
 @contextmanager
 def told_of_compilations(tell: Callable[[int], None]) -> Iterator[None]:
-    """Call `tell` with a running number before each kernel compiles; of nested receivers only the first is called."""
+    """Call `tell` with a running number before each kernel compiles; of nested receivers only the first is called.
+
+    Without any receiver the first compilation of a process is announced on stderr.
+    """
     _told.append(tell)
     try:
         yield
@@ -225,13 +233,18 @@ def _tell_of_compilations() -> None:
         def on_start(self, event: Any) -> None:
             if not (event.data["dispatcher"].py_func.__module__ or "").startswith("numba."):
                 self.number += 1
-                for tell in _told[:1]:
-                    tell(self.number)
+                (_told or [_announce_compilations])[0](self.number)
 
         def on_end(self, event: object) -> None:
             """Do nothing: the next compilation begins, or the work goes on."""
 
     event.register("numba:compile", Listener())
+
+
+def _announce_compilations(_: int) -> None:
+    if not _announced.is_set():
+        _announced.set()
+        print(COMPILING_ONCE, file=sys.stderr, flush=True)
 
 
 def _with_wide_integers(compiled: Any) -> Any:

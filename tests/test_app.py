@@ -32,7 +32,7 @@ from websockets.typing import Origin
 
 import sionna_partial as sp
 from sionna_partial.apps.app import answer as answer_module
-from sionna_partial.apps.app import session as app_session
+from sionna_partial.apps.app import planning, predicting
 from sionna_partial.apps.app.answer import LEVELS, Answer, View
 from sionna_partial.apps.app.drawing import Stroke
 from sionna_partial.apps.app.files import FILES, stored_map
@@ -44,7 +44,7 @@ from sionna_partial.apps.app.server import AppServer
 from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
-from sionna_partial.maps.partial_map import cell_centres_m
+from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.plots.coverage_plot import report_figure
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
@@ -73,45 +73,45 @@ class Window:
         return self.session.answer
 
     def put(self, *places_m: tuple[float, float]) -> str:
-        self.session.put([("", x_m, y_m) for x_m, y_m in places_m])
+        self.session.radios.put([("", x_m, y_m) for x_m, y_m in places_m])
         return self.settle()
 
     def settle(self) -> str:
         end = time.monotonic() + 600.0
-        while self.session.status.fraction is not None and time.monotonic() < end:
+        while self.session.jobs.status.fraction is not None and time.monotonic() < end:
             while self.waiting:
                 self.waiting.pop(0)()
             time.sleep(0.005)
-        return self.session.status.message
+        return self.session.jobs.status.message
 
 
 @pytest.fixture
 def window() -> Iterator[Window]:
     made = Window()
-    made.session.open_map(PARTIAL, "room.yaml")
+    made.session.maps.open_map(PARTIAL, "room.yaml")
     made.session.settings = replace(made.session.settings, spacing_m=0.5)
     yield made
-    made.session.close()
+    made.session.jobs.close()
 
 
 class TestJobs:
     def test_coarse_then_fine(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
+        window.session.radios.put([("", 1.0, 1.0)])
         with pytest.raises(SettingsError, match="no coverage yet"):
             window.session.file("nc")
         assert window.settle() == "Ready."
         assert window.seen == [(False, ("tx1",)), (True, ("tx1",))]
 
     def test_what_an_older_job_has_found_is_dropped(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
-        while not window.waiting or window.session.status.fraction is None:
+        window.session.radios.put([("", 1.0, 1.0)])
+        while not window.waiting or window.session.jobs.status.fraction is None:
             time.sleep(0.01)
-        window.session.remove("tx1")
+        window.session.radios.remove("tx1")
         window.settle()
         for late in window.waiting:
             late()
         assert window.session.answer is None
-        assert "Click on the map" in window.session.status.message
+        assert "Click on the map" in window.session.jobs.status.message
 
     def test_cancel_ends_a_job_and_its_thread(self, window: Window) -> None:
         running, ended = threading.Event(), threading.Event()
@@ -125,15 +125,15 @@ class TestJobs:
                 ended.set()
             yield lambda: None
 
-        window.session.begin(work)
+        window.session.jobs.begin(work)
         assert running.wait(60)
-        window.session.cancel()
+        window.session.jobs.cancel()
         assert ended.wait(60)
-        assert window.session.status.message == "Cancelled."
+        assert window.session.jobs.status.message == "Cancelled."
         assert window.put((1.0, 1.0)) == "Ready."
 
     def test_searches_take_turns_with_other_windows(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
-        other, ended, steps, search = Window(), threading.Event(), list[str](), app_session.place_transmitter
+        other, ended, steps, search = Window(), threading.Event(), list[str](), planning.place_transmitter
 
         def counted(*given: Any, progress: Any, **named: Any) -> Any:
             def report(fraction: float, message: str) -> None:
@@ -148,13 +148,13 @@ class TestJobs:
                 steps.append("other")
             yield lambda: None
 
-        monkeypatch.setattr(app_session, "place_transmitter", counted)
-        other.session.begin(endless)
-        window.session.place()
+        monkeypatch.setattr(planning, "place_transmitter", counted)
+        other.session.jobs.begin(endless)
+        window.session.searches.place()
         assert window.settle() == "Ready."
         ended.set()
         assert other.settle() == "Ready."
-        other.session.close()
+        other.session.jobs.close()
         during = steps[steps.index("search") : len(steps) - steps[::-1].index("search")]
         assert during.count("search") > 4
         assert ("search", "search") not in {*itertools.pairwise(during)}
@@ -164,80 +164,80 @@ class TestJobs:
     ) -> None:
         made: list[Any] = []
         monkeypatch.setattr(
-            app_session, "LinkModel", lambda *given, **named: made.append(sp.LinkModel(*given, **named)) or made[-1]
+            predicting, "LinkModel", lambda *given, **named: made.append(sp.LinkModel(*given, **named)) or made[-1]
         )
         unseen = ROOM.copy()
         unseen[:, 30:] = 2
-        window.session.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
-        window.session.set(frequency_hz=60e9)
+        window.session.maps.open_map(sp.map_from_array(unseen, 0.1), "unseen.yaml")
+        window.session.radios.set(frequency_hz=60e9)
         for x_m in (1.0, 1.5):
-            window.session.put([("tx1" if made else "", x_m, 1.0)])
+            window.session.radios.put([("tx1" if made else "", x_m, 1.0)])
             assert window.settle() == "Ready."
             (warning,) = window.session.warnings
             assert "at 28 GHz, and is used at 60 GHz" in warning
         assert len(made) == 1
-        window.session.set(frequency_hz=28e9)
+        window.session.radios.set(frequency_hz=28e9)
         window.settle()
         assert (len(made), window.session.warnings) == (2, [])
 
 
 class TestTransmitters:
     def test_name_height_and_power(self, window: Window) -> None:
-        window.session.put([("", 1.0, 1.0)])
-        window.session.change("tx1", new_name="door", z_m=2.0, eirp_dbm=30.0)
-        window.session.put([("door", 1.5, 1.0)])
+        window.session.radios.put([("", 1.0, 1.0)])
+        window.session.radios.change("tx1", new_name="door", z_m=2.0, eirp_dbm=30.0)
+        window.session.radios.put([("door", 1.5, 1.0)])
         assert window.session.transmitters == {"door": Transmitter(1.5, 1.0, 2.0, 30.0)}
-        window.session.put([("door", 1.5, 1.0), ("", 3.0, 1.0)])
+        window.session.radios.put([("door", 1.5, 1.0), ("", 3.0, 1.0)])
         for name in ("", "a b", "../x", "tx1", "<b>"):
             with pytest.raises(SettingsError, match="name = "):
-                window.session.change("door", new_name=name)
+                window.session.radios.change("door", new_name=name)
         with pytest.raises(PositionError, match="not between floor and ceiling"):
-            window.session.change("door", z_m=9.0)
+            window.session.radios.change("door", z_m=9.0)
         window.settle()
         assert window.session.transmitters["door"].z_m == 2.0
-        window.session.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
+        window.session.maps.open_map(replace(PARTIAL, wall_height_m=1.2), "low.yaml")
         assert window.put((1.0, 1.0)) == "Ready."
         assert window.session.transmitters["tx1"].z_m == window.session.settings.rx_height_m == 0.6
 
     def test_one_in_a_wall_or_outside_moves_to_the_nearest_free_cell(self, window: Window) -> None:
         session = window.session
-        session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        session.radios.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
         for x_m, free in ((2.02, (1.95, 1.05)), (99.0, (4.05, 1.05))):
-            session.put([("tx1", 1.0, 1.0), ("tx2", x_m, 1.02)])
+            session.radios.put([("tx1", 1.0, 1.0), ("tx2", x_m, 1.02)])
             assert window.settle() == "Ready."
             assert [each.position_m[:2] for each in session.transmitters.values()] == [(1.0, 1.0), free]
             where = f"({free[0]:g}, {free[1]:g}) is the nearest free cell."
             assert session.warnings == [f"tx2 cannot be at ({x_m:g}, 1.02): {where}"]
             assert [*window.answer.coverage["tx"].to_numpy()] == ["tx1", "tx2"]
-        session.put([("tx1", 1.0, 1.2), ("tx2", *free)])
+        session.radios.put([("tx1", 1.0, 1.2), ("tx2", *free)])
         assert (session.warnings, session.chosen) == ([], "tx1")
-        session.remove("tx1")
+        session.radios.remove("tx1")
         assert session.chosen == "tx2"
         window.settle()
 
 
 def test_it_fills_the_fields_of_all_transmitters_present_and_new(window: Window) -> None:
     session = window.session
-    session.put([("", 1.0, 1.0)])
+    session.radios.put([("", 1.0, 1.0)])
     assert session.settings.preset == "Wi-Fi 5 GHz"
-    session.use_preset("5G, 28 GHz")
+    session.radios.use_preset("5G, 28 GHz")
     assert session.settings.text(PARTIAL) == "5G, 28 GHz, opaque walls"
-    session.use_preset("Wi-Fi 5 GHz")
+    session.radios.use_preset("Wi-Fi 5 GHz")
     assert session.settings.text(PARTIAL) == "Wi-Fi 5 GHz, walls of unknown material"
-    session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+    session.radios.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
     assert window.settle() == "Ready."
     assert [each.eirp_dbm for each in session.transmitters.values()] == [23.0, 23.0]
     assert (session.settings.frequency_hz, session.settings.threshold_dbm) == (5.21e9, -67.0)
     assert session.settings.preset == "Wi-Fi 5 GHz"
     scales = [window.answer.scale(name, "tx1", -67.0) for name in LEVELS]
     assert [scale.ticks[3] for scale in scales if scale] == [-67.0, -90.0, 21.0]
-    session.set(bandwidth_hz=40e6)
+    session.radios.set(bandwidth_hz=40e6)
     assert (session.settings.preset, session.settings.channels) == ("", OTHER_CHANNELS)
 
 
 def test_layers_and_scales_of_two_transmitters(window: Window) -> None:
-    window.session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-    window.session.change("tx2", new_name="hall", eirp_dbm=40.0)
+    window.session.radios.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    window.session.radios.change("tx2", new_name="hall", eirp_dbm=40.0)
     window.settle()
     answer = window.answer
     each = [answer.layers_of(name, -60.0)["p_above"].to_numpy() for name in ("tx1", "hall")]
@@ -269,61 +269,61 @@ def test_rates_of_one_and_of_interfering_transmitters(window: Window) -> None:
     window.put((1.0, 1.0))
     alone = window.answer.layers_of("tx1", -67.0)["rate_mbit_s"]
     assert float(alone.max()) == pytest.approx(600.5, abs=0.1)  # MCS 11 at 80 MHz
-    session.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
+    session.radios.put([("tx1", 1.0, 1.0), ("", 3.0, 1.0)])
     window.settle()
     assert float(window.answer.layers_of("", -67.0)["rate_mbit_s"].mean()) < 0.9 * float(alone.mean())
     scale = window.answer.scale("rate_mbit_s", "", -67.0)
     assert scale is not None
     assert (scale.title, scale.names[-1]) == ("Mbit/s; wifi6, one spatial stream", "600")
     session.look(layer="rate_mbit_s")
-    session.set(bandwidth_hz=321e6)  # no standard has it
+    session.radios.set(bandwidth_hz=321e6)  # no standard has it
     assert (session.shown_view.layer, window.settle()) == ("p_above", "Ready.")
 
 
 def test_rooms_are_listed_with_their_coverage(window: Window) -> None:
     room = np.where(ROOM == 0, 1 + (np.arange(ROOM.shape[1]) > 20), 0)
-    window.session.open_map(replace(PARTIAL, room=room.astype(np.uint8), room_names=("west", "<east>")), "rooms")
-    window.session.set(material="metal", threshold_dbm=-20.0)
+    window.session.maps.open_map(replace(PARTIAL, room=room.astype(np.uint8), room_names=("west", "<east>")), "rooms")
+    window.session.radios.set(material="metal", threshold_dbm=-20.0)
     window.put((1.0, 1.0))
     page = Page(Document(), "/files/key")
-    page.session.partial, page.session.answer = window.session.partial, window.answer
+    page.session.partial, page.session.jobs.answer = window.session.partial, window.answer
     page.session.settings = window.session.settings
     page.show()
     assert re.search(r"Rooms, the least covered first: &lt;east&gt; \d+%, west \d+%\.", page.summary.text)
     text = report_figure(window.answer.coverage, [23.0], -20.0).axes[-1].texts[0].get_text()
     assert re.search(r"Rooms above -20 dBm, the least covered first: <east> \d+%, west \d+%", text)
-    page.session.close()
+    page.session.jobs.close()
 
 
 def test_kinds_of_access_points_keep_limits_and_weak_clients_decide(window: Window) -> None:
     session = window.session
-    session.put([("", 1.0, 1.0)])
-    session.change("tx1", model="ceiling access point")
+    session.radios.put([("", 1.0, 1.0)])
+    session.radios.change("tx1", model="ceiling access point")
     assert session.transmitters["tx1"].eirp_dbm == 23.0  # the limit of Europe
-    session.set(region="FCC")
+    session.radios.set(region="FCC")
     assert session.transmitters["tx1"].eirp_dbm == 30.5
-    session.set(both_ways=True, client_dbm=10.0)
+    session.radios.set(both_ways=True, client_dbm=10.0)
     assert window.settle() == "Ready."
     assert window.answer.eirp_dbm.tolist() == [15.5]  # the client, and the antenna that hears it
     assert "client_dbm=[15.5]" in session.python()
-    session.change("tx1", eirp_dbm=12.0)
+    session.radios.change("tx1", eirp_dbm=12.0)
     assert (session.transmitters["tx1"].model, session.transmitters["tx1"].eirp_dbm) == ("", 12.0)
     with pytest.raises(SettingsError, match="model = 'toaster'"):
-        session.change("tx1", model="toaster")
+        session.radios.change("tx1", model="toaster")
 
 
 def test_several_are_placed_for_a_goal_and_get_channels(window: Window) -> None:
     session = window.session
-    session.use_preset("5G, 28 GHz")
-    session.put([("", 1.0, 1.0)])
-    session.set(threshold_dbm=-36.0)
+    session.radios.use_preset("5G, 28 GHz")
+    session.radios.put([("", 1.0, 1.0)])
+    session.radios.set(threshold_dbm=-36.0)
     with pytest.raises(SettingsError, match="two or more transmitters"):
-        session.plan_channels()
-    session.place_several(1.0, 2)
+        session.searches.plan_channels()
+    session.searches.place_several(1.0, 2)
     assert window.settle() == "Ready."
     assert [*session.transmitters] == ["tx1", "tx2"]
     assert re.match(r"Expected covered floor \d+%; each adds: tx1 \d+%, tx2 \d+%\.", session.warnings[0])
-    session.plan_channels()
+    session.searches.plan_channels()
     assert window.settle() == "Ready."
     assert {each.channel for each in session.transmitters.values()} == {"1", "2"}
     assert window.answer.network["channel"].values.tolist() == ["1", "2"]
@@ -336,55 +336,55 @@ def test_layers_of_a_drawing_have_materials(window: Window, tmp_path: Path) -> N
         drawing.modelspace().add_lwpolyline(ends, dxfattribs={"layer": layer})
     drawing.saveas(tmp_path / "flat.dxf")
     content = (tmp_path / "flat.dxf").read_bytes()
-    session.upload_map([("flat.dxf", content)])
+    session.maps.upload_map([("flat.dxf", content)])
     window.settle()
     assert {each.name for each in session.partial.import_source.used} == {"A-WALL", "I-WALL"}
-    session.put([("", 1.0, 1.0)])
-    session.change_source(materials={"I-WALL": "brick"})
+    session.radios.put([("", 1.0, 1.0)])
+    session.maps.change_source(materials={"I-WALL": "brick"})
     assert window.settle() == "Ready."
     assert session.partial == sp.load_map(tmp_path / "flat.dxf", layer_materials={"I-WALL": "brick"})
     assert [*session.transmitters] == ["tx1"]
     assert "sp.load_map('flat.dxf', layer_materials={'I-WALL': 'brick'})" in session.python()
     session.look(layer="power_mean_dbm")
     content = session.file("project")
-    session.open_map(PARTIAL, "room.yaml")
-    session.upload_map([("mine.zip", content)])
+    session.maps.open_map(PARTIAL, "room.yaml")
+    session.maps.upload_map([("mine.zip", content)])
     window.settle()
     assert session.source.materials == {"I-WALL": "brick"}
     assert session.view == View("power_mean_dbm")
-    session.change_source(materials={})
+    session.maps.change_source(materials={})
     window.settle()
     assert session.partial.wall_material is None
 
 
 def test_a_plan_keeps_shade_strokes_and_view_in_a_project(window: Window) -> None:
     session, other = window.session, Window()
-    session.upload_map([("flat.png", picture())])
+    session.maps.upload_map([("flat.png", picture())])
     window.settle()
-    session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+    session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
     window.settle()
-    session.change_source(threshold=190)
+    session.maps.change_source(threshold=190)
     window.settle()
-    session.draw(Stroke("free", ((3.05, 0.5), (3.05, 1.0)), 0.3))
+    session.maps.draw(Stroke("free", ((3.05, 0.5), (3.05, 1.0)), 0.3))
     session.look(outline="power_mean_dbm")
     content, after = session.file("project"), other.session
-    after.upload_map([("mine.zip", content)])
+    after.maps.upload_map([("mine.zip", content)])
     other.settle()
     assert after.plan is not None
     assert (after.plan.threshold, after.plan.pixel_m, after.strokes) == (190, 0.01, session.strokes)
     assert (after.partial, after.view) == (session.partial, View(outline="power_mean_dbm"))
     assert after.file("project") == content
-    after.undo()
+    after.maps.undo()
     assert after.partial.state_at(np.array([[3.05, 0.7]])).tolist() == [1]
-    after.close()
+    after.jobs.close()
 
 
 def test_the_png_is_the_picture_of_the_page(window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
     session = window.session
-    session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-    session.draw(Stroke("brush", ((2.05, 0.5), (2.05, 1.5)), 0.4, "concrete"))
-    session.change("tx2", eirp_dbm=-30.0)
-    session.set(threshold_dbm=-45.0)
+    session.radios.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    session.maps.draw(Stroke("brush", ((2.05, 0.5), (2.05, 1.5)), 0.4, "concrete"))
+    session.radios.change("tx2", eirp_dbm=-30.0)
+    session.radios.set(threshold_dbm=-45.0)
     window.settle()
     drawn: list[Any] = []
     monkeypatch.setattr(answer_module, "figure_png", lambda figure: drawn.append(figure) or b"")
@@ -414,42 +414,44 @@ def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
     window.put((1.0, 1.0))
     page = Page(Document(), "/files/key")
     session = page.session
-    session.open_map(PARTIAL, "room.yaml")
-    session.set(material="brick", threshold_dbm=-67.0)
-    session.answer = replace(window.answer, coverage=window.answer.coverage.assign_attrs(wall_material="brick .69"))
-    session.status = Status("Ready.")
+    session.maps.open_map(PARTIAL, "room.yaml")
+    session.radios.set(material="brick", threshold_dbm=-67.0)
+    session.jobs.answer = replace(
+        window.answer, coverage=window.answer.coverage.assign_attrs(wall_material="brick .69")
+    )
+    session.jobs.status = Status("Ready.")
     page.show()
     assert "Ready. Probability of wall materials: brick .69." in page.message.text
     assert (page.material.value, page.threshold.value, page.preset.value) == ("brick", -67.0, "Wi-Fi 5 GHz")
     assert page.links.text.count("<a ") == len(FILES)
-    session.put([("", 1.0, 1.0)])
+    session.radios.put([("", 1.0, 1.0)])
     page.show()
     page.fields["x_m"].set_from_json("value_throttled", 3.0)
     page.pattern.value = "tr38901"
     page.aims["azimuth_deg"].set_from_json("value_throttled", 90.0)
     changed = Transmitter(3.0, 1.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
     assert session.transmitters == {"tx1": changed}
-    session.close()
+    session.jobs.close()
 
 
 def test_prediction_meets_the_truth(window: Window) -> None:
     with pytest.raises(SettingsError, match="examples alone"):
-        window.session.explore_more()
-    window.session.use_preset("5G, 28 GHz")
-    window.session.open_example("apartment")
+        window.session.maps.explore_more()
+    window.session.radios.use_preset("5G, 28 GHz")
+    window.session.maps.open_example("apartment")
     window.settle()
     session = window.session
     assert (session.steps, [*session.transmitters]) == (100, ["tx1"])
     wall_m = cell_centres_m(session.partial, np.argwhere(session.partial.state == 1)[:1])[0]
-    session.set(spacing_m=0.6)
-    session.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
-    session.explore_more(400)
+    session.radios.set(spacing_m=0.6)
+    session.maps.draw(Stroke("brush", ((float(wall_m[0]), float(wall_m[1])),), 0.3, "metal"))
+    session.maps.explore_more(400)
     window.settle()
     assert session.steps == 500
     assert session.partial.wall_materials == (sp.Material.named("metal"),)
     found = window.answer.agreement()
     assert found[0] > 0.9
-    session.find_views()
+    session.searches.find_views()
     window.settle()
     assert session.views is not None
 
@@ -468,8 +470,8 @@ class TestFiles:
 
     def test_measurements_are_counted_kept_dropped_and_forgotten(self, window: Window) -> None:
         session = window.session
-        session.put([("", 1.0, 1.0)])
-        session.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
+        session.radios.put([("", 1.0, 1.0)])
+        session.surveys.learn(b"x,y,rssi\n1.5,2.0,-20\n3.0,2.5,-30\n2.05,1.0,-30\n")
         assert window.settle() == "Ready."
         assert "measured.csv" in session.python()
         points_m, used = session.measured_points()
@@ -484,22 +486,22 @@ class TestFiles:
             (b"x,y,rssi\n70,1,-60\n", "is outside the map"),
             (b"\xff\x00", "measured.csv"),
         ):
-            session.learn(csv)
+            session.surveys.learn(csv)
             assert message in window.settle()
-            assert session.status.is_error
+            assert session.jobs.status.is_error
             assert (session.measured, session.answer, session.warnings) == (*before, [unused, offset])
-        session.put([("tx1", 3.0, 1.0)])
+        session.radios.put([("tx1", 3.0, 1.0)])
         window.settle()
         assert session.measured is None
         assert "no transmitter is within" in session.warnings[0]
         session.measured = sp.Measurements((3.0, 1.0, 1.5), [(2.05, 1.0, 1.5)], [-60.0])
-        session.predict()
+        session.jobs.predict()
         assert window.settle() == "Ready."
         assert session.measured is None
         assert "are in walls" in session.warnings[0]
-        session.learn(b"x,y,rssi\n1.5,2.0,-60\n")
+        session.surveys.learn(b"x,y,rssi\n1.5,2.0,-60\n")
         window.settle()
-        session.forget_measurements()
+        session.surveys.forget_measurements()
         window.settle()
         assert "measured_links" not in window.answer.coverage.attrs
         assert (len(session.measured_points()[0]), session.warnings) == (0, [])
@@ -518,7 +520,7 @@ class TestUploads:
         stored_map(files, tmp_path / "in")
         assert sorted(path.name for path in (tmp_path / "in").iterdir()) == ["map.pgm", "map.yaml"]
         for given in (files, [("room.zip", zipped(dict(files)))]):
-            window.session.upload_map(given)
+            window.session.maps.upload_map(given)
             window.settle()
             assert window.session.partial == PARTIAL
 
@@ -548,12 +550,12 @@ class TestUploads:
         grey[:600] = bytes([205]) * 600
         text = re.sub(rb"free_thresh: .*", b"free_thresh: 0.25", text)
         for _ in range(2):  # Python shows the same warning of a line once
-            window.session.upload_map([(sheet, text), (image, header + grey)])
+            window.session.maps.upload_map([(sheet, text), (image, header + grey)])
             window.settle()
             assert "205" in window.session.warnings[0]
         window.put((1.0, 1.0))
         assert "205" in window.session.warnings[0]
-        window.session.open_map(PARTIAL, "room.yaml")
+        window.session.maps.open_map(PARTIAL, "room.yaml")
         assert window.session.warnings == []
 
     def test_damaged_files_and_images_of_the_server_change_nothing(self, window: Window, tmp_path: Path) -> None:
@@ -565,9 +567,9 @@ class TestUploads:
             ("a.npz", b"PK\x03\x04 nothing", ""),
             ("white.png", white.getvalue(), "one shade alone"),
         ):
-            window.session.upload_map([(name, content)])
+            window.session.maps.upload_map([(name, content)])
             assert message in window.settle()
-            assert window.session.status.is_error
+            assert window.session.jobs.status.is_error
             assert window.session.partial is PARTIAL
 
 
@@ -583,11 +585,11 @@ def picture() -> bytes:
 class TestDrawing:
     def test_a_plan_is_shown_above_its_coverage(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
         session, shown, figures = window.session, Picture(), list[Any]()
-        session.upload_map([("flat.png", picture())])
+        session.maps.upload_map([("flat.png", picture())])
         window.settle()
-        session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+        session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
         window.settle()
-        session.set(spacing_m=0.5)
+        session.radios.set(spacing_m=0.5)
         window.put((1.0, 1.0))
         shown.show_map(session.partial, session.plan)
         assert (shown.ink.visible, shown.plan.visible) == (True, False)
@@ -601,43 +603,43 @@ class TestDrawing:
 
     def test_a_plan_gets_its_scale_from_a_known_length(self, window: Window, tmp_path: Path) -> None:
         session = window.session
-        session.upload_map([("C:\\flat.PNG", picture())])
+        session.maps.upload_map([("C:\\flat.PNG", picture())])
         message = window.settle()
         assert (session.partial, session.plan is not None) == (None, True)
-        for act in (session.add, session.predict, lambda: session.file("project")):
+        for act in (session.radios.add, session.jobs.predict, lambda: session.file("project")):
             with pytest.raises(MapError, match="Drag along a length"):
                 act()
         with pytest.raises(SettingsError, match="drag along it"):
-            session.measure([(5.0, 5.0)], 4.0)
-        assert message == session.status.message
-        session.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+            session.maps.measure([(5.0, 5.0)], 4.0)
+        assert message == session.jobs.status.message
+        session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
         window.settle()
         (tmp_path / "flat.png").write_bytes(picture())
         assert session.partial == sp.load_map(tmp_path / "flat.png", resolution_m=0.01)
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0]])).tolist() == [1, 0]
-        session.put([("", 1.0, 1.0)])
-        session.draw(Stroke("free", ((0.5, 0.05), (0.7, 0.05)), 0.3))
-        session.change_source(threshold=190)
+        session.radios.put([("", 1.0, 1.0)])
+        session.maps.draw(Stroke("free", ((0.5, 0.05), (0.7, 0.05)), 0.3))
+        session.maps.change_source(threshold=190)
         assert window.settle() == "Ready."
         assert session.partial.state_at(np.array([[2.05, 1.0], [3.05, 1.0], [0.6, 0.05]])).tolist() == [1, 1, 0]
         assert [*session.transmitters] == ["tx1"]
         before = session.partial, session.plan
-        session.measure([(0.0, 1.0), (0.0, 2.0)], 500.0)
+        session.maps.measure([(0.0, 1.0), (0.0, 2.0)], 500.0)
         assert "draw a known length again" in window.settle()
-        assert (session.status.is_error, session.partial, session.plan) == (True, *before)
+        assert (session.jobs.status.is_error, session.partial, session.plan) == (True, *before)
 
     def test_strokes_are_undone_saved_and_in_python(
         self, window: Window, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
         session = window.session
-        session.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-        session.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-        session.set(frequency_hz=5.2e9, through_walls=False, material="brick")
+        session.radios.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+        session.radios.change("tx2", eirp_dbm=30.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+        session.radios.set(frequency_hz=5.2e9, through_walls=False, material="brick")
         assert "partial = sp.load_map('room.yaml')" in session.python()
-        session.draw(Stroke("brush", ((2.05, 0.5),), 0.4, "metal"))
-        session.draw(Stroke("area", ((1.9, 0.0), (1.9, 1.0), (2.2, 1.0), (2.2, 0.0)), material="brick"))
-        session.draw(Stroke("wall", ((2.05, 1.9), (2.05, 3.0)), 9.0))
-        session.draw(Stroke("free", ((2.05, 0.8), (2.05, 1.2)), 0.3))
+        session.maps.draw(Stroke("brush", ((2.05, 0.5),), 0.4, "metal"))
+        session.maps.draw(Stroke("area", ((1.9, 0.0), (1.9, 1.0), (2.2, 1.0), (2.2, 0.0)), material="brick"))
+        session.maps.draw(Stroke("wall", ((2.05, 1.9), (2.05, 3.0)), 9.0))
+        session.maps.draw(Stroke("free", ((2.05, 0.8), (2.05, 1.2)), 0.3))
         assert window.settle() == "Ready."
         partial = session.partial
         column = partial.state[:, 20].tolist()
@@ -651,7 +653,7 @@ class TestDrawing:
         assert names["partial"] == partial
         assert names["coverage"].identical(window.answer.coverage)
         for _ in range(4):
-            session.undo()
+            session.maps.undo()
         window.settle()
         assert session.partial == PARTIAL
         for stroke, message in (
@@ -659,17 +661,17 @@ class TestDrawing:
             (Stroke("area", ((1.0, 1.0), (2.0, 1.0)), material="brick"), "corners of an area = 2"),
         ):
             with pytest.raises(SettingsError, match=message):
-                session.draw(stroke)
+                session.maps.draw(stroke)
 
 
 def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> None:
     before, other = window.session, Window()
-    before.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
-    before.change("tx2", new_name="hall", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
-    before.use_preset("60 GHz (WiGig)")
+    before.radios.put([("", 1.0, 1.0), ("", 3.0, 1.0)])
+    before.radios.change("tx2", new_name="hall", antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
+    before.radios.use_preset("60 GHz (WiGig)")
     before.measured = sp.Measurements((1.0, 1.0, 1.5), [(1.5, 2.5, 1.5)], [-60.0], sensitivity_db=-120.0)
     content, after = before.file("project"), other.session
-    after.upload_map([("mine.zip", content)])
+    after.maps.upload_map([("mine.zip", content)])
     assert other.settle() == "Ready."
     assert (after.partial, after.title) == (before.partial, before.title)
     assert (after.transmitters, after.settings) == (before.transmitters, before.settings)
@@ -689,20 +691,20 @@ def test_projects_are_opened_as_they_were_saved_or_refused(window: Window) -> No
     ):
         text = contents["project.json"]
         assert old in text
-        after.upload_map([("mine.zip", zipped(contents | {"project.json": text.replace(old, new, 1)}))])
+        after.maps.upload_map([("mine.zip", zipped(contents | {"project.json": text.replace(old, new, 1)}))])
         assert message in other.settle()
-        assert after.status.is_error
+        assert after.jobs.status.is_error
         assert after.transmitters is transmitters
 
     def fail() -> None:
         raise ValueError("a fault of ours")
 
-    after.do(fail)
+    after.jobs.do(fail)
     other.waiting.pop()()
-    assert after.status == Status("this failed (ValueError: 'a fault of ours').", is_error=True)
-    after.upload_map([("mine.zip", content)])
+    assert after.jobs.status == Status("this failed (ValueError: 'a fault of ours').", is_error=True)
+    after.maps.upload_map([("mine.zip", content)])
     assert other.settle() == "Ready."
-    after.close()
+    after.jobs.close()
 
 
 @pytest.fixture(scope="module")

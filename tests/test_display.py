@@ -3,7 +3,8 @@
 import base64
 import io
 import re
-from contextlib import redirect_stderr
+import threading
+from contextlib import AbstractContextManager, nullcontext, redirect_stderr
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from PIL import Image
 from public_names import EVERY
 
 import sionna_partial as sp
-from sionna_partial import display
+from sionna_partial import display, process
 from sionna_partial.apps.live.coverage import LiveSettings
 from sionna_partial.display import LONGEST, THUMBNAIL_PX, counting, reporting
 from sionna_partial.errors import SettingsError
@@ -136,6 +137,20 @@ def test_compilations_are_reported_where_work_stands() -> None:
     with redirect_stderr(Terminal()) as terminal, reporting(None):
         assert njit()(lambda number: number + 2)(2.0) == 4.0
     assert re.search("  0%.*compiling, once: kernel", terminal.getvalue())
+
+
+def test_compilations_without_a_bar_are_announced_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In calls without a terminal, and in `LinkModel.predict` and others without a bar."""
+
+    def printed(reports: AbstractContextManager[Any]) -> str:
+        monkeypatch.setattr(process, "_announced", threading.Event())
+        with redirect_stderr(io.StringIO()) as log, reports:
+            assert njit()(lambda number: number + 3)(2.0) == 5.0
+            assert njit()(lambda number: number + 4)(2.0) == 6.0
+        return log.getvalue()
+
+    assert printed(nullcontext()) == printed(reporting(None)) == f"{process.COMPILING_ONCE}\n"
+    assert printed(reporting(False)) == printed(reporting(lambda *_: None)) == ""
 
 
 @pytest.mark.usefixtures("at_once")

@@ -49,6 +49,8 @@ ROOMS = {
             "environment",
             "wall_cells",
             "import_report",
+            "layers",
+            "grid",
             "partial_map",
             "mesh.cells",
             "mesh.upright",
@@ -95,8 +97,12 @@ ROOMS = {
     ),
     "plots": ("style", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
     "results": ("export", "demo", "info", "lab.reports"),
+    "apps": ("refining",),
     "apps.live": ("answers", "coverage", "topics"),
-    "apps.app": ("jobs", "radio", "files", "drawing", "answer", "session", "picture", "page", "server"),
+    "apps.app": (
+        *("jobs", "radio", "files", "drawing", "answer", "state", "predicting", "maps", "planning"),
+        *("session", "picture", "page", "server"),
+    ),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
 }

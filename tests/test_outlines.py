@@ -14,7 +14,8 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m
+from sionna_partial.maps.grid import cell_centres_m
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.outlines import Outlines, lattice_outlines, wall_outlines
 from sionna_partial.scene.scene import build_scene
 from sionna_partial.settings import SceneSettings

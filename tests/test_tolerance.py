@@ -7,7 +7,7 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.checks import no_progress
-from sionna_partial.maps.partial_map import cell_centres_m
+from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures, features_of_paths, path_unobserved_m
 from sionna_partial.resources import scenes_folder
 

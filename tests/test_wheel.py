@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from sionna_partial.process import COMPILING_ONCE
+
 ROOT = Path(__file__).resolve().parents[1]
 
 
@@ -106,5 +108,8 @@ coverage = sp.predict_map(scenes_folder() / "apartment" / "step100", (7.0, 9.8, 
 for suffix in ("nc", "csv", "png", "yaml"):
     coverage.radio.save(f"coverage.{suffix}")
 """
-    subprocess.run([python, "-c", code], cwd=tmp_path, env=environment, check=True, timeout=600)
+    command = [python, "-c", code]
+    result = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=600)
+    assert result.returncode == 0, result.stderr
+    assert result.stderr.splitlines().count(COMPILING_ONCE) == 1
     assert {path.suffix for path in tmp_path.glob("coverage.*")} == {".nc", ".csv", ".png", ".yaml", ".pgm"}

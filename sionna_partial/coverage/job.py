@@ -43,7 +43,8 @@ from sionna_partial.coverage.dataset import (
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, require_height, with_height
+from sionna_partial.maps.grid import with_height
+from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.measurements.assimilation import GAIN_OFFSET_STD_DB, Assimilation
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
 from sionna_partial.measurements.measurements import (

@@ -35,7 +35,8 @@ from sionna_partial.display import Pictured, Shown, part_of, reporting
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, unknown_pockets, with_height
+from sionna_partial.maps.grid import cell_centres_m, unknown_pockets, with_height
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import TransmitterPosterior
 from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
 from sionna_partial.prediction.predictor import Predictor

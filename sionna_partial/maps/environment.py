@@ -364,3 +364,12 @@ def _whole_offset_m(low_m: float, high_m: float) -> float:
     if max(abs(low_m), abs(high_m)) <= FAR_M:
         return 0.0
     return float(np.floor(max(low_m, 0.0)) + np.ceil(min(high_m, 0.0)))
+
+
+def fractions_by_material(materials: tuple[Material | None, ...], sizes: Floats) -> dict[Material | None, float]:
+    """Return the fractions of the walls by their material, from `wall_sizes`; without walls all are of the first."""
+    fractions = sizes / sizes.sum() if sizes.any() else np.ones(1)
+    of_material: dict[Material | None, float] = {}
+    for material, fraction in zip(materials, fractions.tolist(), strict=False):
+        of_material[material] = of_material.get(material, 0.0) + fraction
+    return {material: fraction for material, fraction in of_material.items() if fraction > 0.0}

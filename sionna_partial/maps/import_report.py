@@ -35,6 +35,9 @@ ENCLOSED_FRACTION = 0.1
 FREE_FRACTION = 0.01
 """Smallest free fraction of the extent of any map."""
 
+ODD_CELLS = 1000
+"""Number of cells from which a map should have free and wall cells."""
+
 SHOWN_ROWS = 30
 
 _Map = TypeVar("_Map", bound=Any)
@@ -226,6 +229,24 @@ def report_of(source: ImportSource, state: States, resolution_m: float) -> Impor
     return ImportReport(
         **vars(source), extent_m=extent_m, rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
     )
+
+
+def warn_of_odd_states(what: str, state: States) -> None:
+    """Warn of a map without walls or free cells, or that looks inverted."""
+    count = np.bincount(state.ravel(), minlength=len(CellState))
+    free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
+    if state.size < ODD_CELLS:
+        return
+    if not free + wall:
+        seen = "has no free cell and no wall, so that everything is unknown"
+    elif not wall:
+        seen = f"has {free:,} free cells and no wall, so that nothing obstructs or reflects"
+    elif wall > 2 * free:
+        seen = f"has {wall:,} wall cells and {free:,} free ones, as if inverted"
+    else:
+        return
+    remedy = "look at its states, and at negate and the thresholds of a ROS map."
+    warnings.warn(f"{what} {seen}: {remedy}", MapWarning, stacklevel=3)
 
 
 def _listed(rows: tuple[Elements, ...]) -> list[str]:

@@ -38,15 +38,9 @@ from sionna_partial.files import (
     read_bytes,
 )
 from sionna_partial.maps.environment import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
-from sionna_partial.maps.import_report import ImportSource
-from sionna_partial.maps.partial_map import (
-    MAX_CELLS,
-    PartialMap,
-    grid_array,
-    layers_of,
-    require_map,
-    warn_of_odd_states,
-)
+from sionna_partial.maps.import_report import ImportSource, warn_of_odd_states
+from sionna_partial.maps.layers import MAX_CELLS, grid_array, layers_of
+from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
 from sionna_partial.settings import Material
 
@@ -165,7 +159,7 @@ def load_map(
     if partial.import_source is None:
         partial = replace(partial, import_source=ImportSource(str(source)))
     if partial.environment.is_extruded:
-        warn_of_odd_states(f"path = '{source}'", partial)
+        warn_of_odd_states(f"path = '{source}'", partial.state)
     if wall_height_m is not None:
         partial = replace(partial, wall_height_m=wall_height_m)
         partial = replace(partial, **partial.environment.with_height(partial.wall_height_m))

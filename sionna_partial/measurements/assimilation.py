@@ -18,7 +18,8 @@ from sionna_partial.checks import float_array, require, require_number, require_
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
-from sionna_partial.maps.partial_map import PartialMap, position_array, require_map
+from sionna_partial.maps.grid import position_array
+from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db

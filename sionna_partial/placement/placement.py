@@ -17,7 +17,8 @@ from sionna_partial.display import Pictured, part_of, reporting
 from sionna_partial.errors import PositionError
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, cell_centres_m, require_height
+from sionna_partial.maps.grid import cell_centres_m
+from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction, Predictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m

@@ -29,8 +29,9 @@ from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S,
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
 from sionna_partial.files import atomic_files, temporary_folder
+from sionna_partial.maps.grid import position_array
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import PartialMap, position_array
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import material_is_unknown, scene_settings_of
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna

@@ -11,14 +11,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import TypeAlias
 
+from sionna_partial.apps.refining import GivenWay
 from sionna_partial.checks import Progress, reason_of
 from sionna_partial.errors import SionnaPartialError
 
 _log = logging.getLogger(__name__)
-
-
-class CancelledError(Exception):
-    """A job was cancelled."""
 
 
 @dataclass(frozen=True)
@@ -75,11 +72,11 @@ class Job:
         self.pass_on()
 
     def pass_on(self) -> None:
-        """Let other jobs compute; raise a `CancelledError` when this one was cancelled."""
+        """Let other jobs compute; raise `GivenWay` when this one was cancelled."""
         if not self.is_cancelled.is_set():
             TURNS.pass_on()
         if self.is_cancelled.is_set():
-            raise CancelledError
+            raise GivenWay
 
 
 Work: TypeAlias = Callable[[Progress], Iterator[Callable[[], None]]]
@@ -94,7 +91,7 @@ class WindowJobs:
     """
 
     def __init__(self, call: Callable[[Callable[[], None]], object], show: Callable[[], None]) -> None:
-        self._call, self._show = call, show
+        self._call, self.show = call, show
         self._waiting: deque[Callable[[], None]] = deque()
         self._job: Job | None = None
         self._worker = ThreadPoolExecutor(1, "coverage of a window")
@@ -120,7 +117,7 @@ class WindowJobs:
             self._job.is_cancelled.set()
         job = self._job = Job(self._tell)
         self.status = Status("Waiting", 0.0)
-        self._show()
+        self.show()
         with suppress(RuntimeError):  # a window that was closed computes nothing
             self._worker.submit(self._run, job, work)
 
@@ -132,11 +129,11 @@ class WindowJobs:
 
     def refuse(self, error: object) -> None:
         self.status = Status(str(error), is_error=True)
-        self._show()
+        self.show()
 
     def close(self) -> None:
         """Cancel the job, and accept no other one."""
-        self._call, self._show = lambda function: None, lambda: None
+        self._call, self.show = lambda function: None, lambda: None
         self.cancel()
         self._worker.shutdown(wait=False, cancel_futures=True)
 
@@ -149,7 +146,7 @@ class WindowJobs:
                     self.do(partial(self._take, job, change))
                     job.pass_on()
                 end = Status("Ready.")
-        except CancelledError:
+        except GivenWay:
             return
         except Exception as error:  # shown by the page, which stays alive
             end = Status(_reason(error), is_error=True)
@@ -159,7 +156,7 @@ class WindowJobs:
         def tell() -> None:
             if job is self._job:
                 self.status = status
-                self._show()
+                self.show()
 
         self.do(tell)
 
@@ -167,7 +164,7 @@ class WindowJobs:
         if job is self._job:
             change()
             self._job_warnings += job.warnings
-            self._show()
+            self.show()
 
     def _end(self, job: Job, end: Status) -> None:
         if job is self._job:
@@ -178,7 +175,7 @@ class WindowJobs:
     def _conclude(self, status: Status) -> None:
         """Show the end of a job."""
         self.status = status
-        self._show()
+        self.show()
 
 
 def _reason(error: Exception) -> str:

@@ -13,9 +13,11 @@ import numpy as np
 from sionna_partial.apps.app.answer import LAYERS, LIKELY, OUTLINES, Answer
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
 from sionna_partial.apps.app.files import FILES
+from sionna_partial.apps.app.maps import MORE_STEPS
 from sionna_partial.apps.app.picture import Picture
+from sionna_partial.apps.app.planning import ROUNDING_M
 from sionna_partial.apps.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, PRESETS
-from sionna_partial.apps.app.session import MORE_STEPS, ROUNDING_M, Session
+from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import room_fractions
@@ -101,7 +103,7 @@ class Page:
         )
         self.threshold = self._on(
             Slider(title="Threshold [dBm]", name="threshold", start=-130, end=-30, step=1, value=-67),
-            lambda value: session.set(threshold_dbm=float(value)),
+            lambda value: session.radios.set(threshold_dbm=float(value)),
         )
         self.outline = self._on(
             Select(
@@ -118,14 +120,14 @@ class Page:
         materials: list[Any] = [(name, name or "unknown") for name in MATERIALS]
         self.material = self._on(
             Select(title="Material of walls", name="material", options=materials),
-            lambda name: session.set(material=name),
+            lambda name: session.radios.set(material=name),
         )
         self.message = Div(
             name="message", sizing_mode="stretch_width", html_attributes={"role": "status", "aria-live": "polite"}
         )
         self.warnings = Div(name="warnings", sizing_mode="stretch_width", html_attributes={"role": "status"})
         self.summary = Div(name="summary", sizing_mode="stretch_width")
-        self.cancel = self._button("Cancel", lambda: self.session.cancel(), button_type="danger", width=90)
+        self.cancel = self._button("Cancel", lambda: self.session.jobs.cancel(), button_type="danger", width=90)
 
     def _make_map_controls(self) -> None:
         from bokeh.models.widgets.inputs import Select, Spinner
@@ -141,11 +143,11 @@ class Page:
         self.brush = Spinner(title="Brush [m]", name="brush", low=0.05, high=20, step=0.05, value=0.5)
         self.length = self._on(
             Spinner(title="Known length [m]", name="length", low=0.01, high=10_000, step=0.1),
-            lambda value: self.session.measure(self._line_m, float(value)),
+            lambda value: self.session.maps.measure(self._line_m, float(value)),
         )
         self.dark = self._on(
             Slider(title="Walls up to shade", name="dark", start=0, end=254, step=1, value=127),
-            lambda value: self.session.change_source(threshold=int(value)),
+            lambda value: self.session.maps.change_source(threshold=int(value)),
             "value_throttled",
         )
         self.layer_of_walls = self._on(Select(title="Layer of the drawing", name="wall_layer"), lambda _: self.show())
@@ -153,7 +155,7 @@ class Page:
         self.layer_material = self._on(
             Select(title="Its material", name="wall_layer_material", options=materials), self._set_layer_material
         )
-        self.undo = self._button("Undo", lambda: self.session.undo())
+        self.undo = self._button("Undo", lambda: self.session.maps.undo())
         self.picture.follow(self.stroke, self.brush, self.dark)
 
     def _make_transmitter_controls(self) -> None:
@@ -181,7 +183,7 @@ class Page:
         )
         self.goal = Spinner(title="Covered floor [%]", name="goal", low=1, high=100, step=1, value=95)
         self.most = Spinner(title="At most", name="most", low=1, high=MOST_TRANSMITTERS, step=1, value=4)
-        self.plan_channels = self._button("Plan channels", lambda: self.session.plan_channels())
+        self.plan_channels = self._button("Plan channels", lambda: self.session.searches.plan_channels())
         self.pattern = self._on(
             Select(title="Antenna", name="pattern", options=list[Any](_ANTENNAS.items())),
             lambda value: self._change_antenna("pattern", value),
@@ -204,15 +206,15 @@ class Page:
 
         self.walls = self._on(
             Select(title="Paths through walls", options=list[Any](_WALLS.items()), value=""),
-            lambda value: self.session.set(through_walls={"": None, "opaque": False, "through": True}[value]),
+            lambda value: self.session.radios.set(through_walls={"": None, "opaque": False, "through": True}[value]),
         )
         self.both_ways = self._on(
             Select(title="Received power", name="both_ways", options=list[Any](_DIRECTIONS.items()), value=""),
-            lambda value: self.session.set(both_ways=bool(value)),
+            lambda value: self.session.radios.set(both_ways=bool(value)),
         )
         self.region = self._on(
             Select(title="Power limits of", name="region", options=list[Any](_REGIONS.items())),
-            lambda name: self.session.set(region=name),
+            lambda name: self.session.radios.set(region=name),
         )
         self.radio = {
             name: self._on(
@@ -248,8 +250,8 @@ class Page:
         upload_map.js_on_click(CustomJS(args={"id": "map-file"}, code=_UPLOAD))
         upload_csv.js_on_click(CustomJS(args={"id": "csv-file"}, code=_UPLOAD))
         copy.js_on_click(CustomJS(args={"area": self.python, "message": self.message}, code=_COPY))
-        self.forget = self._button("Forget the measurements", lambda: session.forget_measurements())
-        self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.explore_more())
+        self.forget = self._button("Forget the measurements", lambda: session.surveys.forget_measurements())
+        self.more = self._button(f"Explore {MORE_STEPS} more steps", lambda: session.maps.explore_more())
         x, y, z, eirp = self.fields.values()
         frequency, bandwidth, height, spacing, client = self.radio.values()
         return {
@@ -279,10 +281,10 @@ class Page:
                 _pair(self.model, self.channel),
                 _pair(self.pattern, *self.aims.values()),
                 _pair(
-                    self._button("Add", lambda: session.add()),
-                    self._button("Remove", lambda: session.remove(session.chosen)),
+                    self._button("Add", lambda: session.radios.add()),
+                    self._button("Remove", lambda: session.radios.remove(session.chosen)),
                 ),
-                self._button("Place it for me", lambda: session.place(), button_type="primary"),
+                self._button("Place it for me", lambda: session.searches.place(), button_type="primary"),
                 _pair(self.goal, self.most),
                 self._button("Place several for me", self._place_several),
                 self.plan_channels,
@@ -295,7 +297,7 @@ class Page:
             ),
             "robot": _wide(
                 self.more,
-                self._button("Best next views", lambda: session.find_views()),
+                self._button("Best next views", lambda: session.searches.find_views()),
                 upload_csv,
                 self.measured_text,
                 self.forget,
@@ -329,13 +331,13 @@ class Page:
         try:
             take(*given)
         except SionnaPartialError as error:
-            self.session.refuse(error)
+            self.session.jobs.refuse(error)
 
     # Callbacks
 
     def _on_points(self, _name: str, _old: Any, new: Any) -> None:
         if not self._is_showing:
-            self._guarded(self.session.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
+            self._guarded(self.session.radios.put, [*zip(new["name"], new["x"], new["y"], strict=True)])
 
     def _on_selected(self, _name: str, _old: Any, new: list[int]) -> None:
         """Choose a clicked or dragged transmitter; clearing the selection here would end a drag."""
@@ -353,23 +355,23 @@ class Page:
         self.picture.stroke.data = {"x": [], "y": [], "r": []}
         material = self.paint.value if self.stroke.value in PAINTS else ""
         stroke = Stroke(self.stroke.value, tuple(points_m), float(self.brush.value or 0.0), material)
-        self._guarded(self.session.draw, stroke)
+        self._guarded(self.session.maps.draw, stroke)
 
     def _set_layer_material(self, name: str) -> None:
         assert isinstance(self.session.source, Drawing)
         materials = {**self.session.source.materials, self.layer_of_walls.value: name}
-        self.session.change_source(materials={layer: each for layer, each in materials.items() if each})
+        self.session.maps.change_source(materials={layer: each for layer, each in materials.items() if each})
 
     def _place_several(self) -> None:
-        self.session.place_several(float(self.goal.value or 0.0) / 100.0, int(self.most.value or 1))
+        self.session.searches.place_several(float(self.goal.value or 0.0) / 100.0, int(self.most.value or 1))
 
     def _open_example(self, name: str) -> None:
         if name:
-            self.session.open_example(name)
+            self.session.maps.open_example(name)
 
     def _use_preset(self, name: str) -> None:
         if name:
-            self.session.use_preset(name)
+            self.session.radios.use_preset(name)
 
     def _choose(self, name: str) -> None:
         if name in self.session.transmitters:
@@ -381,10 +383,10 @@ class Page:
         self._change(antenna=replace(antenna, **{name: value}))
 
     def _set_field(self, name: str, unit: float, value: float) -> None:
-        self.session.set(**{name: float(value) * unit})
+        self.session.radios.set(**{name: float(value) * unit})
 
     def _change(self, **values: Any) -> None:
-        self.session.change(self.session.chosen, **values)
+        self.session.radios.change(self.session.chosen, **values)
 
     # Updates
 
@@ -409,7 +411,7 @@ class Page:
             self._drawn[name] = key
 
     def _show_status(self) -> None:
-        status = self.session.status
+        status = self.session.jobs.status
         text = html.escape(status.message)
         if status.fraction is not None:
             text = f'<progress max="1" value="{status.fraction:.2f}" aria-label="progress"></progress> {text}'

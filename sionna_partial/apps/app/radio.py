@@ -19,7 +19,8 @@ from sionna_partial.coverage.link_budget import (
     schemes,
 )
 from sionna_partial.errors import SettingsError
-from sionna_partial.maps.partial_map import PartialMap, nearest_free_m
+from sionna_partial.maps.grid import nearest_free_m
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import FREQUENCIES_HZ, WALL_MATERIALS, SceneSettings, TraceSettings, material_name
 from sionna_partial.tracing.antennas import Antenna
 

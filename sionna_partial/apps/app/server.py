@@ -77,10 +77,8 @@ class AppServer:
 
         logging.getLogger("bokeh.server.views.ws").setLevel(logging.ERROR)  # a window was closed during its job
         self._sessions, self._token = dict[str, Session](), secrets.token_urlsafe(24)
-        self._open_first = functools.partial(Session.open_example, name=_FIRST_EXAMPLE)
         given: dict[str, Any] = {"partial": partial, "title": title, "warnings": warnings, "source": source}
-        if partial is not None or source is not None:
-            self._open_first = functools.partial(Session.open_map, **given)
+        self._given = given if partial is not None or source is not None else None
         path = f"/{self._token}"
         hosts = {address, socket.gethostname()} | ({"localhost"} if address == LOOPBACK else set())
         try:
@@ -129,10 +127,13 @@ class AppServer:
 
         def close(_: Any) -> None:
             self._sessions.pop(key, None)
-            session.close()
+            session.jobs.close()
 
         document.on_session_destroyed(close)
-        self._open_first(session)
+        if self._given is None:
+            session.maps.open_example(_FIRST_EXAMPLE)
+        else:
+            session.maps.open_map(**self._given)
 
 
 def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]) -> tuple[int, str] | None:
@@ -154,11 +155,11 @@ def _upload_fault(session: Session | None, kind: str, headers: Mapping[str, str]
 def _take_upload(session: Session, kind: str, files: list[tuple[str, bytes]]) -> None:
     try:
         if kind == "map":
-            session.upload_map(files)
+            session.maps.upload_map(files)
         else:
-            session.learn(files[0][1], files[0][0])
+            session.surveys.learn(files[0][1], files[0][0])
     except SionnaPartialError as error:
-        session.refuse(error)
+        session.jobs.refuse(error)
 
 
 class _Files:
@@ -236,7 +237,7 @@ class _Files:
         if session is None or not files:
             self._refuse(*_NOTHING_TO_SEND)
             return
-        session.do(functools.partial(_take_upload, session, kind, files))
+        session.jobs.do(functools.partial(_take_upload, session, kind, files))
         await self.finish()
 
 

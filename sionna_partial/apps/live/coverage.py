@@ -16,10 +16,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter
 
 from sionna_partial.apps.live.answers import LiveAnswer, LiveGrid, LiveTransmitter, LiveViews, MapMessage
+from sionna_partial.apps.refining import GivenWay, Pass, coarse_then_fine
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import (
     Checked,
-    Progress,
     Within,
     float_array,
     no_progress,
@@ -29,14 +29,16 @@ from sionna_partial.checks import (
     settings_or_default,
     shown,
 )
-from sionna_partial.constants import COARSER, COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
+from sionna_partial.constants import COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
 from sionna_partial.coverage.job import grid_axes, predict_map
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
+from sionna_partial.maps.grid import nearest_free_m, with_height
 from sionna_partial.maps.importers.bags import map_of_percent, occupancy_parts
-from sionna_partial.maps.partial_map import PartialMap, grid_array, nearest_free_m, with_height
+from sionna_partial.maps.layers import grid_array
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements, can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
@@ -114,10 +116,6 @@ class LiveSettings(Checked):
     views_every_s: Annotated[float, Within(0.0, 1e6)] = 0.0
     max_cost: Annotated[int, Within(1, 100)] = MAX_COST
     every_unknown: bool = False
-
-
-class _NewerMap(Exception):
-    """A newer map is waiting."""
 
 
 def _refusing(method: Callable[..., None]) -> Callable[..., None]:
@@ -378,7 +376,7 @@ class LiveCoverage:
         """Compute, and log failures; "" is a coarse answer, which the final one follows."""
         try:
             compute(*given)
-        except _NewerMap:
+        except GivenWay:
             raise
         except Exception as error:  # whatever it is, the next map may be answered
             if what:
@@ -389,14 +387,15 @@ class LiveCoverage:
         if self._model is None:
             self._model = LinkModel(partial, **self._model_settings)
         self._model.update(partial)
+        coarse, fine = coarse_then_fine(self.settings.spacing_m, fine=no_progress if self._gave_way else self._give_way)
         if grid.number != self._answered:
             self._answered = grid.number
             self._clear_removed()
-            self._each(grid, is_final=False)
-        may_give_way, self._gave_way = not self._gave_way, False
+            self._answer_each(grid, coarse)
         try:  # once a newer map comes first, and then not, so that there is a fine answer now and then
-            self._each(grid, is_final=True, report=self._give_way if may_give_way else no_progress)
-        except _NewerMap:
+            self._gave_way = False
+            self._answer_each(grid, fine)
+        except GivenWay:
             self._gave_way = True
 
     def _extended(self, partial: PartialMap) -> PartialMap:
@@ -427,16 +426,16 @@ class LiveCoverage:
 
     def _give_way(self, fraction: float, message: str) -> None:
         if self._waiting is not None:
-            raise _NewerMap
+            raise GivenWay
 
-    def _each(self, grid: MapMessage, *, is_final: bool, report: Progress = no_progress) -> None:
+    def _answer_each(self, grid: MapMessage, wanted: Pass) -> None:
         for name, tx_m in self.tx_m.items():
-            self._guarded(f"map for {name}" if is_final else "", self._answer, grid, name, tx_m, is_final, report)
+            self._guarded(f"map for {name}" if wanted.is_final else "", self._answer, grid, name, tx_m, wanted)
 
-    def _answer(self, grid: MapMessage, name: str, tx_m: Floats | None, is_final: bool, report: Progress) -> None:
+    def _answer(self, grid: MapMessage, name: str, tx_m: Floats | None, wanted: Pass) -> None:
         assert self._model is not None
         measured = self._measured(name, tx_m)
-        if tx_m is None and (measured is None or not is_final):
+        if tx_m is None and (measured is None or not wanted.is_final):
             return
         beyond_m = 0.0 if tx_m is None else _beyond_m(grid.partial, tx_m)
         if beyond_m > FARTHEST_M:
@@ -445,21 +444,23 @@ class LiveCoverage:
         coverage = predict_map(
             self._model,
             tx_m,
-            spacing_m=self.settings.spacing_m * (1 if is_final else COARSER),
+            spacing_m=wanted.spacing_m,
             rx_height_m=self.settings.rx_height_m,
             area_m=grid.partial.bounds_m,
-            receivers="near" if is_final and not self.settings.every_unknown else "indoor",
+            receivers="near" if wanted.is_final and not self.settings.every_unknown else "indoor",
             measurements=measured,
-            progress=report,
+            progress=wanted.report,
         )
-        receivers = self._receivers(grid.partial, coverage, None if is_final else tx_m)
+        receivers = self._receivers(grid.partial, coverage, None if wanted.is_final else tx_m)
         with self._changed:  # no newer map comes before the grid is published
             newest = self._newest
             if newest is None or name not in self.tx_m or self.tx_m[name] is not tx_m:
                 return  # it was moved meanwhile
             cost, unknown = newest.costs(*receivers, self.settings.max_cost)
             age_s = time.monotonic() - grid.came_s
-            answer = LiveGrid(name, grid.number, is_final, coverage, cost, unknown, newest.header, newest.info, age_s)
+            answer = LiveGrid(
+                name, grid.number, wanted.is_final, coverage, cost, unknown, newest.header, newest.info, age_s
+            )
             self._published[name] = answer
             self._publish(answer)
             if tx_m is None:

@@ -24,7 +24,8 @@ from sionna_partial.checks import is_whole, shown
 from sionna_partial.display import Shown
 from sionna_partial.errors import MapError, PredictorError, SettingsError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
-from sionna_partial.maps.partial_map import PartialMap, layers_of
+from sionna_partial.maps.layers import layers_of
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkContext, LinkFeatures, link_numbers, link_states
 from sionna_partial.prediction.map_networks import FEATURES, columns_of, features_of_columns
 from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings

@@ -9,7 +9,8 @@ from scipy.ndimage import binary_dilation
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.partial_map import PartialMap, grid_array
+from sionna_partial.maps.layers import grid_array
+from sionna_partial.maps.partial_map import PartialMap
 
 HABITAT_INVALID, HABITAT_BORDER = 0, 2
 """Habitat's top-down values: not navigable, and the navigable rim beside it (habitat-lab, maps.py)."""

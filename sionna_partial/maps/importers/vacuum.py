@@ -21,7 +21,8 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SionnaPartialError, one_line
 from sionna_partial.files import read_bytes
 from sionna_partial.maps.import_report import ImportNotes
-from sionna_partial.maps.partial_map import MAX_CELLS, MAX_WALL_MATERIALS, PartialMap
+from sionna_partial.maps.layers import MAX_CELLS, MAX_WALL_MATERIALS
+from sionna_partial.maps.partial_map import PartialMap
 
 MAX_BYTES = 200_000_000
 

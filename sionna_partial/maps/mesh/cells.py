@@ -16,9 +16,11 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
 from sionna_partial.maps.environment import SceneMesh, height_pair
+from sionna_partial.maps.grid import area_polygon
 from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
+from sionna_partial.maps.layers import MAX_CELLS
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
-from sionna_partial.maps.partial_map import MAX_CELLS, PartialMap, area_polygon
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.process import njit
 
