@@ -19,7 +19,7 @@ from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths, in_observed_space
+from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths, path_unobserved_m
 from sionna_partial.prediction.map_networks import feature_values
 from sionna_partial.prediction.path_model import AntennaLinks
 from sionna_partial.prediction.predictor import (
@@ -217,8 +217,8 @@ class LinkModel:
     def _blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
     ) -> Iterator[SolvedPaths]:
-        observed = None if self.partial.is_complete else functools.partial(in_observed_space, self.partial)
-        return self.simulation.blocks(tx_m, rx_m, report, antenna, observed)
+        unobserved = None if self.partial.is_complete else functools.partial(path_unobserved_m, self.partial)
+        return self.simulation.blocks(tx_m, rx_m, report, antenna, unobserved)
 
     def _predict_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]

@@ -8,7 +8,7 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.checks import no_progress
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.prediction.features import LinkFeatures, features_of_paths, in_observed_space
+from sionna_partial.prediction.features import LinkFeatures, features_of_paths, path_unobserved_m
 from sionna_partial.resources import scenes_folder
 
 
@@ -19,12 +19,12 @@ def test_the_tolerance_bounds_power_and_power_through_observed_space(frequency_h
     free = np.argwhere(partial.state == sp.CellState.FREE)
     cells = free[np.random.default_rng(0).choice(len(free), 26, replace=False)]
     tx_m, *rx_m = np.column_stack([cell_centres_m(partial, cells), np.full(len(cells), 1.5)])
-    observed = functools.partial(in_observed_space, partial)
+    unobserved = functools.partial(path_unobserved_m, partial)
 
     def features(tolerance_db: float) -> LinkFeatures:
         settings = sp.TraceSettings(frequency_hz, max_depth=3, power_tolerance_db=tolerance_db)
         simulation = sp.Simulation(partial, settings, sp.SceneSettings(material="drywall"))
-        paths = simulation.blocks(tx_m, np.array(rx_m), no_progress, None, observed)
+        paths = simulation.blocks(tx_m, np.array(rx_m), no_progress, None, unobserved)
         return features_of_paths(partial, tx_m, np.array(rx_m), paths, simulation.resolved)
 
     every, some = features(0.0), features(0.1)

@@ -33,10 +33,11 @@ from sionna_partial.errors import MeasurementError
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
-from sionna_partial.prediction.features import SEEN_M, path_unobserved_m
+from sionna_partial.prediction.features import path_unobserved_m
 from sionna_partial.scene.scene import constants_of
 from sionna_partial.settings import Material, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathSet
+from sionna_partial.tracing.paths import SEEN_M
 from sionna_partial.tracing.power import Polarisation, reflection_loss_db
 from sionna_partial.tracing.simulation import Simulation, nearest_m, simulation_of
 

@@ -23,7 +23,6 @@ from sionna_partial.errors import MemoryLimitError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import (
-    SEEN_M,
     link_features,
     traced_unobserved_m,
     with_path_power,
@@ -33,7 +32,7 @@ from sionna_partial.prediction.predictor import LinkPrediction, Predictor
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.links import TracedLinks, unnamed_counts
-from sionna_partial.tracing.paths import SolvedPaths, path_gain_db, path_order
+from sionna_partial.tracing.paths import SEEN_M, SolvedPaths, path_gain_db, path_order
 from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:

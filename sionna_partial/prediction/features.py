@@ -32,16 +32,13 @@ from sionna_partial.prediction.unobserved import (
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.links import LinkSums, TracedLinks
-from sionna_partial.tracing.paths import SolvedPaths, path_gain_db
+from sionna_partial.tracing.paths import SEEN_M, LocatedPaths, SolvedPaths, path_gain_db
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path through u metres has the weight exp(-u / length)."""
 
 _PATHS_AT_ONCE = 100_000
-
-SEEN_M = 1e-3
-"""Largest unobserved length of a path in observed space [m]."""
 
 _ASIDE_CELLS = 1.5
 """Offset of the parallel lines in `_crosses_wall` [cells]."""
@@ -180,8 +177,11 @@ class IndirectPaths:
             block = slice(start, start + _PATHS_AT_ONCE)
             indirect = start + np.flatnonzero(np.any(paths.interactions[block] > 0, axis=1))
             tx, rx = paths.path_tx[indirect], paths.path_rx[indirect]
-            interactions, vertices_m = paths.interactions[indirect], paths.vertices_m[indirect]
-            unobserved_m = path_unobserved_m(self.partial, self.tx_m[tx], interactions, vertices_m, self.rx_m[rx])
+            if isinstance(paths, LocatedPaths):
+                unobserved_m = paths.unobserved_m[indirect]
+            else:
+                interactions, vertices_m = paths.interactions[indirect], paths.vertices_m[indirect]
+                unobserved_m = path_unobserved_m(self.partial, self.tx_m[tx], interactions, vertices_m, self.rx_m[rx])
             self._add(tx.astype(np.int64) * len(self.rx_m) + rx, np.abs(paths.a[indirect]) ** 2, unobserved_m)
         straight = np.isin(paths.interactions, (0, REFRACTION)).all(axis=1)
         link = paths.path_tx[straight].astype(np.int64) * len(self.rx_m) + paths.path_rx[straight]
@@ -242,13 +242,6 @@ def path_unobserved_m(
         here_m[there] = there_m
     total_m[rows] += lengths_in_unknown_m(partial, here_m, end_m[rows])
     return total_m
-
-
-def in_observed_space(
-    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
-) -> Bools:
-    """Return whether paths (P,) as in `path_unobserved_m` are in observed space."""
-    return path_unobserved_m(partial, start_m, interactions, vertices_m, end_m) < SEEN_M
 
 
 def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:

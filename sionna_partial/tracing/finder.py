@@ -24,7 +24,7 @@ from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
-from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges
+from sionna_partial.tracing.paths import Candidates, LocatedPaths, SolvedPaths, Wedges
 from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates
 from sionna_partial.tracing.plan.room import Room
@@ -46,8 +46,8 @@ power of omitted paths is added."""
 Purpose = Literal["links", "powers"]
 """Use of paths: as they are, or for powers alone, to which the expected power of omitted paths is added."""
 
-Counted = Callable[[SolvedPaths], Bools]
-"""Function that selects the paths whose power the tolerance refers to."""
+Counted = Callable[[SolvedPaths], tuple[LocatedPaths, Bools]]
+"""Function that locates paths, and selects those whose power the tolerance refers to."""
 
 Kinds = tuple[list[Kind], list[Kind]]
 """Kinds of candidates between opaque walls, and through walls."""
@@ -163,7 +163,9 @@ class ExactFinder:
                         indirect = ~paths.is_direct
                         strength = antenna.power(paths, settings.frequency_hz) if antenna and directed else paths.power
                         np.add.at(power, paths.path_rx[indirect], strength[indirect])
-                        indirect = indirect if counted is None else indirect & counted(paths)
+                        if counted is not None:
+                            paths, observed = counted(paths)
+                            indirect &= observed
                         np.add.at(reference, paths.path_rx[indirect], strength[indirect])
                         yield candidates, paths
                 if estimates:

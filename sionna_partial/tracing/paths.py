@@ -15,6 +15,9 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less [m]."""
 
+SEEN_M = 1e-3
+"""Largest unobserved length of a path in observed space [m]."""
+
 
 @dataclass(frozen=True)
 class SolvedPaths:
@@ -50,7 +53,7 @@ class SolvedPaths:
         return self.path_tx.astype(np.int64) * receivers + self.path_rx
 
     def take(self, index: NDArray[Any]) -> "SolvedPaths":
-        return SolvedPaths(*(column[index] for column in vars(self).values()))
+        return replace(self, **{name: column[index] for name, column in vars(self).items()})
 
     def between(self, tx: int, rx: NDArray[np.int32]) -> "SolvedPaths":
         return replace(self, path_tx=np.full(len(self.a), tx, np.int32), path_rx=rx[self.path_rx])
@@ -90,6 +93,13 @@ class SolvedPaths:
             interactions=interactions,
             vertices_m=vertices_m,
         )
+
+
+@dataclass(frozen=True)
+class LocatedPaths(SolvedPaths):
+    """Verified paths with their lengths in unobserved space, `unobserved_m` (P,), 0 for direct paths."""
+
+    unobserved_m: Floats
 
 
 class PathColumns:

@@ -40,11 +40,11 @@ from sionna_partial.tracing.finder import Counted, ExactFinder, Found, Purpose, 
 from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
 from sionna_partial.tracing.links import LinkSums, TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
-from sionna_partial.tracing.paths import PathColumns, PathFiles, SolvedPaths, path_bytes
+from sionna_partial.tracing.paths import SEEN_M, LocatedPaths, PathColumns, PathFiles, SolvedPaths, path_bytes
 
-Observed = Callable[[Floats, NDArray[np.uint8], Floats, Floats], Bools]
-"""Function that returns which paths (P,) are in observed space: from points (P, 3) by interactions (P, D) at vertices
-(P, D, 3) to points (P, 3) [m]."""
+Unobserved = Callable[[Floats, NDArray[np.uint8], Floats, Floats], Floats]
+"""Function that returns the lengths (P,) of paths in unobserved space: from points (P, 3) by interactions (P, D) at
+vertices (P, D, 3) to points (P, 3) [m]."""
 
 InvalidLinks = Literal["raise", "nan"]
 
@@ -73,7 +73,7 @@ class Request(NamedTuple):
     polarisations: int = 1
     antenna: Antenna | None = None
     purpose: Purpose = "links"
-    observed: Observed | None = None
+    unobserved: Unobserved | None = None
 
 
 class Simulation:
@@ -242,14 +242,15 @@ class Simulation:
         rx_m: Floats,
         report: Progress,
         antenna: Antenna | None = None,
-        observed: Observed | None = None,
+        unobserved: Unobserved | None = None,
     ) -> Iterator[SolvedPaths]:
         """Find the paths for powers from a transmitter (3,) to receivers (N, 3), checked positions, in blocks.
 
-        `antenna` is as in `ExactFinder.paths`. The power of a link is within the tolerance, and with `observed` its
-        power through observed space: weak paths are left out, and others amplified by their expected power.
+        `antenna` is as in `ExactFinder.paths`. The power of a link is within the tolerance, and with `unobserved` its
+        power through observed space: weak paths are left out, and others amplified by their expected power. Paths are
+        then LocatedPaths if the transmitter is observed.
         """
-        every, request = [np.arange(len(rx_m))], Request(1 if antenna is None else 2, antenna, "powers", observed)
+        every, request = [np.arange(len(rx_m))], Request(1 if antenna is None else 2, antenna, "powers", unobserved)
         for group in self._groups(tx_m[None], rx_m, every, report, request):
             yield from (paths for _, paths in group)
         report(1.0, "traced")
@@ -340,7 +341,7 @@ class Simulation:
         ]
         for number, (tx, chosen) in enumerate(groups):
             part = part_of(report, number / len(groups), (number + 1) / len(groups))
-            counted = self._counted(tx_m[tx], rx_m[chosen], request.observed)
+            counted = self._counted(tx_m[tx], rx_m[chosen], request.unobserved)
             found = self._finder.paths(
                 self.in_scene(tx_m[tx]),
                 self.in_scene(rx_m[chosen]),
@@ -352,18 +353,18 @@ class Simulation:
             )
             yield self._in_world(tx, chosen, found)
 
-    def _counted(self, tx_m: Floats, rx_m: Floats, observed: Observed | None) -> Counted | None:
+    def _counted(self, tx_m: Floats, rx_m: Floats, unobserved: Unobserved | None) -> Counted | None:
         """Count the paths in observed space where both ends are observed, elsewhere all paths."""
-        if observed is None or self.partial.state_at(tx_m) == CellState.UNKNOWN:
+        if unobserved is None or self.partial.state_at(tx_m) == CellState.UNKNOWN:
             return None
         rx_seen = self.partial.state_at(rx_m) != CellState.UNKNOWN
 
-        def counted(paths: SolvedPaths) -> Bools:
-            rows, rx = np.flatnonzero(rx_seen[paths.path_rx]), paths.path_rx
+        def counted(paths: SolvedPaths) -> tuple[LocatedPaths, Bools]:
+            rows, rx = np.flatnonzero(~paths.is_direct), paths.path_rx
             vertices_m, start_m = self.in_world(paths.vertices_m[rows]), np.broadcast_to(tx_m, (len(rows), 3))
-            mask = np.ones(len(rx), dtype=bool)
-            mask[rows] = observed(start_m, paths.interactions[rows], vertices_m, rx_m[rx[rows]])
-            return mask
+            unobserved_m = np.zeros(len(rx))
+            unobserved_m[rows] = unobserved(start_m, paths.interactions[rows], vertices_m, rx_m[rx[rows]])
+            return LocatedPaths(**vars(paths), unobserved_m=unobserved_m), ~rx_seen[rx] | (unobserved_m < SEEN_M)
 
         return counted
 
