@@ -302,8 +302,9 @@ def _draw_lines(axis: Axes, rows: "list[Row]", name: str) -> None:
 def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
     """Draw reliability diagrams of the link state (above) and histograms of the gain's transform (below), by stage.
 
-    Calibrated states are on the dashed line (area: number of links), calibrated gains fill all bins up to it. A hill
-    shows a standard deviation that is too large, a bowl one that is too small.
+    The confidence is the probability of the most probable state, P(smaller gain) the predicted distribution function at
+    the true gain. Calibrated states are on the dashed line (area: number of links), calibrated gains fill all bins up
+    to it. A hill shows a standard deviation that is too large, a bowl one that is too small.
     """
     require(len(stages) > 0, "stages", dict(stages), "give at least one calibration.")
     figure = Figure(figsize=(max(1.8 * len(stages), 5.4), 4.6), dpi=170, layout="constrained")
@@ -318,14 +319,12 @@ def plot_reliability(stages: Mapping[float, Calibration]) -> Figure:
         above.set(xlim=(0.3, 1.02), ylim=(0.0, 1.05))
         above.set_xticks(np.arange(0.4, 1.01, 0.2))
         above.set_xticks(np.arange(5, CONFIDENCE_BINS + 1) / CONFIDENCE_BINS, minor=True)
+        above.set_xlabel("confidence")
         above.set_title(f"{stage_name(stage)},\nerror {state.error:.3f}", fontsize="medium")
         below.stairs(calibration.gain_pit * PIT_BINS, edges, fill=True, color=BLUE, alpha=0.8)
         below.axhline(1.0, **_IDEAL)
-        below.set(xlim=(0.0, 1.0))
+        below.set(xlim=(0.0, 1.0), xlabel="P(smaller gain)")
         below.set_xticks([0.0, 0.5, 1.0])
-    middle = axes[:, len(stages) // 2]
-    middle[0].set_xlabel("probability of the most probable link state")
-    middle[1].set_xlabel("predicted probability of a smaller path gain")
     axes[0, 0].set_ylabel("accuracy")
     axes[1, 0].set_ylabel("density")
     figure.suptitle("Calibration of the link state (above) and of the path gain (below)")
