@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from extruded import drawn
+from scipy import ndimage
 
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
@@ -52,6 +53,22 @@ def test_known_walls_close_off_the_unknown():
     assert not MapSpace(PartialMap(state, 0.1)).exposure.any()
     state[20, 35:38] = UNKNOWN
     assert MapSpace(PartialMap(state, 0.1)).exposure.max() > 0.01
+
+
+@pytest.mark.parametrize("angle_deg", [0.0, 12.0, 45.0, 71.0])
+@pytest.mark.parametrize("resolution_m", [0.05, 0.1])
+def test_inclined_walls_are_closed(angle_deg, resolution_m):
+    """In a room with walls of one cell, once the space outside can be entered."""
+    axis, angle = np.arange(-6.0, 6.0, resolution_m) + resolution_m / 2.0, math.radians(angle_deg)
+    x, y = np.meshgrid(axis, axis)
+    along, across = x * math.cos(angle) + y * math.sin(angle), y * math.cos(angle) - x * math.sin(angle)
+    inside = (np.abs(along) < 3.0) & (np.abs(across) < 2.0)
+    state = np.where(inside, FREE, np.where(ndimage.binary_dilation(inside, np.ones((3, 3))), WALL, UNKNOWN))
+    state[5, 5] = FREE
+    space, ends = MapSpace(PartialMap(state, resolution_m, (-6.0, -6.0))), at((0.0, 0.0), (1.0, 1.0))
+    assert space.exposure_at(at((-5.0, -5.0))) > 0.5
+    assert space.exposure_at(ends).max() < 1e-6
+    assert space.routes(ends[0], at((-5.0, -5.0)))[0] > 15.0
 
 
 def test_a_far_cell_changes_little():

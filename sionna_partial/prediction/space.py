@@ -81,8 +81,15 @@ class MapSpace:
         rows, columns = (overlaps(edge, count) for edge, count in zip(edges, state.shape, strict=True))
         fractions = [rows @ mask.astype(np.float64) @ columns.T for mask in masks]
         inside = rows.sum(axis=1)[:, None] * columns.sum(axis=1)
-        fractions[2] = fractions[2] + (1.0 - inside) * _outside_is_entered(state, entered)
+        outside = _outside_is_entered(state, entered)
+        fractions[2] = fractions[2] + (1.0 - inside) * outside
         self.image = np.stack(fractions, axis=-1).astype(np.float32)
+        centres = [(edge[:-1] + edge[1:]) / 2.0 - 0.5 for edge in edges]
+        at_centres = ndimage.map_coordinates(
+            entered.astype(np.float64), np.meshgrid(*centres, indexing="ij"), order=1, mode="constant", cval=outside
+        )
+        # what is behind a wall within a cell is not entered from its centre
+        self._unobserved = fractions[2] * np.where(fractions[1] > 0.0, at_centres, 1.0)
         sampled = _sampled_walls(walls, first, self._cells, self.shape)
         self._conductances = _conductances(sampled, self.shape)
 
@@ -128,10 +135,9 @@ class MapSpace:
     @cached_property
     def exposure(self) -> Floats:
         """Exposure of the cells (H, W)."""
-        unobserved = self.image[..., 2].astype(np.float64)
-        if not unobserved.any():
+        if not self._unobserved.any():
             return np.zeros(self.shape)
-        return np.clip(self._walk.solve(unobserved.ravel()), 0.0, 1.0).reshape(self.shape)
+        return np.clip(self._walk.solve(self._unobserved.ravel()), 0.0, 1.0).reshape(self.shape)
 
     def exposure_at(self, points_m: Any, ops: Any = array_ops) -> Any:
         """Return the exposure (N,) of points (N, 2 or 3) [m]."""
@@ -220,11 +226,16 @@ def _sampled_walls(wall: Bools, first: Floats, cells: float, shape: tuple[int, .
 
 
 def _conductances(walls: Bools, shape: tuple[int, ...]) -> tuple[Floats, Floats]:
-    """Return the fractions of open lines between the centres of neighbouring cells: (H, W - 1) and (H - 1, W)."""
+    """Return the fractions of open lines between neighbouring cells: (H, W - 1) and (H - 1, W).
+
+    It is 0 where a wall is between the centres: other lines of cells along an inclined wall lead through it.
+    """
     half = _PARTS // 2
 
     def across(lines: Bools, height: int, width: int) -> Floats:
         inner = lines[:, half : half + _PARTS * (width - 1)].reshape(height, _PARTS, width - 1, _PARTS)
-        return np.maximum((~inner.any(axis=3)).mean(axis=1), _SEPARATE).astype(np.float32)
+        is_open = ~inner.any(axis=3)
+        centre_is_open = is_open[:, half - 1 : half + 1].all(axis=1)
+        return np.maximum(centre_is_open * is_open.mean(axis=1), _SEPARATE).astype(np.float32)
 
     return across(walls, shape[0], shape[1]), across(walls.T, shape[1], shape[0]).T
