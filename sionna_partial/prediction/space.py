@@ -234,7 +234,7 @@ def _conductances(walls: Bools, shape: tuple[int, ...]) -> tuple[Floats, Floats]
 
     def across(lines: Bools, height: int, width: int) -> Floats:
         inner = lines[:, half : half + _PARTS * (width - 1)].reshape(height, _PARTS, width - 1, _PARTS)
-        is_open: Bools = ~inner.any(axis=3)
+        is_open: Bools = np.logical_not(inner.any(axis=3))
         centre_is_open = is_open[:, half - 1 : half + 1].all(axis=1)
         return np.maximum(centre_is_open * is_open.mean(axis=1), _SEPARATE).astype(np.float32)
 
