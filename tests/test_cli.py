@@ -146,7 +146,7 @@ ARGUMENTS = [
     ),
     (
         "calibrate --measurements RX --material 4,0.1,0.2 --frequency 60e9 --max-depth 2 --no-diffraction",
-        "load_measurements calibrate_materials",
+        "measurements.recordings.load_survey calibrate_materials",
         {"start": Material(4.0, 0.1, 0.2), "scene_settings": SceneSettings(material=Material(4.0, 0.1, 0.2))}
         | {"trace_settings": TraceSettings(60e9, 2, diffraction=False)},
     ),

@@ -60,7 +60,8 @@ def test_shipped_predictors() -> None:
         for key, values in model(inputs, training=False).items():
             assert found[key].dtype == np.float32
             exact = key.startswith(("state", "indoor"))
-            np.testing.assert_allclose(found[key], values, rtol=0.0, atol=1e-6 if exact else 5e-5, err_msg=key)
+            rtol, atol = (0.0, 1e-6) if exact else (2e-6, 5e-5)  # logits may be far from 0
+            np.testing.assert_allclose(found[key], values, rtol=rtol, atol=atol, err_msg=key)
 
 
 @pytest.mark.parametrize("activation", ["linear", "relu", "sigmoid", "silu", "softmax", "softplus", "tanh"])
