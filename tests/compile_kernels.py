@@ -11,7 +11,7 @@ from meshes import box, scene_mesh
 
 import sionna_partial as sp
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
-from sionna_partial.process import _Kernel
+from sionna_partial.process import _announced, _Kernel
 
 TX_M, RX_M = (2.0, 1.5, 1.5), [(5.0, 3.0, 1.5)]
 
@@ -29,6 +29,7 @@ def mesh() -> sp.PartialMap:
 
 
 def main(kind: str) -> None:
+    _announced.set()  # make says it
     room = mesh() if kind == "mesh" else plan()
     if kind == "paths":
         compile_only(tuple(f"sionna_partial.tracing.{module}" for module in AFTER_BEAMS))
