@@ -182,9 +182,7 @@ class DifferentiableScene:
 
     @cached_property
     def _finer(self) -> Simulation:
-        settings = self.simulation.trace_settings
-        finer = replace(settings, power_tolerance_db=_FINER * settings.tolerance_db)
-        return Simulation(self.partial, finer, self.simulation.scene_settings)
+        return self.simulation.with_tolerance(_FINER * self.simulation.trace_settings.tolerance_db)
 
     @cached_property
     def predictor(self) -> Predictor:

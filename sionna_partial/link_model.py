@@ -168,8 +168,7 @@ class LinkModel:
     @cached_property
     def _every_path(self) -> Simulation:
         """Simulation without a tolerance, for antennas at receivers."""
-        settings = replace(self.simulation.trace_settings, power_tolerance_db=0.0)
-        return Simulation(self.partial, settings, self.simulation.scene_settings)
+        return self.simulation.with_tolerance(0.0)
 
     def predict(self, tx: ArrayLike, rx: ArrayLike) -> LinkPrediction:
         """Trace and predict links.

@@ -359,10 +359,7 @@ def test_layers_of_a_drawing_have_materials(window: Window, tmp_path: Path) -> N
 
 def test_a_plan_keeps_shade_strokes_and_view_in_a_project(window: Window) -> None:
     session, other = window.session, Window()
-    session.maps.upload_map([("flat.png", picture())])
-    window.settle()
-    session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
-    window.settle()
+    open_plan(window)
     session.maps.change_source(threshold=190)
     window.settle()
     session.maps.draw(Stroke("free", ((3.05, 0.5), (3.05, 1.0)), 0.3))
@@ -582,13 +579,18 @@ def picture() -> bytes:
     return content.getvalue()
 
 
+def open_plan(window: Window) -> None:
+    """Open `picture`, with the length of its lower wall."""
+    window.session.maps.upload_map([("flat.png", picture())])
+    window.settle()
+    window.session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
+    window.settle()
+
+
 class TestDrawing:
     def test_a_plan_is_shown_above_its_coverage(self, window: Window, monkeypatch: pytest.MonkeyPatch) -> None:
         session, shown, figures = window.session, Picture(), list[Any]()
-        session.maps.upload_map([("flat.png", picture())])
-        window.settle()
-        session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
-        window.settle()
+        open_plan(window)
         session.radios.set(spacing_m=0.5)
         window.put((1.0, 1.0))
         shown.show_map(session.partial, session.plan)

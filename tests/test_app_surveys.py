@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from PIL import Image
-from test_app import PARTIAL, Window, picture
+from test_app import PARTIAL, Window, open_plan
 
 import sionna_partial as sp
 from sionna_partial.apps.app import answer as answer_module
@@ -85,10 +85,7 @@ class TestSurveys:
         _take_upload(session, "map", [("survey.json", survey)])
         assert "'survey.json' has powers at pixels of a floor plan: open the plan as a picture" in window.settle()
         assert session.jobs.status.is_error
-        session.maps.upload_map([("flat.png", picture())])
-        window.settle()
-        session.maps.measure([(0.0, 5.0), (420.0, 5.0)], 4.2)
-        window.settle()
+        open_plan(window)
         session.radios.set(spacing_m=0.5)
         window.put((1.0, 1.0))
         _take_upload(session, "map", [("survey.json", survey)])

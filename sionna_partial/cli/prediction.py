@@ -133,8 +133,8 @@ def _write(coverage: Any, path: Path, partial: Any, budget: "_Budget | None", lo
 
     if path.suffix == REPORT:
         power_dbm, threshold_dbm = budget or (POWER_DBM, THRESHOLD_DBM)
-        given = {"eirp_dbm": power_dbm, "threshold_dbm": threshold_dbm}
-        path.write_bytes(report_pdf(coverage, **given, scene=partial, logo=logo))
+        content = report_pdf(coverage, eirp_dbm=power_dbm, threshold_dbm=threshold_dbm, scene=partial, logo=logo)
+        path.write_bytes(content)
     elif path.name == PICTURE and budget:
         path.write_bytes(figure_png(sp.plots.plot_coverage(coverage, threshold_db=budget.gain_db)))
     else:

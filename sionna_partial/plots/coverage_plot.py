@@ -65,6 +65,7 @@ _HATCH, _HATCH_COLOUR = "//", (1.0, 1.0, 1.0, 0.55)
 _UNSEEN_OPACITY = 0.45
 _STAR: dict[str, Any] = STAR | {"markersize": 12}
 _A4_IN, _REPORTED_DB, _LIKELY = (8.27, 11.69), np.arange(20.0, -11.0, -10.0), 0.9
+_STEPS = 2**20
 _ONLY, _LOGO_IN, _TITLE_BESIDE_LOGO = "tx", (1.8, 0.55), 62
 _REPORT_LINE_IN, _REPORT_WIDTH, _MOST_ROOMS, _BESIDE_IN, _BELOW_IN = 0.14, 124, 12, (1.1, 0.45), (0.5, 1.0)
 _NAME: dict[str, Any] = {"fontsize": "small", "parse_math": False, "bbox": {"fc": "white", "ec": "none", "pad": 0.8}}
@@ -522,6 +523,10 @@ def _not_observed() -> Patch:
 def report_pdf(coverage: xr.Dataset, **given: Any) -> bytes:
     """Return `plot_report` as PDF; equal arguments give equal bytes."""
     figure, stream = plot_report(coverage, **given), io.BytesIO()
+    figure.draw_without_rendering()
+    figure.set_layout_engine("none")
+    for axis in figure.axes:  # the last bits of the layout depend on memory addresses
+        axis.set_position(np.round(np.multiply(axis.get_position(original=True).bounds, _STEPS)) / _STEPS)
     figure.savefig(stream, format="pdf", metadata={"CreationDate": None, "Title": "Radio coverage"})
     return stream.getvalue()
 

@@ -88,7 +88,7 @@ class MapSpace:
         at_centres = ndimage.map_coordinates(
             entered.astype(np.float64), np.meshgrid(*centres, indexing="ij"), order=1, mode="constant", cval=outside
         )
-        # what is behind a wall within a cell is not entered from its centre
+        # space behind a wall within a cell is not entered from the centre of the cell
         self._unobserved = fractions[2] * np.where(fractions[1] > 0.0, at_centres, 1.0)
         sampled = _sampled_walls(walls, first, self._cells, self.shape)
         self._conductances = _conductances(sampled, self.shape)

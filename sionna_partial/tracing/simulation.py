@@ -217,6 +217,13 @@ class Simulation:
         every = Simulation(self.partial, settings, links.scene_settings)
         return every.links(links.tx, links.rx, invalid="nan", progress=progress)
 
+    def with_tolerance(self, power_tolerance_db: float) -> Simulation:
+        """Return the simulation of this map with another tolerance [dB], which is this one if it is equal."""
+        if power_tolerance_db == self.trace_settings.tolerance_db:
+            return self
+        settings = replace(self.trace_settings, power_tolerance_db=power_tolerance_db)
+        return Simulation(self.partial, settings, self.scene_settings)
+
     def paths(self, tx: ArrayLike, rx: ArrayLike, *, progress: Progress | bool | None = None) -> PathSet:
         """Find all paths from transmitters (3,) or (T, 3) to receivers (N, 3) [m], which can be differentiated.
 

@@ -126,8 +126,9 @@ def coverage_file(
     `heading` and `logo` are for the report, `scene` for both.
     """
     if kind == "pdf":
-        given: dict[str, Any] = {"eirp_dbm": eirp_dbm, "threshold_dbm": threshold_dbm, "heading": heading}
-        return report_pdf(coverage, **given, scene=scene, logo=logo)
+        return report_pdf(
+            coverage, eirp_dbm=eirp_dbm, threshold_dbm=threshold_dbm, heading=heading, scene=scene, logo=logo
+        )
     with tempfile.TemporaryDirectory(prefix="sionna-partial-") as folder:
         path = Path(folder) / f"coverage.{kind}"
         save_coverage(coverage, path, scene=scene, threshold_db=np.clip(threshold_dbm - eirp_dbm, GAIN_FLOOR_DB, 0.0))

@@ -106,7 +106,9 @@ class Session(WindowState):
 
     def take_logo(self, content: bytes, name: str) -> None:
         """Take a picture for the report; none for no content."""
-        self.logo = (file_name(name, "logo"), content) if content and len(read_logo(content)) else None
+        if content:
+            read_logo(content)
+        self.logo = (file_name(name, "logo"), content) if content else None
         self.jobs.show()
 
     def file(self, kind: str) -> bytes:
