@@ -27,7 +27,6 @@ from sionna_partial.constants import DEFAULT_HEIGHT_M
 from sionna_partial.lab.evaluation import measure
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import Predict, likely_region, locate_transmitter
-from sionna_partial.tracing.simulation import clear_of_walls
 
 Links = tuple[sp.LinkPrediction, NDArray[np.uint8], NDArray[np.float64]]
 
@@ -100,7 +99,7 @@ def explored(home: sp.PartialMap, step: int, seed: int) -> tuple[sp.PartialMap, 
     partial = exploration.maps[0]
     way_m = np.unique(exploration.poses[:, :2], axis=0, return_index=True)[1]
     way_m = np.insert(exploration.poses[np.sort(way_m), :2], 2, DEFAULT_HEIGHT_M, axis=1)
-    return partial, way_m[clear_of_walls(home, way_m) & clear_of_walls(partial, way_m)]
+    return partial, way_m[home.radios_can_stand(way_m) & partial.radios_can_stand(way_m)]
 
 
 def linked(home: sp.PartialMap, partial: sp.PartialMap, tx_m: NDArray[np.float64], rx_m: NDArray[np.float64]) -> Linked:
@@ -192,7 +191,7 @@ def position_errors(
 
     def allowed(points_m: NDArray[np.float64]) -> NDArray[np.bool_]:
         apart_m = np.linalg.norm(points_m[:, None] - measured.rx, axis=2)
-        return clear_of_walls(partial, points_m) & (apart_m.min(axis=1) > 0.02)
+        return partial.radios_can_stand(points_m) & (apart_m.min(axis=1) > 0.02)
 
     found = locate_transmitter(partial, measured, allowed, predict, lambda *_: None)
     points_m, region = found.points_m, likely_region(found.probability).ravel()

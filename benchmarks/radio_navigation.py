@@ -30,7 +30,6 @@ from scipy.special import ndtr
 
 import sionna_partial as sp
 from sionna_partial.settings import SensorSettings
-from sionna_partial.tracing.simulation import clear_of_walls
 from sionna_partial.worlds.camera import Camera
 from sionna_partial.worlds.robot import _Router
 
@@ -186,7 +185,7 @@ def by_radio_map(home: Home) -> Probability:
     models: list[sp.LinkModel] = []
 
     def probability(partial: sp.PartialMap, measured_m: Floats, measured_db: Floats) -> Floats:
-        if not clear_of_walls(partial, home.tx_m[None])[0]:
+        if not partial.radios_can_stand(home.tx_m[None])[0]:
             return np.zeros(partial.shape)
         if not models:
             models.append(sp.LinkModel(partial))

@@ -42,7 +42,6 @@ from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import MOST_POSITIONS, likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
 from sionna_partial.tracing.antennas import Antenna
-from sionna_partial.tracing.simulation import clear_of_walls
 
 Floats = NDArray[np.float64]
 NUMBERS, POINTS, LOCATE_POINTS = (0, 5, 10, 20), 60, 40
@@ -142,7 +141,7 @@ def read_floor(folder: Path) -> tuple[sp.PartialMap, dict[str, Floats], float]:
         of_tx[row.get("tx") or row["sensor"]].append([float(row[column]) for column in COLUMNS])
     links = {}
     for tx, values in ((tx, np.array(values)) for tx, values in of_tx.items()):
-        stands = clear_of_walls(partial, values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
+        stands = partial.radios_can_stand(values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
         if stands.sum() >= POINTS:
             links[tx] = values[stands]
     return partial, links, float((rows and rows[0].get("frequency_hz")) or 2.44e9)

@@ -19,7 +19,6 @@ from sionna_partial.scene.scene import SceneGeometry, build_scene
 from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, find_wedges
-from sionna_partial.tracing.simulation import clear_of_walls
 from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]
@@ -159,7 +158,7 @@ def drawn_points_m(
     cells = rng.permutation(np.argwhere(home.state == sp.CellState.FREE))
     inside = cells + rng.uniform(0.25, 0.75, cells.shape)
     points_m = np.insert(inside[:, ::-1] * home.resolution_m + home.origin_m, 2, DEFAULT_HEIGHT_M, axis=1)
-    return points_m[clear_of_walls(home, points_m) & clear_of_walls(partial, points_m)][:count]
+    return points_m[home.radios_can_stand(points_m) & partial.radios_can_stand(points_m)][:count]
 
 
 def grid_m(partial: sp.PartialMap, spacing_m: float, height_m: float = DEFAULT_HEIGHT_M) -> NDArray[np.float64]:
