@@ -45,7 +45,7 @@ from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.plots.coverage_plot import plot_report
+from sionna_partial.plots.report import plot_report
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1

@@ -94,7 +94,10 @@ ROOMS = {
         *("datasets.shards", "datasets.home_links", "datasets.dataset", "evaluation"),
         *("training.predictor", "training.paths", "training.walls"),
     ),
-    "plots": ("style", "logo", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
+    "plots": (
+        *("style", "logo", "layers", "panel", "coverage_plot", "report", "coverage_viewer"),
+        *("exploration_plot", "result_plots"),
+    ),
     "results": ("export", "demo", "info", "lab.reports"),
     "apps": ("refining",),
     "apps.live": ("answers", "coverage", "topics"),

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from sionna_partial.apps.app.answer import LAYERS, LIKELY, OUTLINES, Answer, measured_powers_dbm
+from sionna_partial.apps.app.answer import LAYERS, OUTLINES, Answer, measured_powers_dbm
 from sionna_partial.apps.app.drawing import AREA, BRUSHES, LENGTH, PAINTS, STROKES, Drawing, Stroke
 from sionna_partial.apps.app.files import FILES
 from sionna_partial.apps.app.maps import MORE_STEPS
@@ -20,8 +20,8 @@ from sionna_partial.apps.app.radio import MATERIALS, MODELS, MOST_TRANSMITTERS, 
 from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import room_fractions
 from sionna_partial.plots.coverage_viewer import server_codes
+from sionna_partial.plots.report import LIKELY, room_fractions
 from sionna_partial.plots.style import material_colour
 from sionna_partial.resources import demo_homes
 from sionna_partial.settings import WALL_MATERIALS, material_name
