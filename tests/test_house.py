@@ -103,7 +103,8 @@ ROOMS = {
     "apps.live": ("answers", "coverage", "topics"),
     "apps.app": (
         *("jobs", "radio", "files", "drawing", "survey", "marks", "answer"),
-        *("state", "predicting", "maps", "planning", "session", "picture", "page", "server"),
+        *("state", "predicting", "maps", "planning", "session", "picture"),
+        *("widgets", "sections", "page", "server"),
     ),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
