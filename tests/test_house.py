@@ -58,7 +58,10 @@ ROOMS = {
             "map_files",
         ),
     ),
-    "maps.importers": (*("drawing_lines", "drawings", "ifc_layers", "ifc", "bags", "vacuum", "points", "simulators"),),
+    "maps.importers": (
+        *("wall_layers", "drawing_units", "drawing_lines", "drawings", "pictures", "ifc_layers", "ifc"),
+        *("bags", "vacuum", "cloud_files", "points", "simulators"),
+    ),
     "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "scene"),
     "tracing": (
@@ -148,8 +151,8 @@ PLOTS_ARE_FOR = ("plots.", "apps.app.", "cli.", "export", "demo", "lab.reports")
 IMPORTERS = {
     f"maps.importers.{reader}"
     for reader in (
-        *("bags:map_from_bag", "drawings:map_from_drawing", "drawings:read_picture", "ifc:map_from_ifc"),
-        *("points:is_cloud", "points:map_from_points", "vacuum:read_vacuum_map"),
+        *("bags:map_from_bag", "drawings:map_from_drawing", "pictures:read_picture", "ifc:map_from_ifc"),
+        *("cloud_files:is_cloud", "points:map_from_points", "vacuum:read_vacuum_map"),
     )
 }
 """What `load_map` imports when it meets a file of that kind."""

@@ -276,7 +276,7 @@ def _read_mesh(source: Path, **options: Any) -> PartialMap:
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
-    is_cloud = later("maps.importers.points:is_cloud")(source)
+    is_cloud = later("maps.importers.cloud_files:is_cloud")(source)
     return (_read_cloud if is_cloud else _read_mesh)(source, **options)
 
 
@@ -354,7 +354,7 @@ _READERS = {
         VACUUM_SUFFIXES, _Reader("the map of a vacuum robot", _importer("maps.importers.vacuum:read_vacuum_map"))
     ),
     **dict.fromkeys(
-        PICTURE_SUFFIXES, _Reader("a picture", _importer("maps.importers.drawings:read_picture"), ("resolution_m",))
+        PICTURE_SUFFIXES, _Reader("a picture", _importer("maps.importers.pictures:read_picture"), ("resolution_m",))
     ),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }
