@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.lab.datasets.shards import LinkTable
-from sionna_partial.lab.evaluation import Metrics, measure
+from sionna_partial.lab.datasets.table import LinkTable
+from sionna_partial.lab.metrics import Metrics, measure
 
 SHORT_M, WRONG_DB = 25.0, 0.5
 """Length of short links [m], and by how much a certain gain may be off [dB]."""

@@ -26,7 +26,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.lab.evaluation import Baselines, measure, nothing_seen
+from sionna_partial.lab.baselines import Baselines, nothing_seen
+from sionna_partial.lab.metrics import measure
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import Predict, likely_region, locate_transmitter
 from sionna_partial.resources import PREDICTORS_FOLDER

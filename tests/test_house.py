@@ -94,7 +94,8 @@ ROOMS = {
     "placement": ("placement", "several"),
     "exploration": ("next_views", "explore"),
     "lab": (
-        *("datasets.shards", "datasets.home_links", "datasets.dataset", "evaluation"),
+        *("datasets.table", "datasets.shards", "datasets.traces", "datasets.home_links", "datasets.home_processes"),
+        *("datasets.dataset", "metrics", "baselines", "evaluation"),
         *("training.predictor", "training.paths", "training.walls"),
     ),
     "plots": (
@@ -141,7 +142,7 @@ HOMES = {
 
 STRAYS = {
     ("scene.scene", "sionna"): "the table of ITU materials",
-    ("lab.datasets.home_links", "drjit"): "the threads of a worker",
+    ("lab.datasets.home_processes", "drjit"): "the threads of a worker",
 }
 """Modules that import one of them all the same, and what for."""
 
@@ -323,6 +324,10 @@ for name in ("", *typer.main.get_command(app).commands):
         assert not libraries(reader) & {"numba", "rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
         assert len(own) <= 68
+
+    def test_figures_need_no_optional_package(self) -> None:
+        loaded = libraries(modules_after("from sionna_partial.plots import plot_placement, plot_report, plot_map")[-1])
+        assert not loaded & {package for packages in EXTRAS.values() for package in packages}
 
     def test_predictions_do_without_tensorflow(self) -> None:
         """With the networks of opaque walls at 28 GHz, with the unseen walls below 24 GHz."""
