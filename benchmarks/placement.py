@@ -23,7 +23,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.placement.placement import PlacementArea, link_values, placement_area, placement_score
+from sionna_partial.placement.area import PlacementArea, placement_area
+from sionna_partial.placement.placement import link_values, placement_score
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.settings import PlacementSettings
 

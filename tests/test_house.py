@@ -87,11 +87,11 @@ ROOMS = {
     ),
     "measurements": ("surveys", "measurements", "recordings", "walks", "evidence", "assimilation", "localisation"),
     "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
-    "channels": ("files", "joint", "samples"),
+    "channels": ("files", "joint", "draws", "samples"),
     "networks": ("coverage.network",),
     "differentiable": ("differentiable",),
     "calibration": ("material_fit", "calibration"),
-    "placement": ("placement", "several"),
+    "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
     "lab": (
         *("datasets.table", "datasets.shards", "datasets.traces", "datasets.home_links", "datasets.home_processes"),
@@ -104,7 +104,7 @@ ROOMS = {
     ),
     "results": ("export", "demo", "info", "lab.reports"),
     "apps": ("refining",),
-    "apps.live": ("answers", "coverage", "topics"),
+    "apps.live": ("answers", "incoming", "coverage", "topics", "dds", "rosbridge"),
     "apps.app": (
         *("jobs", "radio", "files", "drawing", "survey", "marks", "answer"),
         *("state", "predicting", "maps", "planning", "session", "picture"),
