@@ -45,8 +45,9 @@ ROOMS = {
     ),
     "maps": (
         *(
-            "mesh.cut",
             "environment",
+            "mesh.cut",
+            "mesh.scene_mesh",
             "wall_cells",
             "import_report",
             "grid",

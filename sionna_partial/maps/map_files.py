@@ -37,8 +37,9 @@ from sionna_partial.files import (
     output_path,
     read_bytes,
 )
-from sionna_partial.maps.environment import MAX_CELLS, MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, grid_array, layers_of
+from sionna_partial.maps.environment import MAX_CELLS, grid_array, layers_of
 from sionna_partial.maps.import_report import ImportSource, warn_of_odd_states
+from sionna_partial.maps.mesh.scene_mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
 from sionna_partial.settings import Material

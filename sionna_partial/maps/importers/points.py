@@ -17,7 +17,6 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.import_report import ImportNotes
 from sionna_partial.maps.importers.cloud_files import PART, Parts, opened_cloud
 from sionna_partial.maps.mesh.cells import (
@@ -30,6 +29,7 @@ from sionna_partial.maps.mesh.cells import (
     require_metres,
     warn_of_feet,
 )
+from sionna_partial.maps.mesh.scene_mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.mesh.upright import (
     END_M,
     FURNITURE_M,
