@@ -48,6 +48,7 @@ ROOMS = {
             "environment",
             "mesh.cut",
             "mesh.scene_mesh",
+            "straight_runs",
             "wall_cells",
             "import_report",
             "grid",

@@ -1,12 +1,14 @@
-"""Contents of a map: cells and their layers, and walls extruded from them (`FloorPlan`) or triangles (`SceneMesh`).
+"""Contents of a map: its source, cells and their layers, and walls extruded from them (`FloorPlan`) or triangles.
 
 Another kind, such as voxels, needs a class like these, a writer in `scene.write_map`, and a path finder in
 `tracing/finder.py`.
 """
 
+import os
+import warnings
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal
+from dataclasses import dataclass, field, fields, replace
+from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +24,11 @@ MAX_CELLS = 100_000_000
 
 MAX_WALL_MATERIALS = 255
 """Most materials, obstacle heights or rooms of a map: one byte per cell counts them."""
+
+ODD_CELLS = 1000
+"""Number of cells from which a map should have free and wall cells."""
+
+_Map = TypeVar("_Map", bound=Any)
 
 EnvironmentKind = Literal["plan", "mesh"]
 
@@ -210,3 +217,63 @@ def layer_cells(
     cells = np.where(state == of, cells, 0).astype(np.uint8)
     cells.setflags(write=False)
     return cells if cells.any() else None
+
+
+class MapWarning(UserWarning):
+    """A map file that was read with corrections, or whose map is not plausible.
+
+    `report` is the `ImportReport` of the map, or None.
+    """
+
+    report: Any = None
+
+
+@dataclass(frozen=True)
+class Elements:
+    """Elements of one name or type, their number, and the reason for skipping them."""
+
+    name: str
+    count: int
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class ImportSource:
+    """Facts about a file that its reader reports: see `ImportReport`."""
+
+    file: str
+    unit_m: float = 1.0
+    unit_source: str = "format"
+    used: tuple[Elements, ...] = ()
+    skipped: tuple[Elements, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+@dataclass
+class ImportNotes:
+    """Notes of a reader for an `ImportReport`."""
+
+    file: str | os.PathLike[str]
+    unit_m: float = 1.0
+    unit_source: str = "format"
+    notes: list[str] = field(default_factory=list)
+    _counts: dict[tuple[str, str], int] = field(default_factory=dict)
+
+    def use(self, name: str, count: int = 1) -> None:
+        self.skip(name, count, "")
+
+    def skip(self, name: str, count: int, reason: str) -> None:
+        self._counts[name, reason] = self._counts.get((name, reason), 0) + count
+
+    def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "", free: str = "") -> _Map:
+        """Return a PartialMap with its report, and warn of implausible results, as `ImportReport.faults`."""
+        rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
+        used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
+        source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))
+        partial = replace(partial, import_source=source)
+        if size or doors or area or free:
+            for fault in partial.import_report.faults(size, doors, area, free):
+                warning = MapWarning(f"path = '{self.file}' {fault}")
+                warning.report = partial.import_report
+                warnings.warn(warning, stacklevel=4)
+        return partial

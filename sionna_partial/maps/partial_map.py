@@ -19,6 +19,7 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import (
     LAYERS,
     FloorPlan,
+    ImportSource,
     checked_state,
     equal_fields,
     fractions_by_material,
@@ -28,9 +29,9 @@ from sionna_partial.maps.environment import (
     metres,
     uniform_cells,
 )
+from sionna_partial.maps.environment import MapWarning as MapWarning
 from sionna_partial.maps.grid import cells_within, free_standing, has_unknown_room, states_by_height, unit_hint, window
-from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
-from sionna_partial.maps.import_report import MapWarning as MapWarning
+from sionna_partial.maps.import_report import ImportReport, report_of
 from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.maps.wall_cells import noise_field, thick_walls
 from sionna_partial.settings import Material

@@ -31,7 +31,8 @@ from sionna_partial.arrays import (
 )
 from sionna_partial.constants import CellState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import CENTRED_NOISE, fit_runs, noise_field, wall_cells
+from sionna_partial.maps.straight_runs import fit_runs
+from sionna_partial.maps.wall_cells import CENTRED_NOISE, noise_field, wall_cells
 from sionna_partial.process import njit
 
 _KEY = 1 << 32

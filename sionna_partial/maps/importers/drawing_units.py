@@ -9,7 +9,8 @@ import numpy as np
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.errors import MapError
-from sionna_partial.maps.import_report import MapWarning, rooms_of
+from sionna_partial.maps.environment import MapWarning
+from sionna_partial.maps.import_report import rooms_of
 from sionna_partial.maps.mesh.cells import crossed_cells
 
 UNITS_M = {

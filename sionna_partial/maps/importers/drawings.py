@@ -17,7 +17,8 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, DRAWING_SUFFIXES, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, input_path, read_bytes
-from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
+from sionna_partial.maps.environment import ImportNotes, MapWarning
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION
 from sionna_partial.maps.importers.drawing_lines import HIDDEN, LINE_TYPES, XREF, DrawnLines, Segments, opened
 from sionna_partial.maps.importers.drawing_units import POSSIBLE_M, unit_of, wall_thickness
 from sionna_partial.maps.importers.wall_layers import NO_WALL, PARTIAL_HEIGHT, skip_reason

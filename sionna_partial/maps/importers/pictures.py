@@ -12,7 +12,7 @@ from sionna_partial.arrays import Bools, Indices, States
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.environment import ImportNotes
 from sionna_partial.maps.importers.drawing_units import POSSIBLE_M
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, states_of_lines
 from sionna_partial.maps.partial_map import PartialMap

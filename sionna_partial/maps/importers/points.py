@@ -17,7 +17,7 @@ from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, real_array
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.environment import ImportNotes
 from sionna_partial.maps.importers.cloud_files import PART, Parts, opened_cloud
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,

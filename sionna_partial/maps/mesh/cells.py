@@ -15,9 +15,9 @@ from sionna_partial.arrays import Bools, Floats, States, largest_by_area, row_ru
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import MAX_CELLS
+from sionna_partial.maps.environment import MAX_CELLS, ImportNotes, MapWarning
 from sionna_partial.maps.grid import area_polygon
-from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
 from sionna_partial.maps.mesh.scene_mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import PartialMap
