@@ -22,7 +22,7 @@ from stock import drawn_points_m, given_homes
 
 import sionna_partial as sp
 from sionna_partial.channels.samples import ChannelSamples
-from sionna_partial.lab.evaluation import indoor_gain_db
+from sionna_partial.lab.baselines import indoor_gain_db
 from sionna_partial.tracing.antennas import planar_array
 
 STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15

@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 import sionna_partial as sp
-from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.table import LinkTable
 
 
 def main() -> None:

@@ -24,7 +24,7 @@ from stock import drawn_points_m, given_homes
 
 import sionna_partial as sp
 from sionna_partial.constants import DEFAULT_HEIGHT_M
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.metrics import measure
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import Predict, likely_region, locate_transmitter
 

@@ -25,8 +25,8 @@ import sionna_partial as sp
 from sionna_partial.demo import NOTHING, PARTIAL, TRUTH
 from sionna_partial.files import atomic_files
 from sionna_partial.lab.datasets.home_links import closed_home, home_links, home_sources, map_area
-from sionna_partial.lab.datasets.shards import LinkTable
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.datasets.table import LinkTable
+from sionna_partial.lab.metrics import measure
 from sionna_partial.plots.coverage_plot import plot_comparison
 from sionna_partial.plots.style import BLUE, RED, figure_png
 from sionna_partial.settings import PredictorSettings

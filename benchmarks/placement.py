@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from stock import grid_m, timed
 
 import sionna_partial as sp
-from sionna_partial.placement.placement import PlacementArea, link_values, placement_area, placement_score
+from sionna_partial.placement.area import PlacementArea, placement_area
+from sionna_partial.placement.placement import link_values, placement_score
 from sionna_partial.settings import PlacementSettings
 
 FIRST_SEED = 50_100

@@ -24,7 +24,7 @@ import numpy as np
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.metrics import measure
 from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures, link_features
 from sionna_partial.prediction.predictor import LinkPrediction

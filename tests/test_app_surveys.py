@@ -20,7 +20,7 @@ from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.apps.app.server import _take_upload
 from sionna_partial.errors import SettingsError
 from sionna_partial.files import unzipped
-from sionna_partial.plots.coverage_plot import plot_report
+from sionna_partial.plots.report import plot_report
 
 BOTH = "x,y,bssid,ssid,rssi\n" + "".join(
     f"{x_m},{y_m},{bssid},home,{rssi}\n"

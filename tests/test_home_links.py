@@ -20,7 +20,8 @@ from sionna_partial.lab.datasets.home_links import (
     home_sources,
     map_area,
 )
-from sionna_partial.lab.datasets.shards import CIR, LinkTable, read_shard, write_shard
+from sionna_partial.lab.datasets.shards import read_shard, write_shard
+from sionna_partial.lab.datasets.table import CIR, LinkTable
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings

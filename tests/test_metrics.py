@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from predictor_links import LOS, NLOS, OUTAGE, make_links
 
-from sionna_partial.lab.evaluation import (
+from sionna_partial.lab.metrics import (
     CONFIDENCE_BINS,
     DEFINITIONS,
     PIT_BINS,

@@ -11,8 +11,8 @@ from predictor_links import QUIET
 import sionna_partial as sp
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.lab.datasets.home_links import home_links
-from sionna_partial.lab.datasets.shards import LinkTraces, settings_for
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.datasets.traces import LinkTraces, settings_for
+from sionna_partial.lab.metrics import measure
 from sionna_partial.prediction.features import LinkFeatures, mean_wall_loss_db
 from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.unseen_walls import (

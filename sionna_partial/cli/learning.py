@@ -128,7 +128,7 @@ def train(
     the homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.lab.datasets.shards import open_links, settings_for
+        from sionna_partial.lab.datasets.traces import open_links, settings_for
         from sionna_partial.lab.reports import summary
 
         links, traces = open_links(folders)

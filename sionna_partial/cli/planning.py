@@ -284,11 +284,11 @@ def live(
     robot: Any = None
     settings = replace(settings, every_unknown=topics.unknown)
     if bag is None and rosbridge:
-        from sionna_partial.apps.live.topics import Rosbridge
+        from sionna_partial.apps.live.rosbridge import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.apps.live.topics import Dds
+        from sionna_partial.apps.live.dds import Dds
 
         robot = Dds(topics, positions, domain)
 

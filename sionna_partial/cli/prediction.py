@@ -128,7 +128,7 @@ def predict(
 
 def _write(coverage: Any, path: Path, partial: Any, budget: "_Budget | None", logo: Path | None) -> None:
     """Write one file of a coverage map."""
-    from sionna_partial.plots.coverage_plot import report_pdf
+    from sionna_partial.plots.report import report_pdf
     from sionna_partial.plots.style import figure_png
 
     if path.suffix == REPORT:

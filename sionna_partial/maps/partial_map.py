@@ -19,18 +19,21 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import (
     LAYERS,
     FloorPlan,
-    SceneMesh,
+    ImportSource,
     checked_state,
     equal_fields,
     fractions_by_material,
+    frontier_cells,
     layer_cells,
     layer_values,
     metres,
+    uniform_cells,
 )
+from sionna_partial.maps.environment import MapWarning as MapWarning
 from sionna_partial.maps.grid import cells_within, free_standing, has_unknown_room, states_by_height, unit_hint, window
-from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
-from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.wall_cells import frontier_cells, noise_field, thick_walls, uniform_cells, wall_noise
+from sionna_partial.maps.import_report import ImportReport, report_of
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
+from sionna_partial.maps.wall_cells import noise_field, thick_walls
 from sionna_partial.settings import Material
 
 MAX_INTERIOR_CELLS = 2**53
@@ -282,11 +285,6 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         if self.is_complete or not self.environment.is_extruded:
             return self.is_complete
         return not has_unknown_room(self.state, self.resolution_m)
-
-    @cached_property
-    def wall_noise(self) -> float:
-        """Range noise from the depth of uneven walls: 0 (exact; always where the map is complete) to 1."""
-        return 0.0 if self.is_complete else wall_noise(self.state, self.resolution_m)
 
     @cached_property
     def _noise_field(self) -> Floats:

@@ -21,10 +21,8 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
-from sionna_partial.maps.environment import MAX_CELLS
-from sionna_partial.maps.import_report import ODD_CELLS, ImportNotes
+from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportNotes, frontier_cells
 from sionna_partial.maps.partial_map import MAX_INTERIOR_CELLS, MapWarning, PartialMap
-from sionna_partial.maps.wall_cells import frontier_cells
 from sionna_partial.settings import Material
 
 logger = logging.getLogger(__name__)

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
+from sionna_partial.maps.environment import uniform_cells
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import uniform_cells
 from sionna_partial.process import core_count, in_order, njit
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)

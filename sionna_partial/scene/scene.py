@@ -15,15 +15,14 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, row_runs
 from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
 from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.maps.ros_map import write_ros_map
-from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.scene.outlines import Outlines, Plan, cut_by_material, lattice_outlines, prepare_plan, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
