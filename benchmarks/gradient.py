@@ -101,7 +101,7 @@ def compare(
 def jacobians(links: DifferentiableLinks) -> dict[str, NDArray[np.float64]]:
     """Differentiate the mean gain with respect to every parameter with TensorFlow: (N,) arrays."""
     values = {field_of(name): tf.Variable(getattr(links.base, field_of(name))) for name in REACHES}
-    with tf.GradientTape() as tape:
+    with tf.GradientTape(persistent=True) as tape:
         gain_db = links(**values).gain_mean_db
     slopes = tape.jacobian(gain_db, values, experimental_use_pfor=False, unconnected_gradients="zero")
     columns = {name: slope.numpy().reshape(len(gain_db), -1) for name, slope in slopes.items()}
