@@ -57,6 +57,7 @@ ROOMS = {
             "mesh.upright",
             "mesh.files",
             "ros_map",
+            "ros_map_writer",
             "map_files",
         ),
     ),

@@ -22,7 +22,7 @@ from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
 from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.ros_map import write_ros_map
+from sionna_partial.maps.ros_map_writer import write_ros_map
 from sionna_partial.scene.outlines import Outlines, Plan, cut_by_material, lattice_outlines, prepare_plan, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
