@@ -1,4 +1,4 @@
-"""How often the link states that a map excludes are indeed not those of the complete building.
+"""Fraction of links whose states in the complete building are among those that their map leaves possible.
 
 Reads the links of data sets with receivers drawn indoors, and compares what `LinkContext.possible` leaves with the
 trace of the complete building. Run it with

@@ -46,7 +46,7 @@ class Links(NamedTuple):
     true_db: np.ndarray
 
     def multi_wall(self, band_ghz: float) -> tuple[np.ndarray, np.ndarray]:
-        """Gain of free space (N,), and what a multi-wall model subtracts from it (N, 3) [dB]."""
+        """Return the gain of free space (N,), and the terms (N, 3) that a multi-wall model subtracts [dB]."""
         distance_m, context = self.phi.distance_m, self.phi.context
         assert context is not None
         free_db = 20.0 * np.log10(SPEED_OF_LIGHT_M_S / (4e9 * np.pi * band_ghz * distance_m))

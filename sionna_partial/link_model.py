@@ -204,9 +204,9 @@ class LinkModel:
     def predict_each(
         self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        """Return features and predictions of links, and whether each is complete.
+        """Return features and predictions of links, and a mask of links whose trace is the truth (on complete maps).
 
-        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m].
+        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m]; links are in this order.
         """
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))

@@ -129,6 +129,11 @@ class Material(Checked):
 
         Names are the keys of `WALL_MATERIALS`, and other materials of ITU-R P.2040-3 (10 cm). Sources: `docs/walls.md`.
 
+        Raises
+        ------
+        SettingsError
+            For another name; the message lists the names.
+
         Examples
         --------
         >>> import sionna_partial as sp
@@ -343,7 +348,7 @@ class SensorSettings(Checked):
 
     @property
     def is_exact(self) -> bool:
-        """Return whether it makes no errors."""
+        """Return whether the sensor makes no errors."""
         errors = (self.range_noise_m, self.drift_m_per_m, self.heading_noise_deg)
         return not any((*errors, self.missed_wall_fraction, self.missed_return_fraction))
 

@@ -150,7 +150,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return equal_fields(self, other)
 
     def layers(self) -> dict[str, tuple[States, str, list[Any]]]:
-        """Return each layer's cells, the field with its values, and these as plain data."""
+        """Return the layers by name: cells (ny, nx), the field that they index, and its values as plain data."""
         found = {}
         for name, (counted, _, _) in LAYERS.items():
             if (cells := getattr(self, name)) is not None:
@@ -326,7 +326,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def wall_class_count(self) -> int:
-        """Number of classes of walls without a named material: thick walls are the second."""
+        """Number of classes of walls without a named material: 1, or 2 where some walls are thick."""
         return 1 + bool(self.thick_walls.any())
 
     @cached_property
@@ -346,7 +346,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return classes
 
     def wall_classes(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Return the walls at points (..., 3) [m], or NaN: 0 with a named material, 1 thin or 2 thick without."""
+        """Return the class (...,) of the wall at each point (..., 3) [m]: 0 named material, else 1 thin or 2 thick.
+
+        Points of NaN get any class.
+        """
         if self.wall_fractions.keys() == {None} and self.wall_class_count == 1:
             return np.ones(points_m.shape[:-1], dtype=np.uint8)
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)

@@ -398,7 +398,7 @@ class LinkFeatures(Shown):
         return self if self.distance_m.ndim == 1 else self.take(slice(None))
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
-        """Select links of the flat order."""
+        """Select links by an index array, mask or slice of the flat order, transmitter by transmitter."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
         path_power = None if self.path_power is None else self.path_power[index]
@@ -430,7 +430,7 @@ class LinkFeatures(Shown):
         return replace(self, gain_db=gain_db, link_state=states, context=context)
 
     def free_space_shift_db(self, frequency_hz: float) -> float:
-        """Return the free-space gain at `frequency_hz` less that at the frequency of the links [dB]."""
+        """Return the difference of free-space gains: at `frequency_hz` minus at the frequency of the links [dB]."""
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
