@@ -30,7 +30,7 @@ from sionna_partial.lab.evaluation import Baselines, measure, nothing_seen
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import Predict, likely_region, locate_transmitter
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 
 Links = tuple[sp.LinkPrediction, NDArray[np.uint8], NDArray[np.float64]]
 

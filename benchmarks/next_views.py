@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 import sionna_partial as sp
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.settings import SensorSettings
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 from sionna_partial.worlds.camera import unknown_in_view
 from sionna_partial.worlds.robot import Choice, Frontier, Robot
 

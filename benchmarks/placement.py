@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.placement.placement import PlacementArea, link_values, placement_area, placement_score
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import PlacementSettings
 
 FIRST_SEED = 50_100

@@ -30,7 +30,7 @@ from scipy.special import ndtr
 
 import sionna_partial as sp
 from sionna_partial.settings import SensorSettings
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 from sionna_partial.worlds.camera import Camera
 from sionna_partial.worlds.robot import _Router
 

@@ -17,9 +17,9 @@ import sionna_partial as sp
 from sionna_partial.channels import dft_codebook, load_channels, save_channels
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
-from sionna_partial.scene.scene import export_scene
+from sionna_partial.llvm import load_sionna
+from sionna_partial.scene.export import export_scene
 from sionna_partial.tracing import responses
-from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 
 TX = np.array([1.03, 2.93, 1.4])

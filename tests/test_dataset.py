@@ -26,8 +26,8 @@ from sionna_partial.files import locked_folder
 from sionna_partial.lab.datasets import dataset, home_links
 from sionna_partial.lab.datasets.dataset import DatasetReport, build_dataset
 from sionna_partial.lab.datasets.home_links import HomeSource, HomeTask, run_home
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import read_dataset, read_shard, shard_path, write_shard
-from sionna_partial.settings import DatasetSettings
 
 SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
 SEEDS = range(8)

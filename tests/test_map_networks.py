@@ -21,16 +21,14 @@ from sionna_partial.prediction.map_networks import (
     MAP_FEATURES,
     MAP_NETWORK,
     MapFeatures,
-    context_networks,
     expert_parts,
-    fit_context_networks,
     line_points_m,
     link_outputs,
     mean_features,
     predict_by_context,
     scaled_inputs,
-    symmetric,
 )
+from sionna_partial.prediction.map_training import context_networks, fit_context_networks, symmetric
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.settings import PredictorSettings

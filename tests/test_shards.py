@@ -17,6 +17,7 @@ from link_tables import assert_same, make_dataset, make_table
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.lab.datasets import shards
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import (
     COLUMNS,
     FORMAT,
@@ -32,7 +33,7 @@ from sionna_partial.lab.datasets.shards import (
     shard_path,
     write_shard,
 )
-from sionna_partial.settings import DatasetSettings, Material, PredictorSettings
+from sionna_partial.settings import Material, PredictorSettings
 
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}
 

@@ -22,17 +22,15 @@ from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import MemoryLimitError
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import (
-    link_features,
-    traced_unobserved_m,
-    with_path_power,
-)
+from sionna_partial.prediction.features import link_features, with_path_power
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.rule import LinkPrediction
+from sionna_partial.prediction.unobserved import traced_unobserved_m
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.links import TracedLinks, unnamed_counts
-from sionna_partial.tracing.paths import SEEN_M, SolvedPaths, path_gain_db, path_order
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SEEN_M, SolvedPaths, path_gain_db, path_order, unnamed_counts
 from sionna_partial.tracing.simulation import Simulation
 
 if TYPE_CHECKING:

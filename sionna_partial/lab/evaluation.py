@@ -21,7 +21,8 @@ from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.lab.datasets.shards import Dataset, LinkTable, LinkTraces, open_links, require_like, stage_name
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
+from sionna_partial.prediction.predictor import Predictor, warm_predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import PredictorSettings
 

@@ -20,10 +20,12 @@ from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.prediction.features import LinkFeatures
-from sionna_partial.prediction.predictor import AnyPredictor, LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import AnyPredictor, Predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
 from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.simulation import Simulation, clear_of_walls, nearest_m
+from sionna_partial.tracing.positions import clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import Simulation
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
 """Smallest distance from known walls, and largest cells that keep it [m]."""

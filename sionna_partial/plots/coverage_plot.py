@@ -25,16 +25,16 @@ from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.coverage.dataset import (
-    FLOORS,
     TX_COORDINATES,
     WALL_PARTS,
-    named_transmitter,
     probability_above,
     require_coverage,
     transmitter_text,
     transmitters_of,
 )
+from sionna_partial.coverage.grid import named_transmitter
 from sionna_partial.coverage.network import require_network
+from sionna_partial.coverage.radio import FLOORS
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import likely_region
 from sionna_partial.plots.logo import read_logo

@@ -20,7 +20,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.coverage_plot import Outline, Scale, plot_layer
 from sionna_partial.plots.coverage_viewer import STATES, level_codes, radio_layers, server_codes, step_codes
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 LIKELY = 0.9
 """Probability at which an area counts as covered."""

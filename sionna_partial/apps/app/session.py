@@ -17,11 +17,8 @@ from sionna_partial.apps.app.state import WindowState
 from sionna_partial.apps.app.survey import Survey
 from sionna_partial.checks import Progress, require_choice
 from sionna_partial.errors import MeasurementError, SettingsError
-from sionna_partial.measurements.measurements import (
-    SAME_TX_M,
-    Measurements,
-    measurements_of_each,
-)
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import SAME_TX_M, measurements_of_each
 from sionna_partial.plots.logo import read_logo
 
 

@@ -32,7 +32,8 @@ from sionna_partial.checks import (
 )
 from sionna_partial.constants import COST_THRESHOLD_DB, DEFAULT_HEIGHT_M, GAIN_FLOOR_DB, MAX_COST, CellState
 from sionna_partial.coverage.dataset import probability_above
-from sionna_partial.coverage.job import grid_axes, predict_map
+from sionna_partial.coverage.grid import grid_axes
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import MapError, MeasurementError, PositionError, SettingsError, SionnaPartialError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
@@ -40,7 +41,8 @@ from sionna_partial.maps.environment import grid_array
 from sionna_partial.maps.grid import nearest_free_m
 from sionna_partial.maps.importers.bags import map_of_percent, occupancy_parts
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import Measurements, can_be_used
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 from sionna_partial.settings import SceneSettings, TraceSettings
 
