@@ -11,6 +11,7 @@ import xarray as xr
 import yaml
 from numpy.typing import ArrayLike
 
+import sionna_partial.coverage.radio  # noqa: F401 - registers coverage.radio
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import COST_THRESHOLD_DB, MAX_COST, NO_RECEIVER, CellState
 from sionna_partial.coverage.dataset import (

@@ -18,10 +18,10 @@ from scipy.ndimage import label
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
 from sionna_partial.maps import environment
-from sionna_partial.maps.environment import turn_grid
+from sionna_partial.maps.environment import MapWarning, turn_grid
 from sionna_partial.maps.importers.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map_writer import write_ros_map
 
 SHEET: dict[str, Any] = {

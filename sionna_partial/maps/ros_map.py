@@ -19,8 +19,8 @@ from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import is_path, lies_in, open_regular, read_bytes
-from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportNotes, turn_grid
-from sionna_partial.maps.partial_map import MAX_INTERIOR_CELLS, MapWarning, PartialMap
+from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportNotes, MapWarning, turn_grid
+from sionna_partial.maps.partial_map import MAX_INTERIOR_CELLS, PartialMap
 from sionna_partial.settings import Material
 
 MODES = ("trinary", "scale", "raw")
