@@ -37,7 +37,8 @@ import sionna_partial as sp
 from sionna_partial import link_model
 from sionna_partial.checks import no_progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState
-from sionna_partial.coverage.job import CoverageJob, GridArea, Transmitter, grid_receivers
+from sionna_partial.coverage.grid import GridArea, grid_receivers
+from sionna_partial.coverage.job import CoverageJob, Transmitter
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import MOST_POSITIONS, likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
@@ -103,7 +104,7 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
     link_model.KEPT_BLOCKS = POINTS
     area = GridArea(DEFAULT_HEIGHT_M, 1.0)
     job, found = CoverageJob(model, area, block=MOST_POSITIONS), []
-    nowhere = grid_receivers(model, np.empty((0, 3)), area)
+    nowhere = grid_receivers(model.simulation, np.empty((0, 3)), area)
     for number, rows in enumerate(links.values()):
         rows, tx_m = rows[np.random.default_rng(0).permutation(len(rows))[:POINTS]], rows[0, :3]
         for draw in range(draws):

@@ -15,8 +15,8 @@ from scipy.spatial import cKDTree
 
 import sionna_partial as sp
 from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.llvm import load_sionna
 from sionna_partial.scene.scene import SceneGeometry, build_scene
-from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, find_wedges
 from sionna_partial.tracing.stock import listed_before

@@ -27,7 +27,7 @@ from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellStat
 from sionna_partial.lab.metrics import measure
 from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import HOME_KINDS, HomeKind
 
 BANDS_GHZ = {2.4: "brick", 5.0: "drywall", 28.0: "drywall", 60.0: "glass"}

@@ -15,9 +15,9 @@ from types import SimpleNamespace
 import numpy as np
 from link_tables import make_table
 
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.table import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import DatasetSettings
 
 KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
 """Seeds of homes that end their process, never end, raise, end their process at the first try, and find a full disk."""

@@ -27,15 +27,15 @@ from sionna_partial.lab.datasets import dataset, home_processes
 from sionna_partial.lab.datasets.dataset import DatasetReport, build_dataset
 from sionna_partial.lab.datasets.home_links import HomeSource
 from sionna_partial.lab.datasets.home_processes import HomeTask, run_home
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import read_dataset, read_shard, shard_path, write_shard
-from sionna_partial.settings import DatasetSettings
 
 SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
 SEEDS = range(8)
 NAMES = tuple(f"make_home({seed})" for seed in SEEDS)
 BUILD = """
 import sys
-from sionna_partial.settings import DatasetSettings
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.dataset import build_dataset
 build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=2)
 """

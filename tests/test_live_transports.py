@@ -21,8 +21,9 @@ from typer.testing import CliRunner
 import sionna_partial as sp
 from sionna_partial import cli
 from sionna_partial.apps.live import rosbridge
-from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live.coverage import LiveCoverage
 from sionna_partial.apps.live.dds import Dds, filled, struct
+from sionna_partial.apps.live.incoming import LiveSettings
 from sionna_partial.apps.live.rosbridge import Rosbridge
 from sionna_partial.apps.live.topics import (
     CONNECTION_TYPE,

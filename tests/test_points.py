@@ -13,11 +13,12 @@ from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.importers import cloud_files
 from sionna_partial.maps.importers import points as points_module
 from sionna_partial.maps.importers.points import map_from_points
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)

@@ -16,12 +16,12 @@ from sionna_partial.channels.joint import JointLatents, drawn_gains, drawn_state
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import traced_unobserved_m
 from sionna_partial.prediction.path_model import LinkGeometry, PathModel, survival_inputs, wrapped
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
+from sionna_partial.prediction.unobserved import traced_unobserved_m
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB
-from sionna_partial.tracing.links import TracedLinks, unnamed_counts
-from sionna_partial.tracing.paths import SEEN_M, SolvedPaths, path_gain_db, path_order
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SEEN_M, SolvedPaths, path_gain_db, path_order, unnamed_counts
 
 UNSEEN = 255
 """Interaction of paths through unseen space, an extension of Sionna RT's `InteractionType`."""

@@ -238,7 +238,7 @@ def _live_settings(
         int, typer.Option(help="Largest value of a grid [percent]; in nav2, 100 is a wall.")
     ] = MAX_COST,
 ) -> Any:
-    from sionna_partial.apps.live.coverage import LiveSettings
+    from sionna_partial.apps.live.incoming import LiveSettings
 
     options = {"views_every_s": views_every, "max_cost": max_cost}
     return LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]

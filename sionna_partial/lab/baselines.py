@@ -15,7 +15,8 @@ from sionna_partial.files import atomic_write, read_bytes
 from sionna_partial.lab.datasets.table import LinkTable
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
+from sionna_partial.prediction.predictor import Predictor, warm_predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import PredictorSettings
 
 MAJORITY_FILE, DISTANCE_FILE = "majority.json", "distance.keras"

@@ -16,7 +16,8 @@ from sionna_partial.lab.baselines import MAJORITY_FILE, Baselines, baseline_pred
 from sionna_partial.lab.datasets.table import LinkTable, stage_name
 from sionna_partial.lab.datasets.traces import Dataset, LinkTraces, open_links, require_like
 from sionna_partial.lab.metrics import Calibration, Metrics, calibration, gain_errors_db, mean, measure
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor, warm_predictor
+from sionna_partial.prediction.predictor import Predictor, warm_predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.resources import PREDICTORS_FOLDER
 
 _log = logging.getLogger(__name__)

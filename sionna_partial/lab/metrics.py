@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 CONFIDENCE_BINS = 15
 """Equal-width bins of the confidence in the calibration error."""

@@ -4,6 +4,8 @@ Another kind, such as voxels, needs a class like these, a writer in `scene.write
 `tracing/finder.py`.
 """
 
+import logging
+import math
 import os
 import warnings
 from collections.abc import Callable, Mapping
@@ -28,6 +30,7 @@ MAX_WALL_MATERIALS = 255
 ODD_CELLS = 1000
 """Number of cells from which a map should have free and wall cells."""
 
+_log = logging.getLogger(__name__)
 _Map = TypeVar("_Map", bound=Any)
 
 EnvironmentKind = Literal["plan", "mesh"]
@@ -159,6 +162,42 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
         if cells.any() and not cells.all():
             uniform[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
     return uniform
+
+
+def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
+    """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
+
+    Quarter turns are exact. A tilt that moves no cell by more than half its size is ignored. Any other yaw samples the
+    grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs (sqrt 2). Gaps
+    where walls meet only at a corner are closed.
+
+    Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
+    """
+    x, y, yaw = origin
+    ny, nx = state.shape
+    turns = round(yaw / (math.pi / 2))
+    if abs(yaw - turns * math.pi / 2) * math.hypot(ny, nx) <= 0.5:
+        left, down = ((0, 0), (ny, 0), (nx, ny), (0, nx))[turns % 4]
+        return np.rot90(state, -turns), resolution_m, (x - left * resolution_m, y - down * resolution_m)
+    cell_m = resolution_m / 2
+    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])  # acts on (y, x)
+    corners = np.array([(0, 0), (ny, 0), (0, nx), (ny, nx)]) @ turn.T * resolution_m
+    low = corners.min(axis=0)
+    rows, columns = (int(n) for n in np.ceil((corners.max(axis=0) - low) / cell_m - 1e-9))
+    if rows * columns > MAX_CELLS:
+        what = f"has a yaw for which the map needs {rows} x {columns} cells, more than {MAX_CELLS:,}"
+        raise MapError(f"origin = {list(origin)} {what}: set the yaw to 0, or cut or coarsen the map.")
+    _log.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
+    first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
+
+    def turned(grid: States) -> States:
+        shape, unknown = (rows, columns), CellState.UNKNOWN
+        return ndimage.affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
+
+    result = turned(state)
+    frontier = ndimage.binary_dilation(frontier_cells(state), np.ones((3, 3)))
+    result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
+    return result, cell_m, (x + float(low[1]), y + float(low[0]))
 
 
 def layer_values(name: str, given: object) -> tuple[Any, ...]:

@@ -43,7 +43,8 @@ from sionna_partial.files import (
 from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportSource, MapWarning, grid_array, layers_of
 from sionna_partial.maps.mesh.scene_mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
+from sionna_partial.maps.ros_map import bare_image, read_ros_map
+from sionna_partial.maps.ros_map_writer import write_ros_map
 from sionna_partial.settings import Material
 
 ACCEPTED = (

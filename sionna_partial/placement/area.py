@@ -14,7 +14,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import AnyPredictor
 from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 
 CLEARANCE_M, FINEST_M = 0.1, 0.05
 """Smallest distance from known walls, and largest cells that keep it [m]."""

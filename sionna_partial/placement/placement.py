@@ -17,9 +17,11 @@ from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap, require_height
 from sionna_partial.placement.area import PlacementArea, placement_area
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import Objective, PlacementSettings, SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.simulation import Simulation, nearest_m
+from sionna_partial.tracing.positions import nearest_m
+from sionna_partial.tracing.simulation import Simulation
 
 RECEIVERS = 120
 """Largest number of receivers during the search."""

@@ -17,7 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 from sionna_partial.arrays import Floats, States
 from sionna_partial.checks import require
 from sionna_partial.constants import GAIN_FLOOR_DB
-from sionna_partial.coverage.dataset import FLOORS, named_transmitter, probability_above, transmitters_of
+from sionna_partial.coverage.dataset import probability_above, transmitters_of
+from sionna_partial.coverage.grid import named_transmitter
+from sionna_partial.coverage.radio import FLOORS
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.plots.layers import Layer, headline
 from sionna_partial.plots.logo import read_logo

@@ -23,7 +23,7 @@ from sionna_partial.plots.layers import Scale
 from sionna_partial.plots.panel import Outline
 from sionna_partial.plots.report import LIKELY
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
 """Layers with a line at the threshold."""

@@ -206,24 +206,28 @@ class TransmitterSection:
                 ("downtilt_deg", "Downtilt [\u00b0]", -90, 90),
             )
         }
+        self.root = self._laid_out()
+        picture.points.on_change("data", self._on_points)
+        picture.points.selected.on_change("indices", self._on_selected)
+
+    def _laid_out(self) -> Any:
+        session = self._session
         x, y, z, eirp = self.fields.values()
-        self.root = wide(
+        return wide(
             pair(self.chosen, self.name),
             pair(x, y),
             pair(z, eirp),
             pair(self.model, self.channel),
             pair(self.pattern, *self.aims.values()),
             pair(
-                widgets.button("Add", lambda: session.radios.add()),
-                widgets.button("Remove", lambda: session.radios.remove(session.chosen)),
+                self._widgets.button("Add", lambda: session.radios.add()),
+                self._widgets.button("Remove", lambda: session.radios.remove(session.chosen)),
             ),
-            widgets.button("Place it for me", lambda: searches.place(), button_type="primary"),
+            self._widgets.button("Place it for me", lambda: session.searches.place(), button_type="primary"),
             pair(self.goal, self.most),
-            widgets.button("Place several for me", self._place_several),
+            self._widgets.button("Place several for me", self._place_several),
             self.plan_channels,
         )
-        picture.points.on_change("data", self._on_points)
-        picture.points.selected.on_change("indices", self._on_selected)
 
     def _on_points(self, _name: str, _old: Any, new: Any) -> None:
         if not self._widgets.is_showing:

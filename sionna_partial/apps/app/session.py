@@ -18,7 +18,8 @@ from sionna_partial.apps.app.state import NO_TRANSMITTER, WindowState
 from sionna_partial.apps.app.survey import Survey
 from sionna_partial.checks import Progress, require_choice
 from sionna_partial.errors import PositionError, SettingsError
-from sionna_partial.measurements.measurements import Measurements, measurements_of_each
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import measurements_of_each
 from sionna_partial.plots.logo import read_logo
 
 

@@ -26,7 +26,8 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, can_be_used, nearest_transmitters
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import SAME_TX_M, can_be_used, nearest_transmitters
 
 MEASURE = 'Drag along a length that you know, such as a wall; then type it in "Known length [m]" and press Enter.'
 NO_TRANSMITTER = "there is no transmitter yet: click on the map where one shall be."

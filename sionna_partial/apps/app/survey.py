@@ -14,8 +14,9 @@ from sionna_partial.apps.app.drawing import Plan
 from sionna_partial.apps.app.files import file_name
 from sionna_partial.constants import BAG_SUFFIXES
 from sionna_partial.errors import MeasurementError
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements
+from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.recordings import load_survey
+from sionna_partial.measurements.selection import SAME_TX_M
 from sionna_partial.measurements.surveys import is_plan_survey, read_survey
 
 SURVEY_SUFFIXES = (".csv", ".json", ".vwm", *BAG_SUFFIXES)

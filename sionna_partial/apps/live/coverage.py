@@ -19,13 +19,15 @@ from sionna_partial.arrays import Floats
 from sionna_partial.checks import no_progress, reason_of
 from sionna_partial.constants import CellState
 from sionna_partial.coverage.dataset import probability_above
-from sionna_partial.coverage.job import grid_axes, predict_map
+from sionna_partial.coverage.grid import grid_axes
+from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import PositionError
 from sionna_partial.exploration.next_views import next_views
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.grid import nearest_free_m
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import Measurements, can_be_used
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import can_be_used
 from sionna_partial.prediction.unobserved import lengths_in_unknown_m, walled_lengths_m
 
 BETWEEN_DB = 6.0

@@ -79,7 +79,7 @@ class LiveSettings(Checked):
 
     Examples
     --------
-    >>> from sionna_partial.apps.live.coverage import LiveSettings
+    >>> from sionna_partial.apps.live.incoming import LiveSettings
     >>> LiveSettings(threshold_db=-95.0).spacing_m
     0.15
     """

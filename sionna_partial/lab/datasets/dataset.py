@@ -30,9 +30,9 @@ from sionna_partial.lab.datasets.home_processes import (
     settings_record,
     stop_homes,
 )
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
-from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0
 

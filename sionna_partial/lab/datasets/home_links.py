@@ -18,19 +18,12 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.errors import MapError
 from sionna_partial.exploration.explore import explore_trajectory
 from sionna_partial.files import SCENE_FILES
+from sionna_partial.lab.datasets.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings
 from sionna_partial.lab.datasets.table import CIR, LinkTable
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.settings import (
-    HOME_KINDS,
-    MIXED_SENSORS,
-    SHORT_LINK_M,
-    DatasetSettings,
-    Fusion,
-    HomeKind,
-    SensorSettings,
-)
+from sionna_partial.settings import HOME_KINDS, Fusion, HomeKind, SensorSettings
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home

@@ -26,10 +26,10 @@ from typing import Literal
 from sionna_partial.errors import BackendError, OutputError, PredictorError, SionnaPartialError
 from sionna_partial.files import temporary_folder
 from sionna_partial.lab.datasets.home_links import HomeSource, home_links, home_sensor
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import INDEX_FILE, shard_metadata, shard_path, write_shard
 from sionna_partial.llvm import load_llvm
 from sionna_partial.process import cleaned_up, end_process
-from sionna_partial.settings import DatasetSettings
 
 ATTEMPTS = 3
 """Number of processes that may die over a home: one may have been killed from outside."""
