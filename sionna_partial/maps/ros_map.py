@@ -11,12 +11,12 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import affine_transform, binary_dilation
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, with_neighbours
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
@@ -280,10 +280,12 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
 
     def turned(grid: States) -> States:
         shape, unknown = (rows, columns), CellState.UNKNOWN
-        return affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
+        return scipy.ndimage.affine_transform(
+            grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown
+        )
 
     result = turned(state)
-    frontier = binary_dilation(frontier_cells(state), np.ones((3, 3)))
+    frontier = with_neighbours(frontier_cells(state))
     result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
     return result, cell_m, (x + float(low[1]), y + float(low[0]))
 
@@ -560,9 +562,9 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict:
 
 def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
     """Warn if hardly any free cell touches a wall, as around inflated obstacles."""
-    wall, free, square = state == CellState.WALL, state == CellState.FREE, np.ones((3, 3), dtype=bool)
-    faces = wall & binary_dilation(~wall, square)
-    apart = 1.0 - (faces & binary_dilation(free, square)).sum() / max(1, faces.sum())
+    wall, free = state == CellState.WALL, state == CellState.FREE
+    faces = wall & with_neighbours(~wall)
+    apart = 1.0 - (faces & with_neighbours(free)).sum() / max(1, faces.sum())
     inflated = bool(faces.sum() > FEW_CELLS and free.any() and apart >= 1.0 - TOUCHED_WALLS)
     if inflated:
         what = f"grey (unknown) lies between {apart:.0%} of the walls and the free cells, as in an inflated costmap"
