@@ -61,7 +61,7 @@ def shot(tab: Any, folder: Path) -> Image.Image:
 
 
 def record(tab: Any, folder: Path, path: Path) -> None:
-    """Drag the transmitter of the page, and write what it shows as an animation."""
+    """Drag the transmitter of the page, and write the pictures as an animation."""
     tab.run(f"{MODEL}('layer').value = 'gain_mean_db', 0")
     tab.wait(f"{MODEL}('picture').title.text.includes('gain')", WAIT_S)
     tab.run(f"{MODEL}('picture').toolbar.tools.filter(t => t.type == 'HoverTool').forEach(t => t.active = false), 0")

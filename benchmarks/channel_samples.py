@@ -1,16 +1,14 @@
-"""How good draws of channels are where a map is partial, on homes that nothing was trained on.
+"""Scores of drawn channels on partial maps of homes that nothing was trained on.
 
-In every home a robot explores; links between random points indoors are traced in the whole home, and drawn on what the
-robot has seen. Scores of the draws of each link, by ends in observed cells: energy score over gain, delay spread and
+In every home a robot explores; links between random points indoors are traced in the whole home, and drawn on the
+partial map. Scores of the draws of each link, by ends in observed cells: energy score over gain, delay spread and
 azimuth spreads (in units of 10 dB, 5 ns and 20 degrees; no paths count -150 dB and 0), continuous ranked probability
 score (CRPS) of each, and how often the 90 % interval holds the truth. Opponents: the trace of the partial map alone,
-and draws of TR 38.901 InH-office (table 7.5-6, 28 GHz) at the distance of the link, with link states as predicted, or
-(with an advantage that no user has) LOS as it is. The best of 64 x 16 pairs of beams (DFT codebooks of 8 x 8 and 4 x 4
-antennas) is looked for among the 1, 3, 6 and 16 that are most often the best of a draw. The joint part compares draws
-with independent ones: the probability that all transmitters fail, and the fraction of links in outage. Run
+and draws of TR 38.901 InH-office (table 7.5-6, 28 GHz) at the distance of the link, with link states as predicted. The
+best of 64 x 16 pairs of beams (DFT codebooks of 8 x 8 and 4 x 4 antennas) is looked for among the 1, 3, 6 and 16 that
+are most often the best of a draw. Printed as well is the probability that all transmitters fail. Run
 
     python benchmarks/channel_samples.py ../shared/gibson/*/map.yaml
-    python benchmarks/channel_samples.py --made 12
 """
 
 import argparse
@@ -19,58 +17,52 @@ from collections import defaultdict
 from pathlib import Path
 
 import numpy as np
-from measurements import FIRST_SEED, points
 from numpy.typing import NDArray
+from stock import drawn_points_m, given_homes
 
 import sionna_partial as sp
 from sionna_partial.channels.samples import ChannelSamples
-from sionna_partial.lab.evaluation import indoor_gain_db
+from sionna_partial.lab.baselines import indoor_gain_db
 from sionna_partial.tracing.antennas import planar_array
 
 STEPS, TRANSMITTERS, RECEIVERS, DRAWS, NEAREST_M = (0, 50, 100, 200), 3, 40, 100, 0.15
 UNITS = np.array([10.0, 5.0, 20.0, 20.0])
 NUMBERS = (1, 3, 6, 16)
-"""Numbers of likeliest pairs of beams among which the best one is looked for."""
+"""Numbers of most probable pairs of beams among which the best one is looked for."""
 COLUMNS = ("gain [dB]", "delay spread [ns]", "ASD [deg]", "ASA [deg]")
-METHODS = ("draws", "partial trace", "38.901, predicted states", "38.901, true LOS")
+METHODS = ("draws", "trace of the partial map", "TR 38.901 InH-office")
 Floats = NDArray[np.float64]
 
 
 def main() -> None:
     """Score all homes, print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
+    parser.add_argument("--made", type=int, default=12, help="number of procedural homes without maps")
+    arguments = parser.parse_args()
     scores: dict[tuple[str, str], list[Floats]] = defaultdict(list)
-    joint: list[Floats] = []
-    for seed, (name, home) in enumerate(given_homes(__doc__)):
+    failures: list[Floats] = []
+    for seed, (name, home) in enumerate(given_homes(arguments.maps, arguments.made)):
         of_home, of_maps = score_home(home, seed)
-        joint.extend(of_maps)
+        failures.extend(of_maps)
         for key, mean in of_home.items():
             scores[key].append(mean)
         print(f"{name} done", flush=True)
     print_links(scores)
-    print_joint(np.array(joint))
-
-
-def given_homes(description: str | None) -> list[tuple[str, sp.PartialMap]]:
-    """Return the homes that the command line names, by their names."""
-    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("maps", nargs="*", type=Path, help="complete maps")
-    parser.add_argument("--made", type=int, default=0, help="number of procedural homes")
-    arguments = parser.parse_args()
-    homes = [(path.parent.name, sp.load_map(path)) for path in arguments.maps]
-    made = range(FIRST_SEED, FIRST_SEED + arguments.made)
-    return homes + [(f"make_home({seed})", sp.make_home(seed)) for seed in made]
+    joint, independent, true = np.mean(failures, axis=0)
+    print(f"\nall transmitters fail: joint draws {joint:.3f}, independent draws {independent:.3f}, truth {true:.3f}")
 
 
 def score_home(home: sp.PartialMap, seed: int) -> tuple[dict[tuple[str, str], Floats], list[Floats]]:
-    """Return mean scores over the links of a home by group and method, and the joint scores of its partial maps."""
+    """Return mean scores over the links of a home by group and method, and how often all transmitters fail."""
     rng = np.random.default_rng(seed)
     scores: dict[tuple[str, str], list[Floats]] = defaultdict(list)
-    joint = []
+    failures = []
     for partial in sp.explore(home, STEPS, seed):
-        tx_m, rx_m = (points(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
+        tx_m, rx_m = (drawn_points_m(home, partial, count, rng) for count in (TRANSMITTERS, RECEIVERS))
         rx_m = rx_m[np.linalg.norm(rx_m[:, None] - tx_m, axis=2).min(axis=1) > NEAREST_M]
-        joint.append(score_map(home, partial, tx_m, rx_m, seed, scores))
-    return {key: np.nanmean(np.concatenate(rows), axis=0) for key, rows in scores.items()}, joint
+        failures.append(score_map(home, partial, tx_m, rx_m, seed, scores))
+    return {key: np.nanmean(np.concatenate(rows), axis=0) for key, rows in scores.items()}, failures
 
 
 def score_map(
@@ -81,7 +73,7 @@ def score_map(
     seed: int,
     scores: dict[tuple[str, str], list[Floats]],
 ) -> Floats:
-    """Score the links of one partial map; return its joint scores."""
+    """Score the links of one partial map; return how often all transmitters fail: joint, independent, true (3,)."""
     true, known = (sp.trace_links(each, tx_m, rx_m, progress=False) for each in (home, partial))
     samples = sp.channels.sample_channels(partial, tx_m, rx_m, DRAWS, seed, progress=False)
     truth, trace = values(true)[0], values(known)[0]
@@ -89,27 +81,25 @@ def score_map(
     distance_m = np.linalg.norm(rx_m - tx_m[:, None], axis=2).ravel()
     states = samples.link_state.reshape(DRAWS, -1)
     rng = np.random.default_rng(seed)
-    standard = [indoor_office(distance_m, each, rng) for each in (states, np.tile(true.link_state.ravel(), (DRAWS, 1)))]
+    standard = indoor_office(distance_m, states, rng)
     seen = [partial.state_at(end_m) == sp.CellState.FREE for end_m in (tx_m, rx_m)]
     both = seen[0][:, None] + 2 * seen[1][None]
     groups = np.array(["no end seen", "transmitter seen", "receiver seen", "both seen"])[both.ravel()]
     best, received = best_pairs(true)[0], true.link_state.ravel() != sp.LinkState.OUTAGE
-    clusters = indoor_office_paths(samples, standard[0], rng)
+    clusters = indoor_office_paths(samples, standard, rng)
     pairs = {
         METHODS[0]: best_pairs(samples.drawn, DRAWS),
         METHODS[1]: ranked_pairs(known),
         METHODS[2]: best_pairs(clusters, DRAWS),
     }
-    for method, draws in zip(METHODS, (drawn, trace[None], *standard), strict=True):
-        hits = (
-            among_likeliest(pairs[method], best, received)
-            if method in pairs
-            else np.full((len(truth), len(NUMBERS)), np.nan)
-        )
+    for method, draws in zip(METHODS, (drawn, trace[None], standard), strict=True):
+        hits = among_likeliest(pairs[method], best, received)
         rows = np.array([[*score(draws[:, link], truth[link]), *hits[link]] for link in range(len(truth))])
         for group in ("all links", *np.unique(groups)):
             scores[group, method].append(rows[(groups == group) | (group == "all links")])
-    return joint_scores(samples.link_state, true.link_state)
+    fails = samples.link_state == sp.LinkState.OUTAGE
+    true_fails = (true.link_state == sp.LinkState.OUTAGE).all(axis=0)
+    return np.array([fails.all(axis=1).mean(), fails.mean(axis=0).prod(axis=0).mean(), true_fails.mean()])
 
 
 def values(links: sp.TracedLinks, draws: int = 1) -> Floats:
@@ -195,7 +185,7 @@ def ranked_pairs(links: sp.TracedLinks) -> NDArray[np.intp]:
 
 
 def among_likeliest(drawn: NDArray[np.intp], best: NDArray[np.intp], received: NDArray[np.bool_]) -> Floats:
-    """Whether the best pair of each link (L,) is among the k most frequent ones (L, 4); NaN in an outage."""
+    """Return whether the best pair of each link (L,) is among the k most frequent ones (L, 4); NaN in an outage."""
     hits = np.full((len(best), len(NUMBERS)), np.nan)
     for link in np.flatnonzero(received):
         pairs, count = np.unique(drawn[drawn[:, link] >= 0, link], return_counts=True)
@@ -215,51 +205,14 @@ def score(draws: Floats, truth: Floats) -> Floats:
     return np.concatenate([[energy], crps, (low - 1e-6 <= truth) & (truth <= high + 1e-6)])
 
 
-def joint_scores(drawn: NDArray[np.uint8], truth: NDArray[np.uint8]) -> Floats:
-    """Brier scores of "all transmitters fail", their means, and CRPS of the fraction in outage: joint, independent."""
-    fails, fail = drawn == sp.LinkState.OUTAGE, truth == sp.LinkState.OUTAGE
-    together, alone = fails.all(axis=1).mean(axis=0), fails.mean(axis=0).prod(axis=0)
-    true = fail.all(axis=0)
-    rng = np.random.default_rng(0)
-    shuffled = rng.permuted(fails, axis=0)
-    crps = []
-    for draws in (fails, shuffled):
-        fraction = draws.mean(axis=(1, 2))
-        spread = np.abs(fraction[:, None] - fraction).mean()
-        crps.append(np.abs(fraction - fail.mean()).mean() - 0.5 * spread)
-    brier = [float(((each - true) ** 2).mean()) for each in (together, alone)]
-    return np.array([*brier, together.mean(), alone.mean(), true.mean(), *crps])
-
-
 def print_links(scores: dict[tuple[str, str], list[Floats]]) -> None:
-    """Print a table for each group, means over homes, and the paired lead in energy score over the opponents."""
+    """Print a table for each group, means over homes."""
     for group in dict.fromkeys(key[0] for key in scores):
-        print(f"\n{group} ({len(scores[group, METHODS[0]])} homes)\n")
-        columns = ["energy score", *(f"CRPS {each}" for each in COLUMNS), "90 % intervals hold", "best beams", "lead"]
-        print(f"| | {' | '.join(columns)} |\n|{'---|' * (len(columns) + 1)}")
-        ours = np.array(scores[group, METHODS[0]])
+        print(f"\n| {group} | energy score | {' | '.join(COLUMNS)} | in 90 % intervals | best beams |\n{'|---' * 8}|")
         for method in METHODS:
-            rows = np.array(scores[group, method])
-            mean, lead = np.nanmean(rows, axis=0), rows[:, 0] - ours[:, 0]
-            held = "/".join(f"{each:.2f}" for each in mean[5:9]) if method != METHODS[1] else ""
-            ahead = f"{lead.mean():.2f} +- {lead.std(ddof=1) / np.sqrt(len(lead)):.2f}" if lead.any() else ""
-            found = "" if np.isnan(mean[9:]).all() else "/".join(f"{each:.2f}" for each in mean[9:])
-            crps = " | ".join(f"{each:.2f}" for each in mean[1:5])
-            print(f"| {method} | {mean[0]:.3f} | {crps} | {held} | {found} | {ahead} |")
-
-
-def print_joint(rows: Floats) -> None:
-    """Print what joint draws add to independent ones, means over maps and paired differences."""
-    mean = rows.mean(axis=0)
-    print("\n| | joint draws | independent draws | truth | difference |\n|---|---|---|---|---|")
-    for name, first, second, truth in (
-        ("all transmitters fail: Brier score", 0, 1, ""),
-        ("all transmitters fail: probability", 2, 3, f"{mean[4]:.3f}"),
-        ("fraction of links in outage: CRPS", 5, 6, ""),
-    ):
-        difference = rows[:, second] - rows[:, first]
-        error = difference.std(ddof=1) / np.sqrt(len(rows))
-        print(f"| {name} | {mean[first]:.4f} | {mean[second]:.4f} | {truth} | {difference.mean():.4f} +- {error:.4f} |")
+            mean = np.nanmean(scores[group, method], axis=0)
+            held, found = ("/".join(f"{each:.2f}" for each in part) for part in (mean[5:9], mean[9:]))
+            print(f"| {method} | {' | '.join(f'{each:.2f}' for each in mean[:5])} | {held} | {found} |")
 
 
 if __name__ == "__main__":

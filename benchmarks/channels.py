@@ -1,22 +1,21 @@
 """Channels of traced links: time and memory.
 
-    python benchmarks/channels.py speed
+    python benchmarks/channels.py
 
 compares impulse responses of 3,000 receivers (8 x 8 by 2 x 2 antennas), and the gains of 64 x 16 beams, with the trace
 of the same links in the same process, the median of several runs after a warm-up; and writes the channels of 25,000
-receivers in processes of their own. Times are those of the processor, of which one core is used.
+receivers in processes of their own. Times are processor times of one core.
 """
 
 import argparse
 import shutil
 import tempfile
-import time
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from stock import isolated, limit_cores, peak_memory_gb
+from stock import grid_m, isolated, limit_cores, peak_memory_gb, timed
 
 import sionna_partial as sp
 from sionna_partial.channels.samples import ChannelSamples
@@ -29,20 +28,13 @@ _UNIT |= dict.fromkeys(("predict_map", "predict_map, three transmitters"), "pred
 
 
 def main() -> None:
-    """Run one of the parts."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parts = parser.add_subparsers(required=True)
-    part = parts.add_parser("speed", help="time and memory")
-    part.add_argument("--receivers", type=int, default=3000)
-    part.add_argument("--streamed", type=int, default=25_000)
-    part.add_argument("--runs", type=int, default=5)
-    part.set_defaults(run=speed)
-    arguments = vars(parser.parse_args())
-    arguments.pop("run")(**arguments)
-
-
-def speed(receivers: int, streamed: int, runs: int) -> None:
     """Print the times as ratios to the trace, and what streaming takes."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--receivers", type=int, default=3000)
+    parser.add_argument("--streamed", type=int, default=25_000)
+    parser.add_argument("--runs", type=int, default=5)
+    arguments = parser.parse_args()
+    receivers, streamed, runs = arguments.receivers, arguments.streamed, arguments.runs
     seconds = isolated(times, receivers, runs)
     print(f"{receivers} receivers of the {HOME}, one core, processor time, median of {runs} runs")
     for name, value in seconds.items():
@@ -73,7 +65,7 @@ def times(receivers: int, runs: int) -> dict[str, float]:
         "beam_gains, 64 by 16 beams": lambda: links.beam_gains(*codebooks, **wide),
         "spreads": links.spreads,
     }
-    return {name: float(np.median([_seconds(step) for _ in range(runs + 1)][1:])) for name, step in steps.items()}
+    return {name: float(np.median([timed(step)[1] for _ in range(runs + 1)][1:])) for name, step in steps.items()}
 
 
 def partial_times(receivers: int, runs: int) -> dict[str, float]:
@@ -99,7 +91,7 @@ def partial_times(receivers: int, runs: int) -> dict[str, float]:
         "predict_map": lambda: sp.predict_map(partial, tx, spacing_m=0.25, predictor=model),
         "predict_map, three transmitters": lambda: sp.predict_map(partial, three, spacing_m=0.25, predictor=model),
     }
-    return {name: float(np.median([_seconds(step) for _ in range(runs + 1)][1:])) for name, step in steps.items()}
+    return {name: float(np.median([timed(step)[1] for _ in range(runs + 1)][1:])) for name, step in steps.items()}
 
 
 def stream(receivers: int, suffix: str) -> dict[str, float]:
@@ -109,7 +101,7 @@ def stream(receivers: int, suffix: str) -> dict[str, float]:
     try:
         links = sp.trace_links(*_scene(receivers))
         path = folder / f"channels{suffix}"
-        seconds = _seconds(lambda: sp.channels.save_channels(links, path, progress=False, **_arrays()))
+        _, seconds = timed(lambda: sp.channels.save_channels(links, path, progress=False, **_arrays()))
         files = [path] if path.is_file() else [each for each in path.rglob("*") if each.is_file()]
         size = sum(each.stat().st_size for each in files)
         array_gb = sp.channels.load_channels(path).a.nbytes / 1e9
@@ -121,12 +113,6 @@ def stream(receivers: int, suffix: str) -> dict[str, float]:
         shutil.rmtree(folder)
 
 
-def _seconds(step: Callable[[], object]) -> float:
-    start = time.process_time()
-    step()
-    return time.process_time() - start
-
-
 def _arrays() -> dict[str, object]:
     return {"tx_array": planar_array(8, 8, "tr38901"), "rx_array": planar_array(2, 2)}
 
@@ -134,9 +120,8 @@ def _arrays() -> dict[str, object]:
 def _scene(receivers: int) -> tuple[sp.PartialMap, NDArray[np.float64], NDArray[np.float64]]:
     """Return the complete home, its transmitter, and so many receivers in free cells."""
     partial = sp.load_map(scenes_folder() / HOME / "complete")
-    x, y = np.meshgrid(*(np.linspace(low, high, 400) for low, high in np.reshape(partial.bounds_m, (2, 2)).T))
-    rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 1.5)])
-    rx = rx[partial.radios_can_stand(rx) & (partial.state_at(rx) == sp.CellState.FREE)]
+    rx = grid_m(partial, partial.resolution_m)
+    rx = rx[partial.radios_can_stand(rx)]
     tx = np.array(demo_homes()[HOME]["transmitter"])
     rx = rx[np.linalg.norm(rx - tx, axis=1) > 0.1]
     return partial, tx, rx[np.linspace(0, len(rx) - 1, receivers).astype(int)]

@@ -1,4 +1,4 @@
-"""How often the link states that a map excludes are indeed not those of the complete building.
+"""Fraction of links whose states in the complete building are among those that their map leaves possible.
 
 Reads the links of data sets with receivers drawn indoors, and compares what `LinkContext.possible` leaves with the
 trace of the complete building. Run it with
@@ -12,7 +12,7 @@ import argparse
 import numpy as np
 
 import sionna_partial as sp
-from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.table import LinkTable
 
 
 def main() -> None:

@@ -91,8 +91,7 @@ LABELS = {
     "solid_fraction": "fraction of a link not in free space",
     "unobserved_fraction": f"d_unobs / d after {STEPS} steps",
 }
-"""What the statistics are called in the table and the picture. Rooms are what remains where no passage is wider than
-0.9 m."""
+"""Names of the statistics in the table and the picture. Rooms are the parts that passages of at most 0.9 m join."""
 
 
 def main() -> None:

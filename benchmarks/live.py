@@ -26,7 +26,8 @@ from stock import peak_memory_gb
 
 import sionna_partial as sp
 from sionna_partial.apps.live.answers import LiveGrid
-from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live.coverage import LiveCoverage
+from sionna_partial.apps.live.incoming import LiveSettings
 from sionna_partial.constants import CellState
 
 APARTMENT = Path(__file__).resolve().parents[1] / "scenes/apartment"

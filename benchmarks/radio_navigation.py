@@ -1,8 +1,8 @@
-"""What a predicted radio map is good for: a robot that must stay connected drives to a goal through unseen rooms.
+"""Outages of a robot that must stay connected and drives to a goal through unseen rooms, with a predicted radio map.
 
-The transmitter of a home is that of 12 random positions that covers nearest to half of the floor. Starts and goals are
-random covered positions at least 4 m of driving apart, of which are taken those where outage matters and can be
-avoided: the shortest route on the complete map is in outage for at least 1 m, and the best one for at most half of it.
+The transmitter of a home is the one of 12 random positions whose coverage is nearest to half of the floor. Starts and
+goals are random covered positions at least 4 m of driving apart between which outage matters and can be avoided: the
+shortest route on the complete map is in outage for at least 1 m, the best one for at most half of it.
 A robot with a camera that sees all around drives from start to goal, and plans anew after every metre: the cheapest
 route over cells that are not known walls, where a metre costs one, and four more by the probability that the path gain
 is not above the threshold:
@@ -30,7 +30,6 @@ from scipy.special import ndtr
 
 import sionna_partial as sp
 from sionna_partial.settings import SensorSettings
-from sionna_partial.tracing.simulation import clear_of_walls
 from sionna_partial.worlds.camera import Camera
 from sionna_partial.worlds.robot import _Router
 
@@ -160,7 +159,7 @@ def by_map(partial: sp.PartialMap, measured_m: Floats, measured_db: Floats) -> F
 
 
 def by_process(home: Home) -> Probability:
-    """Return that of a Gaussian process over the measurements, on path loss with the logarithm of the distance."""
+    """Return the probability by a Gaussian process over the measurements, on path loss fitted to them."""
 
     def probability(partial: sp.PartialMap, measured_m: Floats, measured_db: Floats) -> Floats:
         if len(measured_db) < 3:
@@ -182,11 +181,11 @@ def by_process(home: Home) -> Probability:
 
 
 def by_radio_map(home: Home) -> Probability:
-    """Return that of the predicted coverage of the map seen so far."""
+    """Return the probability by the predicted coverage of the map seen so far."""
     models: list[sp.LinkModel] = []
 
     def probability(partial: sp.PartialMap, measured_m: Floats, measured_db: Floats) -> Floats:
-        if not clear_of_walls(partial, home.tx_m[None])[0]:
+        if not partial.radios_can_stand(home.tx_m[None])[0]:
             return np.zeros(partial.shape)
         if not models:
             models.append(sp.LinkModel(partial))

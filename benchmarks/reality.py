@@ -1,12 +1,10 @@
 """Received powers that were measured on real floors, predicted from a few of them.
 
-Each FOLDER holds map.yaml (others with --map) and measurements.csv with the columns tx, tx_x ... rx_z, frequency_hz and
-power_dbm, as ../shared/measured/bleflat does. Of each transmitter 60 random points are taken, N of them are given, and
-the powers at the others are predicted, 20 times; the offset of powers is not known. The table has the root mean square
-error (RMSE) and the continuous ranked probability score (CRPS), averaged over transmitters [dB], the fraction of powers
-in the central 90 % interval of the prediction, and the fraction of points, all of which received, with
-P(outage) > 0.5. The last tables are the mean over folders of the figures of each baseline minus ours, and the residual
-spread about the trace: on each floor, and on average over the other floors, as a prior would have it.
+Each FOLDER holds map.yaml and measurements.csv with the columns tx, tx_x ... rx_z, frequency_hz and power_dbm, as
+../shared/measured/bleflat does. Of each transmitter 60 random points are taken, N of them are given, and the powers at
+the others are predicted; the offset of powers is not known. The table has the root mean square error (RMSE), averaged
+over transmitters [dB], and the fraction of powers in the central 90 % interval of our prediction; the last one the
+residual spread about the trace.
 
     python benchmarks/reality.py ../shared/measured/bleflat ../shared/measured/ble_floor
 
@@ -14,21 +12,16 @@ Without a FOLDER, buildings are procedural: their powers are traced with other w
 process of 4 dB, fading of 4 dB and an offset of each transmitter. With --repeats, these are drawn several times, and
 mean and scatter of the fraction of powers in the 90 % interval without given powers are printed instead.
 
-Baselines: path loss with fitted exponent; multi-wall (COST 231), whose loss per wall comes from the other transmitters
-of the floor; a Gaussian process about each of the two (Matern 3/2 over the receiver's position); the traced gain.
-Without given powers (N = 0), their constants are those of the other transmitters, which give the offset. Their
-predictions are Gaussian, with the standard deviation of their own errors for the other transmitters.
-"ours, alone" does without the links of the floor's other transmitters.
+Baselines: multi-wall (COST 231), whose loss per wall comes from the other transmitters of the floor; a Gaussian process
+(Matern 3/2 over the receiver's position) about it, and about path loss with fitted exponent. Without given powers
+(N = 0), their constants are the means of the other transmitters.
 
 With --locate, the position of each transmitter is unknown instead, and estimated from 40 of its 60 random powers, drawn
 several times; the 12 transmitters of procedural buildings have the same 60 receivers, and other errors in each draw.
-With --time, the processor time of a coverage from 20 and from all powers of the first transmitter, whose position is
-unknown, is printed instead, in predictions of its coverage.
 """
 
 import argparse
 import csv
-import time
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import replace
@@ -43,17 +36,16 @@ from through_walls import ends
 import sionna_partial as sp
 from sionna_partial import link_model
 from sionna_partial.checks import no_progress
-from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.coverage.job import CoverageJob, GridArea, Transmitter, grid_receivers
+from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.coverage.grid import GridArea, grid_receivers
+from sionna_partial.coverage.job import CoverageJob, Transmitter
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.localisation import MOST_POSITIONS, likely_region
 from sionna_partial.prediction.unobserved import walled_lengths_m
 from sionna_partial.tracing.antennas import Antenna
-from sionna_partial.tracing.simulation import clear_of_walls
 
 Floats = NDArray[np.float64]
 NUMBERS, POINTS, LOCATE_POINTS = (0, 5, 10, 20), 60, 40
-FIGURES = "RMSE [dB]", "CRPS [dB]", "in 90 %", "P(out) > .5"
 EXPONENT, EXPONENT_STD, NOISE_DB, OFFSET_STD_DB = 2.0, 0.5, 6.0, 8.0
 COLUMNS = "tx_x", "tx_y", "tx_z", "rx_x", "rx_y", "rx_z", "power_dbm"
 NO_INFORMATION_DB = 30.0
@@ -73,64 +65,38 @@ PROCESS_DB, PROCESS_M, FADING_DB, OFFSET_DB, SENSITIVITY_DBM = 4.0, 4.0, 4.0, (-
 
 
 def main() -> None:
-    """Measure, and print a table for each floor, and the mean lead over the baselines."""
+    """Measure, and print a table for each floor, and the residual spreads."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", type=Path, nargs="*")
-    parser.add_argument("--map", default="map.yaml", help="name of the map in each folder")
-    parser.add_argument("--material", default="unknown", help="of the walls; unknown is the default of SceneSettings")
-    parser.add_argument("--opaque-walls", action="store_true")
     parser.add_argument("--locate", action="store_true", help="estimate positions of transmitters instead")
-    parser.add_argument("--time", action="store_true", help="time of coverages from an unknown position instead")
-    parser.add_argument("--half", action="store_true", help="hide each half of the plan in turn: left, right, ...")
-    parser.add_argument("--transmitters", type=int, help="number of transmitters that are read of each floor")
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--repeats", type=int, default=0, help="of the errors of procedural buildings")
     parser.add_argument("--only", default="", help="part of the names of the procedural buildings")
     arguments = parser.parse_args()
-    scene = sp.SceneSettings(**{} if arguments.material == "unknown" else {"material": arguments.material})
-    leads, spreads, located = defaultdict(list), {}, []
-    floors = {f"{folder.name}, {arguments.map}": (folder, arguments.map) for folder in arguments.folders}
     buildings = {name: source for name, source in BUILDINGS.items() if arguments.only in name}
     if arguments.locate:
         print("| | trials | median error [m] | mean error [m] | truth in the 90 % region |\n|---|---|---|---|---|")
-    for name, source in (floors or buildings).items():
-        partial, links, frequency_hz = read_floor(*source) if floors else procedural(*source, shared=arguments.locate)
-        links = dict([*links.items()][: arguments.transmitters])
-        if not links:
-            print(f"\n{name}: no transmitter with a known position and {POINTS} powers")
-            continue
-        trace = sp.TraceSettings(frequency_hz, refraction=False if arguments.opaque_walls else None)
-        if arguments.time:
-            print_times(name, sp.LinkModel(partial, None, trace, scene), next(iter(links.values())))
-            continue
-        maps = halves(partial) if arguments.half else [partial]
+    spreads = {}
+    for name, source in ({folder.name: folder for folder in arguments.folders} or buildings).items():
+        shared = arguments.locate
+        partial, links, frequency_hz = (
+            read_floor(source) if isinstance(source, Path) else procedural(*source, shared=shared)
+        )
+        simulation = sp.Simulation(partial, sp.TraceSettings(frequency_hz))
         if arguments.locate:
-            located.append(locate(sp.LinkModel(partial, None, trace, scene), links, arguments.draws))
-            print_located(name, located[-1])
+            print_located(name, locate(sp.LinkModel(simulation), links, arguments.draws))
             continue
-        floors_of_maps = [Floor(each, links, sp.Simulation(each, trace, scene)) for each in maps]
+        floor = Floor(partial, links, simulation)
         if arguments.repeats:
-            inside = floors_of_maps[0].inside(arguments.repeats)
+            inside = floor.inside(arguments.repeats)
             print(f"{name}: in 90 % {np.mean(inside):.2f}, of single draws {np.std(inside):.2f}", flush=True)
             continue
-        spreads[name] = floors_of_maps[0].residual_stds_db()
-        tables = [floor.table(arguments.draws) for floor in floors_of_maps]
-        table = {method: np.mean([each[method] for each in tables], axis=0) for method in tables[0]}
-        print_table(f"{name}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", table)
-        for method, figures in table.items():
-            leads[method].append(figures[:2] - table["ours"][:2])
-    if arguments.locate:
-        print_located("all", np.concatenate(located))
-    if arguments.locate or arguments.repeats or arguments.time:
-        return
-    print_table("mean lead of ours over the floors", {method: np.mean(each, axis=0) for method, each in leads.items()})
-    print(
-        "\n| residual spread [dB] | process | fading | both | both, mean of the other floors |\n|---|---|---|---|---|"
-    )
-    both = {name: np.hypot(*stds) for name, stds in spreads.items()}
+        spreads[name] = floor.residual_stds_db()
+        print_table(f"{name}, {frequency_hz / 1e9:g} GHz, {len(links)} transmitters", floor.table(arguments.draws))
+    if spreads:
+        print("\n| residual spread [dB] | process | fading | both |\n|---|---|---|---|")
     for name, stds in spreads.items():
-        others = np.mean([total for other, total in both.items() if other != name] or [np.nan])
-        print(f"| {name} | {stds[0]:.1f} | {stds[1]:.1f} | {both[name]:.1f} | {others:.1f} |")
+        print(f"| {name} | {stds[0]:.1f} | {stds[1]:.1f} | {np.hypot(*stds):.1f} |")
 
 
 def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
@@ -138,7 +104,7 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
     link_model.KEPT_BLOCKS = POINTS
     area = GridArea(DEFAULT_HEIGHT_M, 1.0)
     job, found = CoverageJob(model, area, block=MOST_POSITIONS), []
-    nowhere = grid_receivers(model, np.empty((0, 3)), area)
+    nowhere = grid_receivers(model.simulation, np.empty((0, 3)), area)
     for number, rows in enumerate(links.values()):
         rows, tx_m = rows[np.random.default_rng(0).permutation(len(rows))[:POINTS]], rows[0, :3]
         for draw in range(draws):
@@ -153,18 +119,6 @@ def locate(model: sp.LinkModel, links: dict[str, Floats], draws: int) -> Floats:
     return np.array(found)
 
 
-def print_times(name: str, model: sp.LinkModel, rows: Floats) -> None:
-    """Print the times of coverages from an unknown position, in predictions."""
-    tx_m, nowhere, spent_s = rows[0, :3], (np.nan, np.nan, rows[0, 2]), []
-    measured = [sp.Measurements(nowhere, rows[:count, 3:6], rows[:count, 6]) for count in (20, len(rows))]
-    for tx, measurements in ((tx_m + 0.01, None), (tx_m, None), *((None, each) for each in measured)):
-        began_s = time.process_time()
-        sp.predict_map(model, tx, measurements=measurements)
-        spent_s.append(time.process_time() - began_s)
-    numbers = ", ".join(f"{each_s / spent_s[1]:.1f}" for each_s in spent_s[2:])
-    print(f"{name}: {numbers} predictions of {spent_s[1]:.1f} s from 20 and {len(rows)} powers", flush=True)
-
-
 def print_located(name: str, found: Floats) -> None:
     """Print a row of the table of `locate`."""
     errors_m = f"{np.median(found[:, 0]):.2f} | {np.mean(found[:, 0]):.2f}"
@@ -172,29 +126,15 @@ def print_located(name: str, found: Floats) -> None:
 
 
 def print_table(title: str, table: dict[str, Floats]) -> None:
-    """Print the first figures (F, N) of each method."""
-    columns = [f"{name}, N = {number}" for name in FIGURES[: len(table["ours"])] for number in NUMBERS]
-    print(f"\n{title}\n\n| | {' | '.join(columns)} |\n{'|---' * (len(columns) + 1)}|")
+    """Print the figures (N,) of each method."""
+    print(f"\n{title}\n\n| RMSE [dB] | {' | '.join(f'N = {number}' for number in NUMBERS)} |\n|---|---|---|---|---|")
     for method, figures in table.items():
-        cells = [f"{value:.2f}" if np.isfinite(value) else "" for value in figures.ravel()]
-        print(f"| {method} | {' | '.join(cells)} |", flush=True)
+        print(f"| {method} | {' | '.join(f'{value:.2f}' for value in figures)} |", flush=True)
 
 
-def halves(partial: sp.PartialMap) -> list[sp.PartialMap]:
-    """Hide the left, right, lower and upper half of what is free or wall."""
-    rows, columns = np.nonzero(partial.state != CellState.UNKNOWN)
-    of_cell = np.indices(partial.shape)
-    hidden = [
-        sign * (index - np.median(known)) > 0.0
-        for index, known in zip(of_cell, (rows, columns), strict=True)
-        for sign in (-1, 1)
-    ]
-    return [replace(partial, state=np.where(mask, np.uint8(CellState.UNKNOWN), partial.state)) for mask in hidden]
-
-
-def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats], float]:
+def read_floor(folder: Path) -> tuple[sp.PartialMap, dict[str, Floats], float]:
     """Return the map, the rows (N, 7) of each transmitter, and the frequency [Hz]."""
-    partial = sp.load_map(folder / name)
+    partial = sp.load_map(folder / "map.yaml")
     with (folder / "measurements.csv").open(encoding="utf-8") as stream:
         rows = [row for row in csv.DictReader(stream) if row["tx_x"]]
     of_tx = defaultdict(list)
@@ -202,7 +142,7 @@ def read_floor(folder: Path, name: str) -> tuple[sp.PartialMap, dict[str, Floats
         of_tx[row.get("tx") or row["sensor"]].append([float(row[column]) for column in COLUMNS])
     links = {}
     for tx, values in ((tx, np.array(values)) for tx, values in of_tx.items()):
-        stands = clear_of_walls(partial, values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
+        stands = partial.radios_can_stand(values[:, 3:6]) & (partial.state_at(values[0, :3]) != CellState.WALL)
         if stands.sum() >= POINTS:
             links[tx] = values[stands]
     return partial, links, float((rows and rows[0].get("frequency_hz")) or 2.44e9)
@@ -259,14 +199,12 @@ class Floor:
         self.frequency_hz = simulation.trace_settings.frequency_hz
         self.through_walls = simulation.trace_settings.through_walls
         model = sp.LinkModel(simulation)
-        self.free_db, self.walls, self.prior, self.traced_db = {}, {}, {}, {}
+        self.free_db, self.walls, self.prior = {}, {}, {}
         for tx, rows in links.items():
             tx_m, rx_m = rows[0, :3], rows[:, 3:6]
             distance_m = np.maximum(np.linalg.norm(rx_m - tx_m, axis=1), 0.1)
             self.free_db[tx] = 20.0 * np.log10(SPEED_OF_LIGHT_M_S / self.frequency_hz / (4.0 * np.pi * distance_m))
             self.walls[tx] = walls_between(partial, tx_m, rx_m)
-            traced_db = simulation.links(tx_m, rx_m).gain_db
-            self.traced_db[tx] = np.maximum(traced_db, traced_db[traced_db > -150.0].min() - 10.0)
             self.prior[tx] = model.predict(tx_m, rx_m)
         self.fitted = {tx: self.fit(tx, np.arange(len(rows))) for tx, rows in links.items()}
 
@@ -277,26 +215,19 @@ class Floor:
         return np.sqrt(squares)
 
     def table(self, draws: int) -> dict[str, Floats]:
-        """Return the mean over transmitters of the figures (4, N) of each method."""
-        shape = len(NUMBERS), draws, POINTS
-        errors: dict[str, dict[str, Floats]] = defaultdict(lambda: defaultdict(lambda: np.full(shape, np.nan)))
-        found: dict[str, dict[str, Floats]] = defaultdict(lambda: defaultdict(lambda: np.full((4, *shape), np.nan)))
-        for tx in self.links:
+        """Return the mean RMSE over transmitters (N,) of each method, and how often our interval holds the power."""
+        found: dict[str, Floats] = defaultdict(lambda: np.zeros((len(NUMBERS), len(self.links), draws)))
+        for column, (tx, rows) in enumerate(self.links.items()):
             for row, number in enumerate(NUMBERS):
                 for draw in range(draws):
-                    order = np.random.default_rng(draw).permutation(len(self.links[tx]))[:POINTS]
+                    order = np.random.default_rng(draw).permutation(len(rows))[:POINTS]
                     known, rest = order[:number], order[number:]
-                    for method, power in self.baselines(tx, known, rest).items():
-                        errors[method][tx][row, draw, number:] = power - self.links[tx][rest, 6]
-                    for method, figures in self.ours(tx, known, rest).items():
-                        found[method][tx][:, row, draw, number:] = figures
-        for method, of_tx in errors.items():
-            for tx, error_db in of_tx.items():
-                others = [of_tx[other] for other in self.others(tx)]
-                std_db = np.sqrt(np.nanmean(np.square(others), axis=(0, 2, 3)))[:, None, None] + 0.0 * error_db
-                gaussian = np.ones((1, *error_db.shape)), error_db[None], std_db[None]
-                found[method][tx][:3] = error_db, *scores(gaussian, np.zeros(1))
-        return {method: np.mean([means(each) for each in of_tx.values()], axis=0) for method, of_tx in found.items()}
+                    error_db, holds = self.ours(tx, known, rest)
+                    errors = {name: power - rows[rest, 6] for name, power in self.baselines(tx, known, rest).items()}
+                    for method, off_db in {**errors, "ours": error_db}.items():
+                        found[method][row, column, draw] = np.sqrt(np.mean(off_db**2))
+                    found["ours, in 90 %"][row, column, draw] = np.mean(holds)
+        return {method: values.mean(axis=(1, 2)) for method, values in found.items()}
 
     def inside(self, repeats: int) -> list[float]:
         """Return the fraction of powers in the 90 % interval without given powers, for errors drawn again and again."""
@@ -306,8 +237,8 @@ class Floor:
             self.links = {tx: np.column_stack([rows[:, :6], powers[tx]]) for tx, rows in traced.items()}
             self.fitted = {tx: self.fit(tx, np.arange(len(rows))) for tx, rows in self.links.items()}
             none = np.zeros(0, dtype=np.int64)
-            held = [self.ours(tx, none, np.arange(len(rows)))["ours"][2] for tx, rows in self.links.items()]
-            found.append(float(np.mean([np.nanmean(each) for each in held])))
+            held = [self.ours(tx, none, np.arange(len(rows)))[1] for tx, rows in self.links.items()]
+            found.append(float(np.mean([each.mean() for each in held])))
         self.links = traced
         return found
 
@@ -327,31 +258,27 @@ class Floor:
         power, rx_m, loss_db = self.links[tx][:, 6], self.links[tx][:, 3:6], self.loss_elsewhere(tx)
         fits = [path_loss(self.free_db[o], self.links[o][:, 6], (-30.0, EXPONENT / 2.0)) for o in self.others(tx)]
         slope = path_loss(self.free_db[tx][known], power[known], np.mean(fits, axis=0))
-        predicted = {"path loss": slope[0] + slope[1] * self.free_db[tx]}
+        path_loss_db = slope[0] + slope[1] * self.free_db[tx]
         through = {each: self.free_db[each] - loss_db * self.walls[each] for each in self.links}
-        for name, gain_db in {"multi-wall": through, "trace": self.traced_db}.items():
-            mean_db = float(np.mean([np.mean(self.links[o][:, 6] - gain_db[o]) for o in self.others(tx)]))
-            predicted[name] = gain_db[tx] + offset(power[known] - gain_db[tx][known], mean_db)
-        for name, without in (("path loss", "path loss"), ("direct line through walls", "multi-wall")):
-            residual_db = process(rx_m[known], (power - predicted[without])[known], rx_m)
-            predicted[f"{name} + Gaussian process"] = predicted[without] + residual_db
+        mean_db = float(np.mean([np.mean(self.links[o][:, 6] - through[o]) for o in self.others(tx)]))
+        multi_wall_db = through[tx] + offset(power[known] - through[tx][known], mean_db)
+        predicted = {"multi-wall": multi_wall_db}
+        for name, without_db in (("path loss", path_loss_db), ("multi-wall", multi_wall_db)):
+            residual_db = process(rx_m[known], (power - without_db)[known], rx_m)
+            predicted[f"{name} + Gaussian process"] = without_db + residual_db
         return {name: values[rest] for name, values in predicted.items()}
 
-    def ours(self, tx: str, known: NDArray[np.int64], rest: NDArray[np.int64]) -> dict[str, tuple[Floats, ...]]:
-        """Return errors [dB], scores [dB], and whether the interval holds and an outage is probable, of our methods."""
-        power, found = self.links[tx][rest, 6], {}
-        for name, others in {"ours": self.others(tx), "ours, alone": ()}.items():
-            if len(known) or others:
-                fitted = self.fit(tx, known, [self.fitted[other] for other in others if other != tx])
-                after = fitted.update(self.links[tx][rest, 3:6], self.prior[tx].take(rest))
-                weights, means_db, stds_db = after.by_state
-                parts = weights, means_db + fitted.offset_db, stds_db
-                error_db = after.gain_mean_db + fitted.offset_db - power
-                found[name] = error_db, *scores(parts, power), weights[LinkState.OUTAGE] > 0.5
-        return found
+    def ours(self, tx: str, known: NDArray[np.int64], rest: NDArray[np.int64]) -> tuple[Floats, NDArray[np.bool_]]:
+        """Return the errors [dB] of our prediction, and whether its 90 % intervals hold the powers."""
+        power = self.links[tx][rest, 6]
+        fitted = self.fit(tx, known, [self.fitted[other] for other in self.others(tx) if other != tx])
+        after = fitted.update(self.links[tx][rest, 3:6], self.prior[tx].take(rest))
+        weights, means_db, stds_db = after.by_state
+        below = (weights * ndtr((power - fitted.offset_db - means_db) / np.maximum(stds_db, 1e-9))).sum(axis=0)
+        return after.gain_mean_db + fitted.offset_db - power, (below >= 0.05) & (below <= 0.95)
 
     def fit(self, tx: str, known: NDArray[np.int64], others: Sequence[Assimilation] = ()) -> Assimilation:
-        """Assimilate some of the powers of a transmitter; without any, one that says nothing stands for them."""
+        """Assimilate some powers of a transmitter; without any, one of a standard deviation that says nothing."""
         rows, std_db = self.links[tx], None if len(known) else NO_INFORMATION_DB
         known = known if len(known) else np.zeros(1, dtype=np.int64)
         return Assimilation.fit(
@@ -363,33 +290,6 @@ class Floor:
             through_walls=self.through_walls,
             others=others,
         )
-
-
-def means(found: Floats) -> Floats:
-    """Return the RMSE, CRPS and fractions (4, N) of errors, scores and truth values (4, N, draws, points)."""
-    with np.errstate(invalid="ignore"):
-        of_draw = np.nansum([found[0] ** 2, *found[1:]], axis=-1) / np.isfinite(found).sum(axis=-1)
-    return np.concatenate([np.sqrt(of_draw[:1]), of_draw[1:]]).mean(axis=-1)
-
-
-def scores(parts: tuple[Floats, Floats, Floats], truth: Floats) -> tuple[Floats, Floats]:
-    """Return the CRPS of Gaussian mixtures (K, ...), and whether their central 90 % intervals hold the truth.
-
-    The score is E|x - truth| - E|x - x'| / 2 (Grimit et al. 2006, equation 5).
-    """
-
-    def mean_distance(mean: Floats, std: Floats) -> Floats:
-        """Return E|x| of normal distributions."""
-        z = mean / np.maximum(std, 1e-9)
-        distance: Floats = mean * (2.0 * ndtr(z) - 1.0) + 2.0 * std * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-        return distance
-
-    weights, centres, stds = parts
-    pairs = mean_distance(centres[:, None] - centres, np.hypot(stds[:, None], stds))
-    half = 0.5 * (weights[:, None] * weights * pairs).sum(axis=(0, 1))
-    below = (weights * ndtr((truth - centres) / np.maximum(stds, 1e-9))).sum(axis=0)
-    holds = np.where(np.isfinite(below), (below >= 0.05) & (below <= 0.95), np.nan)
-    return (weights * mean_distance(truth - centres, stds)).sum(axis=0) - half, holds
 
 
 def walls_between(partial: sp.PartialMap, tx_m: Floats, rx_m: Floats) -> Floats:

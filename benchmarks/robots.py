@@ -5,7 +5,7 @@
 - Specks: fraction of wall cells in pieces of three cells or fewer.
 - Gaps: one or two free cells between wall cells of a row or column, as a fraction of the runs.
 - Ragged: fraction of edges of walls that are shifted by one cell between two edges in line.
-- Noise: `PartialMap.wall_noise`.
+- Noise: mean of `PartialMap.noise_near` over the free cells.
 
 Simulated lidars of 12 m (halls: 20 m) drive through furnished homes and warehouses until they have seen most of them.
 SHARED is the folder with real maps. With --agree, `ROBOTS` map one home each from a start of its own, and their
@@ -27,10 +27,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 import sionna_partial as sp
+from sionna_partial.arrays import row_runs
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SionnaPartialError
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.settings import Fusion
 
 REAL = ("slam/*.yaml", "ros/*.yaml", "measured/dae/map.yaml", "measured/bleflat/robot.yaml", "vacuum/*.json")
@@ -84,7 +84,7 @@ def print_agreement(seed: int) -> None:
     tx_m, *rx_m = np.column_stack([points_m, np.full(len(points_m), HEIGHT_M)])
     truth, *found = (sp.LinkModel(scene).predict(tx_m, rx_m) for scene in (home, *maps))
     for (fusion, noise_m), partial, prediction in zip(ROBOTS, maps, found, strict=True):
-        name = f"home {seed}, {fusion}, {100 * noise_m:g} cm, noise {partial.wall_noise:.2f}"
+        name = f"home {seed}, {fusion}, {100 * noise_m:g} cm, noise {noise(partial):.2f}"
         print(row(name, differences(prediction, truth)), flush=True)
     pairs = np.array([differences(*pair) for pair in combinations(found, 2)])
     print(row(f"home {seed}, {len(pairs)} pairs", pairs.mean(axis=0)), flush=True)
@@ -124,7 +124,13 @@ def shape(partial: sp.PartialMap) -> NDArray[np.float64]:
     sizes = np.bincount(ndimage.label(wall, structure=np.ones((3, 3)))[0].ravel())[1:]
     specks = sizes[sizes <= 3].sum() / max(1, wall.sum())
     runs = max(1.0, lengths.sum())
-    return np.array([*lengths[1:] / runs, specks, gaps / runs, ragged / max(1, edges), partial.wall_noise])
+    return np.array([*lengths[1:] / runs, specks, gaps / runs, ragged / max(1, edges), noise(partial)])
+
+
+def noise(partial: sp.PartialMap) -> float:
+    """Return the mean range noise of the walls near free cells."""
+    free_m = cell_centres_m(partial, np.argwhere(partial.state == CellState.FREE))
+    return float(partial.noise_near(free_m).mean())
 
 
 def row(name: str, values: NDArray[np.float64]) -> str:

@@ -1,11 +1,11 @@
-"""Stock Sionna RT for the benchmarks: its path solver on tiles of receivers, and how far its paths and ours agree."""
+"""Functions that benchmarks share: homes and positions, stock's path solver on tiles, and agreement of its paths."""
 
 import itertools
 import multiprocessing
 import os
 import re
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,14 +14,18 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 import sionna_partial as sp
+from sionna_partial.constants import DEFAULT_HEIGHT_M
+from sionna_partial.llvm import load_sionna
 from sionna_partial.scene.scene import SceneGeometry, build_scene
-from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.interactions import DIFFRACTION
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS, find_wedges
 from sionna_partial.tracing.stock import listed_before
 
 Paths = dict[str, NDArray[Any]]
 """Paths of one receiver: `a` and `delay_s` (P,), `interactions` (P, D), `vertices_m` (P, D, 3), NaN where none is."""
+
+FIRST_SEED = 300_000
+"""Seed of the first procedural home of `given_homes`; no network was trained on it."""
 
 TRUTH_RAYS = 1_000_000
 TRUTH_TABLE = 30_000_000
@@ -97,7 +101,7 @@ def true_paths(folder: str, tx: NDArray[np.float64], rx: NDArray[np.float64], **
 
 
 def is_bent(paths: Paths) -> NDArray[np.bool_]:
-    """Whether each path diffracts."""
+    """Return whether each path diffracts."""
     return (paths["interactions"] == DIFFRACTION).any(axis=1)
 
 
@@ -137,6 +141,38 @@ def stock_scene(rt: Any, folder: str, tx: NDArray[np.float64], rx: NDArray[np.fl
     for index, position in enumerate(rx):
         scene.add(rt.Receiver(f"rx{index}", position=[float(value) for value in position]))
     return scene
+
+
+def given_homes(paths: Sequence[Path], made: int) -> Iterator[tuple[str, sp.PartialMap]]:
+    """Yield the maps of files with their names, or else so many procedural homes."""
+    for path in paths:
+        yield path.parent.name if path.suffix else path.name, sp.load_map(path)
+    for seed in range(FIRST_SEED, FIRST_SEED + made * (not paths)):
+        yield f"make_home({seed})", sp.make_home(seed)
+
+
+def drawn_points_m(
+    home: sp.PartialMap, partial: sp.PartialMap, count: int, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """Draw points (count, 3) in free cells of a home where radios can be, also on its partial map [m]."""
+    cells = rng.permutation(np.argwhere(home.state == sp.CellState.FREE))
+    inside = cells + rng.uniform(0.25, 0.75, cells.shape)
+    points_m = np.insert(inside[:, ::-1] * home.resolution_m + home.origin_m, 2, DEFAULT_HEIGHT_M, axis=1)
+    return points_m[home.radios_can_stand(points_m) & partial.radios_can_stand(points_m)][:count]
+
+
+def grid_m(partial: sp.PartialMap, spacing_m: float, height_m: float = DEFAULT_HEIGHT_M) -> NDArray[np.float64]:
+    """Return the positions (N, 3) of a square grid that lie in free cells [m]."""
+    x0, y0, x1, y1 = partial.bounds_m
+    x, y = np.meshgrid(np.arange(x0 + spacing_m / 2, x1, spacing_m), np.arange(y0 + spacing_m / 2, y1, spacing_m))
+    points_m = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, height_m)])
+    return points_m[partial.state_at(points_m) == sp.CellState.FREE]
+
+
+def timed(function: Callable[[], Any]) -> tuple[Any, float]:
+    """Call a function; return its result and its processor time [s]."""
+    start = time.process_time()
+    return function(), time.process_time() - start
 
 
 def limit_cores(cores: int | None) -> None:
@@ -209,8 +245,8 @@ def link(paths: Paths) -> tuple[sp.LinkState, float]:
 def meant(partial: sp.PartialMap, tx: NDArray[np.float64], rx: NDArray[np.float64], paths: list[Paths]) -> list[Paths]:
     """Leave out diffracted paths that are not traced: with many reflections, at horizontal edges, open ends, junctions.
 
-    Where three walls or more meet, Sionna RT takes any two of them for a wedge. Only in a sector wider than a
-    half-plane there are directions that the walls hide from each other, so both legs must lie in it.
+    Sionna RT takes any two walls of a junction for a wedge. Only in a sector wider than a half-plane there are
+    directions that the walls hide from each other, so both legs must be in it.
     """
     wedges, shift = find_wedges(build_scene(partial), open_ends=False), np.array([*partial.origin_m, 0.0])
     edges = cKDTree(wedges.edge_m.reshape(-1, 2))
@@ -291,7 +327,7 @@ def _plan_crossings(
 
 
 def _hits(corners: NDArray[np.float64], start: NDArray[np.float64], leg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Shares of a leg at which it passes triangles (Moeller and Trumbore 1997)."""
+    """Fractions of a leg at which it passes triangles (Moeller and Trumbore 1997)."""
     first, second, offset = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], start - corners[:, 0]
     normal = np.cross(leg, second)
     side = np.cross(offset, first)

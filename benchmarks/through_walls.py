@@ -1,16 +1,15 @@
-"""Paths through walls: against stock Sionna RT with refraction, their time, and how much one mapped wall costs.
+"""Paths through walls: their time, weak paths that are left out, the loss of one mapped wall, and plans as meshes.
 
     python benchmarks/through_walls.py ../shared/gibson/*/map.yaml
 
-takes some minutes for a map on two cores. Without maps it takes procedural homes. `--only stock`, for instance, runs
-one part. Stock `PathSolver` gets one receiver in each call, as rays share a table of paths; it counts every face as a
-slab, so that it is compared with `wall_depth_m=0`, and with paths of as many interactions.
+takes some minutes for a map on two cores. Without maps it takes procedural homes. `--only wall`, for instance, runs one
+part.
 """
 
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,52 +17,27 @@ from unittest.mock import patch
 
 import numpy as np
 from numpy.typing import NDArray
+from stock import given_homes
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.prediction.wall_materials import COMMON
-from sionna_partial.tracing.engine import open_scene
-from sionna_partial.tracing.finder import write_scene_of
-from sionna_partial.tracing.paths import SolvedPaths
 from sionna_partial.tracing.select import Limits
-from sionna_partial.tracing.simulation import resolved_settings
-from sionna_partial.tracing.stock import stock_paths
 
-REFRACTION = 4
 CASES = {"drywall": 28e9, "brick": 5e9}
-DEPTH = 6
-SAME_M = 0.03
-"""Paths of the same interactions at points closer than this are one path [m]."""
 
 
 def main() -> None:
     """Measure, and print a table for each part."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("maps", type=Path, nargs="*")
-    parser.add_argument("--only", choices=["stock", "time", "material", "weak", "wall", "mesh"])
-    parser.add_argument("--receivers", type=int, default=20, help="of each map, for stock Sionna RT")
-    parser.add_argument("--rays", type=int, default=1_000_000)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--only", choices=PARTS)
+    parser.add_argument("--made", type=int, default=3, help="number of procedural homes without maps")
     arguments = parser.parse_args()
-    maps = dict(_maps(arguments.maps))
-    parts = {
-        "stock": against_stock,
-        "time": relative_time,
-        "material": unknown_material,
-        "weak": left_out,
-        "wall": one_wall,
-        "mesh": as_meshes,
-    }
-    for name, part in parts.items():
+    maps = dict(given_homes(arguments.maps, arguments.made))
+    for name, part in PARTS.items():
         if arguments.only in (None, name):
-            part(maps, arguments)
-
-
-def _maps(paths: list[Path]) -> Iterator[tuple[str, sp.PartialMap]]:
-    for path in paths:
-        yield path.parent.name if path.name == "map.yaml" else path.stem, sp.load_map(path)
-    if not paths:
-        yield from ((f"home {seed}", sp.make_home(seed, "apartment")) for seed in (1, 2, 3))
+            part(maps)
 
 
 def ends(partial: sp.PartialMap, count: int, seed: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -77,75 +51,14 @@ def ends(partial: sp.PartialMap, count: int, seed: int) -> tuple[NDArray[np.floa
     return points_m[0], points_m[1:]
 
 
-def against_stock(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
-    """Compare the paths of stock Sionna RT with ours, path by path."""
-    print(
-        f"\nStock: {arguments.rays:g} rays for each of {arguments.receivers} receivers, depth {DEPTH}; each face a slab"
-    )
-    print("| map | case | of stock's within 20 / 40 dB we find | of ours within 40 dB stock finds |", end="")
-    print(" links within 0.5 dB | stock - ours [dB] | times as fast |\n|---|---|---|---|---|---|---|")
-    for name, partial in maps.items():
-        for material, frequency_hz in CASES.items():
-            _compare(name, partial, material, frequency_hz, arguments)
-
-
-def _compare(
-    name: str, partial: sp.PartialMap, material: str, frequency_hz: float, arguments: argparse.Namespace
-) -> None:
-    tx_m, rx_m = ends(partial, arguments.receivers, arguments.seed)
-    settings, scene_settings = resolved_settings(
-        partial,
-        sp.TraceSettings(
-            frequency_hz,
-            DEPTH,
-            diffraction=False,
-            refraction=True,
-            wall_depth_m=0.0,
-            max_walls=DEPTH,
-            power_tolerance_db=0.0,
-            samples_per_tx=arguments.rays,
-        ),
-        sp.SceneSettings(material=material),
-    )
-    simulation = sp.Simulation(partial, replace(settings, power_tolerance_db=0.1), scene_settings)
-    simulation.links(tx_m, rx_m)
-    start = time.perf_counter()
-    simulation.links(tx_m, rx_m)
-    own_s = time.perf_counter() - start
-    ours = sp.trace_links(partial, tx_m, rx_m, trace_settings=settings, scene_settings=scene_settings)
-    shift = np.array([*partial.origin_m, 0.0])
-    with tempfile.TemporaryDirectory() as folder:
-        scene = open_scene(write_scene_of(partial, Path(folder), settings, scene_settings).xml, frequency_hz)
-    start = time.perf_counter()
-    stock = list(stock_paths(scene, settings, tx_m - shift, rx_m - shift))
-    stock_s = time.perf_counter() - start
-    near, far, back, gaps = np.zeros(2), np.zeros(2), np.zeros(2), []
-    for rx, paths in enumerate(stock):
-        own = np.flatnonzero((ours.path_rx == rx) & ((ours.interactions > 0).sum(axis=1) <= DEPTH))
-        found, used = _matched(ours, own, paths, shift)
-        power = np.abs(ours.a[own]) ** 2
-        total = max(power.sum(), paths.power.sum())
-        near += found[paths.power > 1e-2 * total].sum(), (paths.power > 1e-2 * total).sum()
-        far += found[paths.power > 1e-4 * total].sum(), (paths.power > 1e-4 * total).sum()
-        back += used[power > 1e-4 * total].sum(), (power > 1e-4 * total).sum()
-        if total > 1e-15:
-            gaps.append(10.0 * np.log10(max(paths.power.sum(), 1e-15) / max(power.sum(), 1e-15)))
-    print(
-        f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {near[0] / near[1]:.1%} / {far[0] / far[1]:.1%} | "
-        f"{back[0] / back[1]:.1%} | {np.mean(np.abs(gaps) < 0.5):.0%} | {min(gaps):.2f} to {max(gaps):.2f} | "
-        f"{stock_s / own_s:.0f} |"
-    )
-
-
-def as_meshes(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
-    """Trace maps as meshes as well, and compare links; then compare the paths of the meshes with those of stock."""
-    meshes = {}
+def as_meshes(maps: dict[str, sp.PartialMap]) -> None:
+    """Trace maps as meshes as well, and compare links."""
     print("\n| map | case | receivers | as mesh - as plan [dB]: 5, 50, 95 % | within 0.5 dB | time, opaque mesh = 1 |")
     print("|---|---|---|---|---|---|")
     for name, partial in maps.items():
         for material, frequency_hz in CASES.items():
-            mesh = meshes[name] = _as_mesh(partial)
-            tx_m, rx_m = ends(partial, 500, arguments.seed)
+            mesh = _as_mesh(partial)
+            tx_m, rx_m = ends(partial, 500, 0)
             rx_m = rx_m[mesh.radios_can_stand(rx_m)]
             gains, seconds = [], []
             for scene, refraction in ((partial, True), (mesh, False), (mesh, True)):
@@ -161,7 +74,6 @@ def as_meshes(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> 
                 f"| {name} | {material}, {frequency_hz / 1e9:g} GHz | {len(rx_m)} | {spread} | "
                 f"{np.mean(np.abs(difference) < 0.5):.1%} | {seconds[2] / seconds[1]:.1f} |"
             )
-    against_stock(meshes, arguments)
 
 
 def _as_mesh(partial: sp.PartialMap) -> sp.PartialMap:
@@ -174,30 +86,13 @@ def _as_mesh(partial: sp.PartialMap) -> sp.PartialMap:
     return replace(partial, mesh=replace(mesh, materials=(None,) * len(mesh.materials)))
 
 
-def _matched(
-    ours: sp.TracedLinks, own: NDArray[np.int64], paths: SolvedPaths, shift: NDArray[np.float64]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Whether each path of stock Sionna RT is one of ours, and each of ours one of its."""
-    found, used = np.zeros(len(paths.a), dtype=bool), np.zeros(len(own), dtype=bool)
-    for path, kinds in enumerate(paths.interactions):
-        length = int((kinds > 0).sum())
-        for index in np.flatnonzero(~used):
-            row = ours.interactions[own[index]]
-            same = (row > 0).sum() == length and (row[:length] == kinds[:length]).all()
-            at_m = paths.vertices_m[path, :length] + shift
-            if same and np.allclose(ours.vertices_m[own[index], :length], at_m, atol=SAME_M):
-                found[path] = used[index] = True
-                break
-    return found, used
-
-
-def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+def relative_time(maps: dict[str, sp.PartialMap]) -> None:
     """Compare warm traces of up to 3,000 receivers with opaque walls and through walls."""
     print("\n| map | case | receivers | opaque [s] | through walls, times as long | outages gain (median) [dB] |")
     print("|---|---|---|---|---|---|")
     for name, partial in maps.items():
         for material, frequency_hz in CASES.items():
-            tx_m, rx_m = ends(partial, 3000, arguments.seed)
+            tx_m, rx_m = ends(partial, 3000, 0)
             seconds, gains = [], []
             for refraction in (False, True):
                 settings = sp.TraceSettings(frequency_hz, refraction=refraction)
@@ -215,14 +110,14 @@ def relative_time(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace)
             )
 
 
-def unknown_material(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+def unknown_material(maps: dict[str, sp.PartialMap]) -> None:
     """Compare the time of predictions with walls of an unknown material and of named ones, and gains under each."""
     print("\n| map | GHz | material | receivers | named [s] | unknown, times as long |", end="")
     print(" nearest candidate is off [dB] | change of the mean by coarse limits [dB]: 50, 90 % |")
     print("|---|---|---|---|---|---|---|---|")
     for name, partial in maps.items():
         for frequency_hz in (2.4e9, 5e9):
-            tx_m, rx_m = ends(partial, 1000, arguments.seed)
+            tx_m, rx_m = ends(partial, 1000, 0)
             found = {}
             for material in (None, *COMMON, "usual limits"):
                 named = {"material": material} if material in COMMON else {}
@@ -243,13 +138,13 @@ def unknown_material(maps: dict[str, sp.PartialMap], arguments: argparse.Namespa
                 )
 
 
-def left_out(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+def left_out(maps: dict[str, sp.PartialMap]) -> None:
     """Print what links of 200 receivers lack of their gain with the limits of weak paths, against much lower ones."""
     usual = Limits.of
     print("\n| map | case | paths | paths with low limits | missing [dB]: 50, 90, 99 %, most |")
     print("|---|---|---|---|---|")
     for name, partial in maps.items():
-        tx_m, rx_m = ends(partial, 200, arguments.seed)
+        tx_m, rx_m = ends(partial, 200, 0)
         for material, frequency_hz in (*CASES.items(), ("drywall", 2.4e9)):
             links = []
             for changes, tolerance_db in (({}, 0.1), ({"weakest": 1e-5, "discount": 1.0}, 0.01)):
@@ -268,7 +163,7 @@ def left_out(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> N
             )
 
 
-def one_wall(maps: dict[str, sp.PartialMap], arguments: argparse.Namespace) -> None:
+def one_wall(maps: dict[str, sp.PartialMap]) -> None:
     """Print the loss of one wall of other depths, angles and turns of the grid, seen from one side and from both."""
     print("\nLoss of one straight wall [dB], brick of 10 cm at 5 GHz, beyond that of its slab")
     print("| turned by | angle of incidence | 1 cell | 3 cells | 8 cells | of 8 cells only the front seen |")
@@ -298,6 +193,14 @@ def _wall_loss_db(turned_deg: float, angle_deg: float, cells: int, seen: int) ->
     links = sp.trace_links(partial, [*tx, 1.5], [[*rx, 1.5]], trace_settings=settings, scene_settings=scene_settings)
     return float(-links.gain_db[0] + 20.0 * np.log10(299792458.0 / 5e9 / (4.0 * np.pi * 4.0)))
 
+
+PARTS: dict[str, Callable[[dict[str, sp.PartialMap]], None]] = {
+    "time": relative_time,
+    "material": unknown_material,
+    "weak": left_out,
+    "wall": one_wall,
+    "mesh": as_meshes,
+}
 
 if __name__ == "__main__":
     main()

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from stock import (
     Paths,
     agreement,
+    grid_m,
     isolated,
     limit_cores,
     meant,
@@ -99,10 +100,7 @@ def compare(name: str, count: int, sample_size: int, settings: sp.TraceSettings)
 def receivers(partial: sp.PartialMap, tx: NDArray[np.float64], count: int) -> NDArray[np.float64]:
     """About `count` receivers at the height of the transmitter on a square grid, none within 1 cm of a wall."""
     free = (partial.state == sp.CellState.FREE).sum() * partial.resolution_m**2
-    spacing_m = math.sqrt(free / count)
-    x0, y0, x1, y1 = partial.bounds_m
-    x, y = np.meshgrid(np.arange(x0 + spacing_m / 2, x1, spacing_m), np.arange(y0 + spacing_m / 2, y1, spacing_m))
-    rx = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, tx[2])])
+    rx = grid_m(partial, math.sqrt(free / count), tx[2])
     for dx, dy in ((0.01, 0.01), (0.01, -0.01), (-0.01, 0.01), (-0.01, -0.01)):
         rx = rx[partial.state_at(rx[:, :2] + (dx, dy)) == sp.CellState.FREE]
     return rx

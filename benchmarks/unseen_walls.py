@@ -24,10 +24,10 @@ import numpy as np
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, CellState, LinkState
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.metrics import measure
 from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.prediction.features import LinkFeatures, link_features
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import HOME_KINDS, HomeKind
 
 BANDS_GHZ = {2.4: "brick", 5.0: "drywall", 28.0: "drywall", 60.0: "glass"}
@@ -46,7 +46,7 @@ class Links(NamedTuple):
     true_db: np.ndarray
 
     def multi_wall(self, band_ghz: float) -> tuple[np.ndarray, np.ndarray]:
-        """Gain of free space (N,), and what a multi-wall model subtracts from it (N, 3) [dB]."""
+        """Return the gain of free space (N,), and the terms (N, 3) that a multi-wall model subtracts [dB]."""
         distance_m, context = self.phi.distance_m, self.phi.context
         assert context is not None
         free_db = 20.0 * np.log10(SPEED_OF_LIGHT_M_S / (4e9 * np.pi * band_ghz * distance_m))

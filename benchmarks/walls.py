@@ -31,7 +31,7 @@ PARTS = {
     "block\n1 m, unseen": (10.5, 1.0, CellState.UNKNOWN),
     "table\n0.75 m high": (13.0, 0.5, None),
 }
-"""Where parts begin along x and how deep they are [m], and what lies between their faces; None for more wall."""
+"""Start of each part along x and its depth [m], and the state between its faces; None for more wall."""
 
 LONG_M, STRIP_M = 1.5, 2.5
 """Length of each part, and width of the strip that it and its own transmitter have to themselves [m]."""
@@ -61,7 +61,7 @@ def transmitter_of(left_m: float) -> NDArray[np.float64]:
 
 
 def losses_db(partial: sp.PartialMap, left_m: float, rx: NDArray[np.float64], depth_m: float) -> NDArray[np.float64]:
-    """Return what a part takes of the straight paths from its transmitter to receivers (N, 3)."""
+    """Return the loss (N,) of straight paths from a part's transmitter to receivers (N, 3) behind it [dB]."""
     settings = sp.TraceSettings(FREQUENCY_HZ, max_depth=0, diffraction=False, wall_depth_m=depth_m)
     tx, scene = transmitter_of(left_m), sp.SceneSettings(floor_extent="none")
     links = sp.trace_links(partial, tx, rx, trace_settings=settings, scene_settings=scene, invalid="nan")

@@ -88,7 +88,7 @@ def public_names(package: str = "") -> list[tuple[str, str]]:
 
 
 def write_api() -> None:
-    """Write a page that lists every public name by room, and those of the groups."""
+    """Write a page that lists every public name by room, and the names of the groups."""
     names: dict[str, list[str]] = {heading: [] for heading in [*ROOMS.values(), "More"]}
     for module, name in public_names():
         names[ROOMS.get(module.partition(".")[0], "More")].append(name)

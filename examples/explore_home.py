@@ -17,8 +17,7 @@ trajectory = sp.explore_trajectory(home, steps=(0, 25, 50, 100, 150, 200), seed=
 maps = sp.plots.plot_exploration(trajectory.at((50, 100, 200)))
 
 # %%
-# What does the robot gain from each step? At each stage the link from a transmitter to a room at the other end of the
-# home is predicted again, from what the robot has seen by then.
+# The link from a transmitter to a room at the other end of the home is predicted at each stage, from the robot's map.
 
 tx, rx = (7.0, 9.8, 1.5), [(10.0, 3.5, 1.5)]
 predictor = sp.Predictor.load()

@@ -22,8 +22,8 @@ home = sp.load_map(scenes_folder() / "apartment" / "complete" / "map.yaml")
 links = sp.trace_links(home, (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)])
 
 # %%
-# What is simulated takes anything with `cfr`: it draws bits, sends them through the channel of each subcarrier, adds
-# noise, and decides by the sign of what arrives, with the phase of the channel turned back.
+# The simulation takes anything with `cfr`: it draws bits, sends them through the channel of each subcarrier, adds
+# noise, removes the phase of the channel, and decides by the sign.
 
 
 def bit_error_rate(channels: sp.TracedLinks, tx_power_dbm: float, symbols: int = 100, seed: int = 0) -> np.ndarray:
@@ -64,8 +64,8 @@ left.legend()
 right.set(xlabel="transmitted power [dBm]", ylabel="bit error rate", ylim=(1e-5, 1))
 
 # %%
-# On a map that shows half of the apartment the channel is not known: `sample_channels` draws what it may be. Bit error
-# rates of the second link over 100 draws, for a robot that wants to know how much power will do.
+# On a map that shows half of the apartment the channel is not known: `sample_channels` draws possible ones. Bit error
+# rates of the second link over 100 draws tell how much power is enough.
 
 partial = sp.load_map(scenes_folder() / "apartment" / "step100" / "map.yaml")
 samples = sp.channels.sample_channels(partial, (7.0, 9.8, 1.5), [(8.0, 10.0, 1.5), (8.0, 7.0, 1.5)], n=100)

@@ -22,8 +22,8 @@ figure = sp.plots.plot_placement(found)
 
 # %%
 # The rest of this home is known, too, so that the position can be compared with the truth: the fraction of the home
-# where the full trace finds a gain above the threshold. For comparison, the free cell nearest to the middle of what the
-# robot has seen.
+# where the full trace finds a gain above the threshold. For comparison, the free cell nearest to the middle of the
+# robot's map.
 
 home = sp.load_map(scenes_folder() / "apartment" / "complete")
 

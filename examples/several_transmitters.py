@@ -32,6 +32,6 @@ assert 0.0 < alone < together
 figure = sp.plots.plot_network(network)
 
 # %%
-# The coverage of each. ``sp.save_coverage(coverage, "coverage.html")`` writes a page with a choice of the transmitter.
+# The coverage of each transmitter. ``sp.save_coverage(coverage, "coverage.html")`` writes a page where it is chosen.
 
 coverage_figure = sp.plots.plot_coverage(coverage, layers=("gain_mean_db", "p_outage"))

@@ -3,8 +3,8 @@ Coverage at 2.4, 5, 28 and 60 GHz
 =================================
 
 Below 24 GHz paths go through walls, from there on walls are opaque, unless set otherwise. Here one
-transmitter covers the shipped apartment, whose walls are of drywall, at four bands. The map is complete, so the trace
-is the prediction.
+transmitter covers the shipped apartment, whose walls are of drywall, at four bands. The map is complete, so that the
+mean gain is the traced one.
 """
 
 import matplotlib.pyplot as plt
@@ -30,7 +30,7 @@ for band, coverage in coverages.items():
 assert [coverage.attrs["walls"] for coverage in coverages.values()] == ["through walls"] * 2 + ["opaque walls"] * 2
 
 # %%
-# Walls that transmit leave no receiver without a path.
+# With walls that transmit, every receiver has a path.
 
 figure, axes = plt.subplots(1, 4, figsize=(16, 4.6), layout="compressed", sharey=True)
 for axis, (band, coverage) in zip(axes, coverages.items(), strict=True):

@@ -17,14 +17,14 @@ import trimesh
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
+from sionna_partial.arrays import row_runs
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.explore import explore
 from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import row_runs
-from sionna_partial.scene.scene import export_scene
+from sionna_partial.scene.export import export_scene
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.tracing.trace import trace_links
 from sionna_partial.worlds.homes import make_home
 
 STEPS = (50, 100, 150, 200)

@@ -28,20 +28,20 @@ from sionna_partial.placement.placement import place_transmitter as place_transm
 from sionna_partial.placement.several import place_transmitters as place_transmitters
 from sionna_partial.prediction.features import LinkFeatures as LinkFeatures
 from sionna_partial.prediction.features import link_features as link_features
-from sionna_partial.prediction.predictor import LinkPrediction as LinkPrediction
 from sionna_partial.prediction.predictor import Predictor as Predictor
-from sionna_partial.scene.scene import export_scene as export_scene
+from sionna_partial.prediction.rule import LinkPrediction as LinkPrediction
+from sionna_partial.scene.export import export_scene as export_scene
 from sionna_partial.settings import Material as Material
 from sionna_partial.settings import SceneSettings as SceneSettings
 from sionna_partial.settings import SensorSettings as SensorSettings
 from sionna_partial.settings import TraceSettings as TraceSettings
+from sionna_partial.tracing.antenna_files import load_antenna as load_antenna
 from sionna_partial.tracing.antennas import Antenna as Antenna
 from sionna_partial.tracing.antennas import AntennaPattern as AntennaPattern
-from sionna_partial.tracing.antennas import load_antenna as load_antenna
 from sionna_partial.tracing.gradients import gain_gradients as gain_gradients
 from sionna_partial.tracing.links import TracedLinks as TracedLinks
 from sionna_partial.tracing.simulation import Simulation as Simulation
-from sionna_partial.tracing.simulation import trace_links as trace_links
+from sionna_partial.tracing.trace import trace_links as trace_links
 from sionna_partial.worlds.homes import make_home as make_home
 
 __version__: str

@@ -1,4 +1,4 @@
-"""Types of arrays, read-only arrays of dataclasses, and geometry in the plane."""
+"""Types of arrays, read-only arrays of dataclasses, grids of cells, and geometry in the plane."""
 
 import math
 from dataclasses import fields
@@ -73,6 +73,53 @@ def largest_by_area(values: Floats, area: Indices, count: int) -> Floats:
     largest = np.zeros(count + 1)
     np.maximum.at(largest, area.ravel(), values.ravel())
     return largest
+
+
+def row_runs(mask: Bools) -> tuple[Indices, Indices, Indices]:
+    """Return row, first and end column of horizontal runs of True, in reading order."""
+    step = np.diff(np.pad(mask, ((0, 0), (1, 1))).astype(np.int8), axis=1)
+    row, start = np.nonzero(step == 1)
+    return row, start, np.nonzero(step == -1)[1]
+
+
+def run_lengths(mask: Bools) -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
+    """Return width and height of the runs through every cell, at most 255."""
+    width, height = np.zeros((2, *mask.shape), dtype=np.uint8)
+    for length, cells in ((width, mask), (height.T, mask.T)):
+        _, start, end = row_runs(cells)
+        length[cells] = np.repeat(np.minimum(end - start, 255), end - start)
+    return width, height
+
+
+def canonical(grid: States) -> tuple[States, bool, tuple[bool, bool]]:
+    """Turn or mirror a grid to the orientation with the smallest bytes, so that results turn with it.
+
+    Returns the grid, whether it was transposed, and whether columns and rows were then flipped.
+    """
+    turns = [(swap, (x, y)) for swap in (False, True) for y in (False, True) for x in (False, True)]
+    grids = [(turned_grid(grid, *turn), *turn) for turn in turns]
+    return min(grids, key=lambda turned: (turned[0].shape, turned[0].tobytes()))
+
+
+def turned_back(grid: Bools, transpose: bool, flips: tuple[bool, bool]) -> Bools:
+    """Undo `turned_grid`."""
+    grid = grid[:: -1 if flips[1] else 1, :: -1 if flips[0] else 1]
+    return grid.T if transpose else grid
+
+
+def turned_grid(grid: NDArray[Any], transpose: bool, flips: tuple[bool, bool]) -> NDArray[Any]:
+    """Transpose a grid, then flip its columns and rows."""
+    grid = grid.T if transpose else grid
+    return np.ascontiguousarray(grid[:: -1 if flips[1] else 1, :: -1 if flips[0] else 1])
+
+
+def counted_near(cells: NDArray[np.generic], deviation: float) -> Floats:
+    """Add up cells with the weights of a window that is 1 in its middle, about a Gaussian: three box filters."""
+    half = round((math.sqrt(4.0 * deviation**2 + 1.0) - 1.0) / 2.0)
+    counts = np.pad(cells.astype(np.float64), half)  # so that unknown cells around a map change nothing
+    for _ in range(3):
+        counts = scipy.ndimage.uniform_filter(counts, 2 * half + 1, mode="constant")
+    return 2.0 * math.pi * deviation**2 * counts[half : half + cells.shape[0], half : half + cells.shape[1]]
 
 
 def grid_edges(cost: Floats) -> tuple[Indices, Floats]:

@@ -26,15 +26,6 @@ MEMORY_GB = 2.0
 DEFAULT_WALL_HEIGHT_M = 3.0
 """Default height of walls [m]."""
 
-DRYWALL_PERMITTIVITY = 2.94
-"""Relative permittivity of layered drywall at 28 GHz (the paper's Wireless InSite material)."""
-
-DRYWALL_CONDUCTIVITY_S_M = 0.1226
-"""Conductivity of layered drywall at 28 GHz [S/m] (same source)."""
-
-DRYWALL_CONDUCTIVITY_EXPONENT = 0.9395
-"""Exponent of the frequency in the conductivity, as of plasterboard (ITU-R P.2040-3, table 3)."""
-
 WALL_THICKNESS_M = 0.1
 """Thickness of the slab in the reflection coefficient [m] (Sionna RT's default)."""
 

@@ -16,22 +16,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import cache, cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, require, require_number
-from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import part_of, reporting
 from sionna_partial.errors import MapError
 from sionna_partial.link_model import LinkModel, link_model_of, warn_of_other_traces
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, attenuation, context_of
+from sionna_partial.prediction.features import context_of
 from sionna_partial.prediction.map_networks import (
     LINK_NETWORK,
     MAP_NETWORK,
@@ -42,6 +41,7 @@ from sionna_partial.prediction.map_networks import (
     link_outputs,
     read_features,
 )
+from sionna_partial.prediction.moved_links import MovedLinks, by_differences, moved_paths, wall_losses
 from sionna_partial.prediction.paper_networks import (
     GAIN_INPUTS,
     GAIN_NETWORKS,
@@ -52,41 +52,30 @@ from sionna_partial.prediction.paper_networks import (
     parts,
     tf,
 )
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
-from sionna_partial.prediction.rule import GATE_NETWORK, Parts, doubt, over_materials, predicted, traced_parts
-from sionna_partial.prediction.space import MapSpace
-from sionna_partial.prediction.unobserved import unobserved_lengths_m, walled_lengths_m
-from sionna_partial.prediction.unseen_walls import (
-    DirectLines,
-    UnseenWalls,
-    WallDensity,
-    WallTrace,
-    by_mean_losses,
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.rule import (
+    GATE_NETWORK,
+    LinkPrediction,
+    Parts,
+    doubt,
+    over_materials,
+    predicted,
+    traced_parts,
 )
-from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
-from sionna_partial.scene.scene import power_laws
+from sionna_partial.prediction.space import MapSpace
+from sionna_partial.prediction.unseen_walls import DirectLines, UnseenWalls, WallDensity, WallTrace, by_mean_losses
+from sionna_partial.prediction.wall_materials import RESIDUAL_DB
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.gradients import one_transmitter
-from sionna_partial.tracing.links import unnamed_counts
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathSet
-from sionna_partial.tracing.power import mean_loss_db, wall_loss_db
-from sionna_partial.tracing.simulation import Simulation, nearest_m
+from sionna_partial.tracing.paths import unnamed_counts
+from sionna_partial.tracing.positions import nearest_m
+from sionna_partial.tracing.simulation import Simulation
 
 _FINER = 0.1
 """Tolerance of the paths of derivatives, relative to the tolerance of values: the slope of a gain in dB is less exact
 than the gain where weak paths change fast."""
 
-_NEAREST_M = 1e-6
-"""Shortest distance between transmitter and receivers, where a distance has no slope [m]."""
-
-_LENGTH_STEP_M = 1e-3
-"""Step of central differences of lengths in cells [m]: their derivatives jump where a line passes a corner."""
-
-_STEEPEST = 30.0
-"""Largest derivative of a length: lines along the border of cells have none."""
-
-_RELATIVE_STEP = 1e-5
-"""Step of central differences, relative to the value or to itself."""
 
 _RIM = np.array([(math.cos(angle), math.sin(angle), 0.0) for angle in np.arange(8) * math.pi / 4.0])
 """Directions (8, 3) of the positions on the rim of a disc."""
@@ -98,8 +87,6 @@ _LIMITS = {
     "thickness_m": (0.0, 10.0),
     "frequency_hz": FREQUENCIES_HZ,
 }
-
-_Numbers: TypeAlias = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -313,24 +300,6 @@ class DifferentiableScene:
         walls = UnseenWalls.shipped().of_map(self.partial)
         return walls._replace(lines=UnseenWalls.keras_lines())
 
-    def _walls_at(self, values: Mapping[str, Floats]) -> Floats:
-        """Return the mean loss of traced walls [dB]; additional losses (2 K,) [dB] and prior (K,) of candidates."""
-        at, resolved = self.simulation.parameters(np.zeros(3)), self.simulation.resolved
-        base_hz, at, total_db = float(at.frequency_hz), replace(at, **values), 0.0
-        frequency_hz, default = float(at.frequency_hz), resolved.scene_settings.traced_material
-        known = self.partial.environment.scene_materials(default)
-        traced = [known[name] for name in self.materials]
-        for named, fraction in self.partial.wall_fractions.items():
-            material = named or default
-            if material not in traced:
-                total_db += fraction * wall_loss_db(material, frequency_hz)
-                continue
-            slab = [getattr(at, name)[traced.index(material)] for name in MATERIAL_PARAMETERS]
-            grown = [(frequency_hz / base_hz) ** law.exponent for law in power_laws(material, base_hz)]
-            total_db += fraction * mean_loss_db(slab[0] * grown[0], slab[1] * grown[1], slab[2], frequency_hz)
-        candidates = WallMaterials.at(frequency_hz, self.partial.wall_class_count)
-        return np.concatenate([[total_db], candidates.crossing_db.ravel(), candidates.prior])
-
 
 class DifferentiableLinks:
     """Links from one transmitter to N receivers, traced once; a call returns their distribution.
@@ -344,6 +313,7 @@ class DifferentiableLinks:
     def __init__(self, scene: DifferentiableScene, paths: PathSet) -> None:
         self.base, self._scene, self._paths = paths.base, scene, paths
         self._phi = scene.model.features(paths.base.tx_m, paths.rx_m)
+        self._moved = MovedLinks(scene.partial, paths, self._phi)
         self._is_certain = not doubt(feature_values(self._phi)).any()
         # before any call, as a tape would watch variables that are made under it
         self._networks = {} if self._is_certain or scene.model.by_mean_losses else scene.networks
@@ -395,20 +365,14 @@ class DifferentiableLinks:
         require(inside, name, value, f"give numbers in [{low:g}, {high:g}].")
         return tensor
 
-    @cached_property
-    def _legs(self) -> _Legs:
-        return _Legs(self._scene.partial, self._paths)
-
-    def _sum(self, power: Any, rx: _Numbers) -> Any:
-        return tf.math.unsorted_segment_sum(power, rx, len(self._paths.rx_m))
-
     def _traces(self, power: Any, given: Mapping[str, Any]) -> tuple[list[WallTrace], Any]:
         """Return the traced links under each candidate for the material of walls, and their probabilities."""
         phi, scene, nothing = self._phi, self._scene, np.zeros(len(self._phi))
-        walls = by_differences(scene._walls_at, {name: each for name, each in given.items() if name != "tx_m"})
+        constants = {name: value for name, value in given.items() if name != "tx_m"}
+        walls = by_differences(lambda at: wall_losses(scene.simulation, at), constants)
         known = context_of(phi).straight_walls
         if phi.path_power is None or {*given} & {*MATERIAL_PARAMETERS}:
-            gain_db = self._changed_db(phi.gain_db, power, self._paths.power)
+            gain_db = self._moved.changed_db(phi.gain_db, power, self._paths.power)
             return [WallTrace(phi.link_state, gain_db, nothing + walls[0], known)], np.ones(1)
         materials, fractions, traces = scene.model.wall_materials, scene.partial.unnamed_walls, []
         count = len(materials.prior)
@@ -419,7 +383,7 @@ class DifferentiableLinks:
                 10.0 ** (-0.1 * tf.linalg.matvec(self._unnamed, tf.concat([each_db, [reflection_db]], axis=0)))
                 for each_db in (crossing_db, materials.crossing_db[number])
             )
-            gain_db = self._changed_db(under.gain_db, power * kept, self._paths.power * first)
+            gain_db = self._moved.changed_db(under.gain_db, power * kept, self._paths.power * first)
             loss_db = walls[0] + tf.reduce_sum(crossing_db * fractions)
             traces.append(WallTrace(under.link_state, gain_db, nothing + loss_db, known))
         return traces, prior
@@ -430,22 +394,13 @@ class DifferentiableLinks:
         classes = self._scene.partial.wall_classes(self._paths.vertices_m)
         return np.stack(unnamed_counts(self._paths.interactions, classes), axis=1).astype(np.float64)
 
-    def _changed_db(self, gain_db: Floats, power: Any, first_power: Any, rx: _Numbers | None = None) -> Any:
-        """Return gains (N,) [dB] that change as the sums of the powers of paths, to `rx`, do; outages stay."""
-        rx = self._paths.path_rx if rx is None else rx
-        now_db, first_db = (_gain_db(self._sum(each, rx)) for each in (power, first_power))
-        changed_db = tf.maximum(gain_db + (now_db - first_db), GAIN_FLOOR_DB)
-        return tf.where(gain_db > GAIN_FLOOR_DB, changed_db, GAIN_FLOOR_DB)
-
     def _by_rule(
         self, traces: Sequence[WallTrace], given: Mapping[str, Any], power: Any, vertices_m: Any
     ) -> list[Parts]:
         """Return the prediction under each candidate for the material of walls (`LinkModel.predict_features`)."""
-        ops, tx_m, scene = import_keras().ops, given.get("tx_m"), self._scene
-        values = self._moved_features(tx_m, self._changed_db(self._phi.gain_db, power, self._paths.power))
-        values |= self._indirect_features(values["distance_m"], tx_m, power, vertices_m)
+        ops, scene, values = import_keras().ops, self._scene, self._moved.features(given.get("tx_m"), power, vertices_m)
         if scene.model.by_mean_losses:
-            experts = self._by_mean_losses(traces, given)
+            experts = self._by_mean_losses(traces, values, given.get("tx_m"))
         else:
             values["free_db"], expert = self._by_networks(values, given)
             if LINK_NETWORK in self._networks:
@@ -454,18 +409,17 @@ class DifferentiableLinks:
         under = [{"gain_db": trace.gain_db, "link_state": trace.link_state} for trace in traces]
         return [predicted(values | own, expert, ops=ops) for own, expert in zip(under, experts, strict=True)]
 
-    def _by_mean_losses(self, traces: Sequence[WallTrace], given: Mapping[str, Any]) -> list[Parts]:
-        ops, scene, rx_m, tx_m = import_keras().ops, self._scene, self._paths.rx_m, given.get("tx_m")
-        ends_m = [tf.broadcast_to(self.base.tx_m if tx_m is None else tx_m, rx_m.shape), tf.constant(rx_m)]
-        moved = self._moved_features(tx_m, self._phi.gain_db)
-        lengths_m = (tf.convert_to_tensor(moved[name]) for name in ("unobserved_distance_m", "distance_m"))
-        walls = scene._walls.counts(DirectLines._make([*ends_m, *lengths_m, traces[0].known]), ops)
+    def _by_mean_losses(self, traces: Sequence[WallTrace], values: Mapping[str, Any], tx_m: Any) -> list[Parts]:
+        ops, scene = import_keras().ops, self._scene
+        lengths_m = (tf.convert_to_tensor(values[name]) for name in ("unobserved_distance_m", "distance_m"))
+        lines = DirectLines._make([*self._moved.ends_m(tx_m), *lengths_m, traces[0].known])
+        walls = scene._walls.counts(lines, ops)
         return [by_mean_losses(trace, walls, scene.simulation.trace_settings.max_walls, ops) for trace in traces]
 
     def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:
         """Return the free-space gain (N,) [dB], and the distribution of the networks."""
         ops, networks = import_keras().ops, self._networks
-        tx_m, frequency_hz = given.get("tx_m"), self._scene.predictor.settings.frequency_hz
+        frequency_hz = self._scene.predictor.settings.frequency_hz
         carrier_hz = given.get("frequency_hz", tf.constant(self.base.frequency_hz))
         shift_db = 20.0 / math.log(10.0) * tf.math.log(carrier_hz / frequency_hz)
         free_db = free_space_gain_db(values["distance_m"], frequency_hz, ops) - shift_db
@@ -475,180 +429,12 @@ class DifferentiableLinks:
         inputs, of_map = tf.cast(link_inputs(values, frequency_hz, shift_db, ops), tf.float32), None
         if MAP_NETWORK in networks:
             space = MapSpace.of(self._scene.partial)
-            ends_m = self.base.tx_m if tx_m is None else tx_m, self._paths.rx_m
-            ends_m = tuple(tf.broadcast_to(end_m, self._paths.rx_m.shape) for end_m in ends_m)
+            ends_m = self._moved.ends_m(given.get("tx_m"))
             of_map = read_features(space, image_features(networks, space.image, ops), *ends_m, ops)
         outputs = tf.cast(link_outputs(networks, inputs, of_map, ops), tf.float64)
         return free_db, expert_parts(outputs, free_db, context_of(self._phi).possible, ops)
-
-    def _moved_features(self, tx_m: Any, gain_db: Any) -> dict[str, Any]:
-        """Return the features that depend on transmitter position (None: as traced) and gain alone."""
-        phi, rx_m = self._phi, tf.constant(self._paths.rx_m)
-        numeric = feature_values(phi) | {"gain_db": gain_db}
-        if tx_m is None:
-            return numeric
-        scene, ends = self._scene, (tf.broadcast_to(tx_m, rx_m.shape), rx_m)
-        distance_m = tf.sqrt(tf.maximum(tf.reduce_sum((rx_m - tx_m) ** 2, axis=1), _NEAREST_M**2))
-        unobserved_m = moved_lengths_m(partial(unobserved_lengths_m, scene.partial), ends)
-        ops, space, base_m = import_keras().ops, MapSpace.of(scene.partial), self.base.tx_m
-        exposed = space.exposure_at(tx_m[None], ops) - space.exposure_at(base_m[None])
-        noise = by_differences(lambda at: scene.partial.noise_near(at["tx_m"][None]), {"tx_m": tx_m})
-        return numeric | {
-            "exposure": numeric["exposure"] + exposed[:, None] * np.array([1.0, 0.0]),
-            "route": numeric["route"]
-            + (space.routes(tx_m, self._paths.rx_m, ops) - space.routes(base_m, self._paths.rx_m)),
-            "wall_noise": numeric["wall_noise"] + 0.5 * (noise - scene.partial.noise_near(base_m[None])),
-            "distance_m": distance_m,
-            "unobserved_distance_m": tf.minimum(unobserved_m, distance_m),
-            "walled_m": moved_lengths_m(partial(walled_lengths_m, scene.partial), ends),
-        }
-
-    def _indirect_features(self, distance_m: Any, tx_m: Any, power: Any, vertices_m: Any) -> dict[str, Any]:
-        legs, context, indirect = self._legs, context_of(self._phi), self._paths.power[self._legs.paths]
-        unobserved_m = tf.constant(legs.unobserved_m)
-        if tx_m is not None:
-            unobserved_m = legs.moved_m(tx_m, vertices_m)
-        gains_db = []
-        for column, length_m in enumerate(ATTENUATION_LENGTHS_M):
-            first = attenuation(legs.unobserved_m, length_m)
-            kept = tf.exp(-unobserved_m / length_m) if length_m > 0.0 else first
-            of_paths = tf.gather(power, legs.paths) * kept, indirect * first
-            gains_db.append(self._changed_db(context.indirect_gain_db[:, column], *of_paths, legs.rx))
-        strongest_m = context.strongest_unobserved_m
-        grown_m = unobserved_m - legs.unobserved_m
-        if len(legs.paths):
-            grown_m = tf.gather(grown_m, np.maximum(legs.strongest, 0))
-            strongest_m = strongest_m + tf.where(legs.strongest >= 0, grown_m, distance_m - self._phi.distance_m)
-        return {"indirect_gain_db": tf.stack(gains_db, axis=1), "strongest_unobserved_m": strongest_m}
-
-
-class _Legs:
-    """The straight legs of the Q indirect paths, and their lengths in unknown cells.
-
-    `strongest` (N,) is the strongest path to each receiver, -1 for none. Legs join nodes in this order: transmitter,
-    receivers, vertices path by path.
-    """
-
-    def __init__(self, on_map: PartialMap, paths: PathSet) -> None:
-        self.paths = np.flatnonzero(~paths.is_direct)
-        self.rx = paths.path_rx[self.paths]
-        self._rx_m = paths.rx_m
-        interacts, vertices_m = paths.interactions[self.paths] > 0, paths.vertices_m[self.paths]
-        nodes_m = np.concatenate([paths.base.tx_m[None], paths.rx_m, vertices_m.reshape(-1, 3)])
-        first = np.zeros((len(self.rx), 1), dtype=np.intp)
-        numbers = 1 + len(paths.rx_m) + np.arange(interacts.size).reshape(interacts.shape)
-        exists = np.pad(interacts, ((0, 0), (1, 1)), constant_values=True)
-        of_path, nodes = np.nonzero(exists)[0], np.hstack([first, numbers, 1 + self.rx[:, None]])[exists]
-        same = of_path[:-1] == of_path[1:]
-        self._of_path, self._start, self._end = of_path[:-1][same], nodes[:-1][same], nodes[1:][same]
-        self._lengths_m = partial(unobserved_lengths_m, on_map)
-        exact_m = self._lengths_m(nodes_m[self._start], nodes_m[self._end])
-        self.unobserved_m = np.bincount(self._of_path, weights=exact_m, minlength=len(self.rx)).astype(np.float64)
-        self.strongest = np.full(len(paths.rx_m), -1)
-        weakest_first = np.argsort(paths.power[self.paths], kind="stable")
-        self.strongest[self.rx[weakest_first]] = weakest_first
-
-    def moved_m(self, tx_m: Any, vertices_m: Any) -> Any:
-        """Return the lengths (Q,) [m] for a transmitter at `tx_m` and vertices (P, D, 3) [m]."""
-        vertices_m = tf.reshape(tf.gather(vertices_m, self.paths), (-1, 3))
-        nodes_m = tf.concat([tx_m[None], self._rx_m, vertices_m], axis=0)
-        ends = tf.gather(nodes_m, self._start), tf.gather(nodes_m, self._end)
-        moved_m = moved_lengths_m(self._lengths_m, ends)
-        return tf.math.unsorted_segment_sum(moved_m, self._of_path, len(self.rx))
 
 
 def _doubled(network: Any) -> Any:
     """Return a network that takes and returns double precision."""
     return lambda inputs: tf.cast(network(tf.cast(inputs, tf.float32)), tf.float64)
-
-
-def _gain_db(power: Any) -> Any:
-    """Return the gain (N,) of a power, at least -150 dB, where its derivative is 0."""
-    return 10.0 / math.log(10.0) * tf.math.log(tf.maximum(power, 10.0 ** (GAIN_FLOOR_DB / 10.0)))
-
-
-def moved_paths(paths: PathSet, given: Mapping[str, Any]) -> tuple[Any, Any]:
-    """Return power (P,) and vertices (P, D, 3), 0 where there are none."""
-
-    @tf.custom_gradient
-    def evaluate(*tensors: Any) -> tuple[tuple[Any, Any], Callable[..., list[Any]]]:
-        values = {name: tensor.numpy() for name, tensor in zip(given, tensors, strict=True)}
-        parameters = replace(paths.base, **values)
-
-        @cache
-        def slopes() -> dict[str, Floats]:
-            constants = [name for name in given if name != "tx_m"]
-            found = paths.slopes(parameters, constants) if constants else {}
-            if "tx_m" in given:
-                found["tx_m"], of_vertices = paths.transmitter_slopes(parameters)
-                found["vertices_m"] = of_vertices.reshape(-1, 3)
-            return found
-
-        def pull_back(of_power: Any, of_vertices: Any) -> list[Any]:
-            found = {name: _pulled(slopes()[name], of_power) for name in given}
-            if "tx_m" in given:
-                found["tx_m"] += _pulled(slopes()["vertices_m"], tf.reshape(of_vertices, [-1]))
-            return [_once_only(tf.reshape(found[name], values[name].shape)) for name in given]
-
-        power, vertices_m = paths.at(parameters)
-        return (tf.constant(power), tf.constant(np.nan_to_num(vertices_m))), pull_back
-
-    if not given:
-        return tf.constant(paths.power), tf.constant(np.nan_to_num(paths.vertices_m))
-    return evaluate(*given.values())
-
-
-def by_differences(function: Callable[[dict[str, Floats]], Floats], given: Mapping[str, Any]) -> Any:
-    """Return a NumPy function (K,) of a few tensors, with derivatives by central differences."""
-
-    @tf.custom_gradient
-    def evaluate(*tensors: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
-        values = {name: tensor.numpy() for name, tensor in zip(given, tensors, strict=True)}
-
-        def slope(name: str, entry: int, upstream: Floats) -> float:
-            value, step = values[name], np.zeros(values[name].size)
-            step[entry] = _RELATIVE_STEP * max(abs(value.ravel()[entry]), _RELATIVE_STEP)
-            ends = [function(values | {name: value + way * step.reshape(value.shape)}) for way in (1, -1)]
-            return float((ends[0] - ends[1]) @ upstream) / (2.0 * step[entry])
-
-        def pull_back(upstream: Any) -> list[Any]:
-            pulled = []
-            for name, value in values.items():
-                slopes = [slope(name, entry, upstream.numpy()) for entry in range(value.size)]
-                pulled.append(_once_only(tf.constant(slopes, tf.float64, value.shape)))
-            return pulled
-
-        return tf.constant(function(values)), pull_back
-
-    return evaluate(*given.values()) if given else tf.constant(function({}))
-
-
-def _pulled(slopes: Floats, upstream: Any) -> Any:
-    """Sum (K,) slopes (P, K) times upstream derivatives (P,), in an order independent of threads."""
-    rows = tf.convert_to_tensor(upstream)[:, None] * slopes
-    return tf.math.unsorted_segment_sum(rows, np.zeros(len(slopes), dtype=np.int32), 1)[0]
-
-
-def _once_only(slopes: Any) -> Any:
-    """Refuse second derivatives: a part would be missing."""
-    return tf.raw_ops.PreventGradient(input=slopes, message="links have first derivatives only.")
-
-
-def moved_lengths_m(lengths_m: Callable[[Floats, Floats], Floats], ends_m: tuple[Any, Any]) -> Any:
-    """Return lengths (N,) [m] of segments between two tensors (N, 3) [m], with derivatives by differences."""
-
-    @tf.custom_gradient
-    def evaluate(*tensors: Any) -> tuple[Any, Callable[[Any], list[Any]]]:
-        ends = np.stack([tensor.numpy() for tensor in tensors])
-
-        def pull_back(upstream: Any) -> list[Any]:
-            slopes = np.zeros(ends.shape)
-            for end, axis in np.ndindex(len(ends), ends.shape[2]):
-                step = np.zeros((len(ends), 1, ends.shape[2]))
-                step[end, 0, axis] = _LENGTH_STEP_M
-                slopes[end, :, axis] = (lengths_m(*(ends + step)) - lengths_m(*(ends - step))) / (2.0 * _LENGTH_STEP_M)
-            return [_once_only(upstream[:, None] * slope) for slope in np.clip(slopes, -_STEEPEST, _STEEPEST)]
-
-        return tf.constant(lengths_m(*ends)), pull_back
-
-    return evaluate(*ends_m)

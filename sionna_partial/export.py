@@ -11,6 +11,7 @@ import xarray as xr
 import yaml
 from numpy.typing import ArrayLike
 
+import sionna_partial.coverage.radio  # noqa: F401 - registers coverage.radio
 from sionna_partial.arrays import Floats
 from sionna_partial.constants import COST_THRESHOLD_DB, MAX_COST, NO_RECEIVER, CellState
 from sionna_partial.coverage.dataset import (
@@ -26,7 +27,7 @@ from sionna_partial.errors import OutputError, SettingsError
 from sionna_partial.files import atomic_write, output_path, read_bytes, require_plain_hdf5, write_netcdf
 from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.ros_map import ros_sheet, write_ros_files
+from sionna_partial.maps.ros_map_writer import ros_sheet, write_ros_files
 from sionna_partial.plots.coverage_plot import plot_coverage, plot_network
 from sionna_partial.plots.coverage_viewer import coverage_page
 from sionna_partial.plots.style import figure_png

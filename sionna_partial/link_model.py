@@ -19,23 +19,18 @@ from sionna_partial.checks import Progress, no_progress, require, shown
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import part_of
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths, path_unobserved_m
-from sionna_partial.prediction.map_networks import feature_values
+from sionna_partial.prediction.features import LinkFeatures, context_of, features_of_paths
+from sionna_partial.prediction.map_networks import feature_values, rule_values
 from sionna_partial.prediction.path_model import AntennaLinks
-from sionna_partial.prediction.predictor import (
-    AnyPredictor,
-    LinkPrediction,
-    MeanLosses,
-    OtherPredictor,
-    Predictor,
-    warm_predictor,
-)
-from sionna_partial.prediction.rule import doubt
+from sionna_partial.prediction.predictor import AnyPredictor, MeanLosses, OtherPredictor, Predictor, warm_predictor
+from sionna_partial.prediction.rule import LinkPrediction, doubt, predicted
+from sionna_partial.prediction.unobserved import path_unobserved_m
 from sionna_partial.prediction.wall_materials import RESIDUAL_DB, WallMaterials
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.paths import SolvedPaths
-from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
+from sionna_partial.tracing.positions import checked_positions
+from sionna_partial.tracing.simulation import Simulation, simulation_of
 
 KEPT_BLOCKS = 8
 """Number of cached blocks of links."""
@@ -204,9 +199,9 @@ class LinkModel:
     def predict_each(
         self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress
     ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
-        """Return features and predictions of links, and whether each is complete.
+        """Return features and predictions of links, and a mask of links whose trace is the truth (on complete maps).
 
-        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m].
+        `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m]; links are in this order.
         """
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
@@ -257,7 +252,8 @@ class LinkModel:
             return [self.predictor.predict(traced)] * len(features)
         else:
             experts = [self.predictor.predict(traced)] * len(features)
-        return [expert.by_rule(phi) for expert, phi in zip(experts, features, strict=True)]
+        of_links = zip(map(rule_values, features), experts, strict=True)
+        return [LinkPrediction.of_parts(*predicted(values, expert.by_state)) for values, expert in of_links]
 
     @property
     def wall_materials(self) -> WallMaterials:

@@ -1,4 +1,4 @@
-"""Loads the LLVM library of Dr.Jit before Dr.Jit and TensorFlow meet.
+"""Loads the LLVM library of Dr.Jit before Dr.Jit and TensorFlow meet, and Sionna RT after it.
 
 Dr.Jit accepts LLVM 15 and 16, which abort the process in path solving, and TensorFlow exports LLVM symbols that would
 replace its symbols. So pip's library is loaded when `sionna_partial` is imported, with its own symbols first, and
@@ -14,9 +14,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from types import ModuleType
 from typing import Final
 
 from sionna_partial.errors import BackendError
+from sionna_partial.process import signals_held
 
 PATH_VARIABLE: Final = "DRJIT_LIBLLVM_PATH"
 """Environment variable with the path of Dr.Jit's LLVM library."""
@@ -26,6 +28,8 @@ PIP_PACKAGE = "karellen-llvm-core"
 
 OLDEST_MAJOR = 17
 """Oldest LLVM that compiles path kernels: 15 and 16 abort with "Cannot select"."""
+
+MITSUBA_VARIANT = "llvm_ad_mono_polarized"
 
 _RUNTIME_LIBRARIES = ("libunwind.so.1", "libc++abi.so.1", "libc++.so.1")
 _INSTALL = f"""run pip install "{PIP_PACKAGE}>=19.1.7,<24\""""
@@ -72,6 +76,25 @@ def load_llvm() -> LlvmLibrary:
     except OSError as error:
         raise BackendError("the working directory was deleted: change to one that is there (cd).") from error
     return library
+
+
+def load_sionna() -> ModuleType:
+    """Import Sionna RT with a working LLVM, or raise a BackendError with the remedy."""
+    load_llvm()
+    with signals_held():
+        import mitsuba as mi
+
+        if mi.variant() is None:
+            mi.set_variant(MITSUBA_VARIANT)
+    if mi.variant() != MITSUBA_VARIANT:
+        raise BackendError(
+            f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
+            "before the first trace, or import sionna_partial in a process of its own."
+        )
+    with signals_held():
+        import sionna.rt
+
+    return sionna.rt
 
 
 @functools.cache

@@ -3,18 +3,11 @@
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Annotated, Any, Literal, ParamSpec, TypeVar, get_args
 
-from sionna_partial.checks import Checked, Within, are_stages, plain, require, require_choice, require_number, shown
-from sionna_partial.constants import (
-    CARRIER_FREQUENCY_HZ,
-    DEFAULT_HEIGHT_M,
-    DRYWALL_CONDUCTIVITY_EXPONENT,
-    DRYWALL_CONDUCTIVITY_S_M,
-    DRYWALL_PERMITTIVITY,
-    WALL_THICKNESS_M,
-)
+from sionna_partial.checks import Checked, Within, require, require_choice, require_number, shown
+from sionna_partial.constants import CARRIER_FREQUENCY_HZ, DEFAULT_HEIGHT_M, WALL_THICKNESS_M
 from sionna_partial.errors import ArgumentError
 
 ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
@@ -40,7 +33,6 @@ ITU_BANDS_GHZ: dict[str, tuple[tuple[float, float], ...]] = {
 }
 """Frequency bands of the ITU-R P.2040-3 materials in Sionna RT [GHz]."""
 
-
 FREQUENCIES_HZ = (1e6, 1e12)
 
 POWER_TOLERANCE_DB = 0.1
@@ -60,12 +52,10 @@ NetworkKind = Literal["paper", "paths", "map"]
 Objective = Literal["coverage", "percentile"]
 
 Fusion = Literal["slam_toolbox", "gmapping", "cartographer", "vacuum"]
-
 Policy = Literal["random", "coverage"]
 
 Frequency = Annotated[float, Within(*FREQUENCIES_HZ)]
 Fraction = Annotated[float, Within(0.0, 1.0)]
-Height = Annotated[float, Within(0.0, 1000.0, open_low=True)]
 Seed = Annotated[int, Within(0, 2**31 - 1)]
 Count = Annotated[int, Within(1, 1_000_000)]
 
@@ -77,8 +67,8 @@ _Result = TypeVar("_Result")
 class Material(Checked):
     """Radio material of walls, floor and ceiling.
 
-    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default is the paper's drywall at 28 GHz,
-    at every frequency; ``Material.named("drywall")`` loses 10 dB less at 5 GHz.
+    Either an ITU-R P.2040-3 material, by its `itu` name, or a custom one. The default is the paper's layered
+    drywall at 28 GHz (of Wireless InSite), at every frequency; ``Material.named("drywall")`` loses 10 dB less at 5 GHz.
 
     Parameters
     ----------
@@ -107,8 +97,8 @@ class Material(Checked):
     4.0
     """
 
-    relative_permittivity: Annotated[float, Within(1.0, 1e6)] = DRYWALL_PERMITTIVITY
-    conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = DRYWALL_CONDUCTIVITY_S_M
+    relative_permittivity: Annotated[float, Within(1.0, 1e6)] = 2.94
+    conductivity_s_m: Annotated[float, Within(0.0, 1e9)] = 0.1226
     thickness_m: Annotated[float, Within(0.0, 10.0, open_low=True)] = WALL_THICKNESS_M
     itu: str | None = None
     conductivity_exponent: Annotated[float, Within(0.0, 2.0)] = 0.0
@@ -128,6 +118,11 @@ class Material(Checked):
         """Return a wall material with its usual thickness.
 
         Names are the keys of `WALL_MATERIALS`, and other materials of ITU-R P.2040-3 (10 cm). Sources: `docs/walls.md`.
+
+        Raises
+        ------
+        SettingsError
+            For another name; the message lists the names.
 
         Examples
         --------
@@ -151,7 +146,7 @@ class Material(Checked):
 
 
 WALL_MATERIALS = {
-    "drywall": Material(conductivity_exponent=DRYWALL_CONDUCTIVITY_EXPONENT),
+    "drywall": Material(conductivity_exponent=0.9395),  # as plasterboard, ITU-R P.2040-3, table 3
     "brick": Material(itu="brick", thickness_m=0.11),
     "concrete": Material(itu="concrete", thickness_m=0.2),
     "reinforced concrete": Material(itu="concrete", thickness_m=0.25),
@@ -343,98 +338,9 @@ class SensorSettings(Checked):
 
     @property
     def is_exact(self) -> bool:
-        """Return whether it makes no errors."""
+        """Return whether the sensor makes no errors."""
         errors = (self.range_noise_m, self.drift_m_per_m, self.heading_noise_deg)
         return not any((*errors, self.missed_wall_fraction, self.missed_return_fraction))
-
-
-SHORT_LINK_M = 25.0
-"""Largest horizontal length of a short link [m]."""
-
-MIXED_SENSORS = {
-    "range_m": (3.0, 30.0),
-    "field_of_view_deg": (60.0, 120.0),
-    "range_noise_m": (0.0, 0.05),
-    "drift_m_per_m": (0.0, 0.02),
-    "missed_wall_fraction": (0.0, 0.1),
-    "heading_noise_deg": (0.0, 0.5),
-    "missed_return_fraction": (0.0, 0.1),
-}
-"""Ranges of the sensors for `sensor="mixed"`: uniform logarithm of the range, field of view and mapper; squares of
-uniform numbers for errors.
-"""
-
-
-@dataclass(frozen=True)
-class DatasetSettings(Checked):
-    """Selection of the links of each home in a data set.
-
-    Parameters
-    ----------
-    links_per_home : int
-        Number of links at each stage with receivers in free cells of the complete home, at least
-        `transmitters_per_home`; as many more have receivers anywhere in the map area.
-    transmitters_per_home : int
-        Number of transmitters in free cells of the complete home.
-    stages : tuple of int, or of float
-        Increasing exploration steps; or, in [0, 1], observed fractions of the home's free area. At 1, the robot drove
-        to the end, and unknown cells that touch free ones are walls: the map is complete, with the robot's errors.
-    seed : int
-        Seed of positions and robot, combined with the home's name.
-    tx_height_m, rx_height_m : float
-        Heights [m].
-    margin_m : float
-        Margin of the map area around the known cells of the complete home [m].
-    sensor : SensorSettings or "mixed"
-        Sensor of the robot; "mixed" draws one for each home from `MIXED_SENSORS`: a camera for one home in three, else
-        a turning lidar.
-    short_link_fraction : float
-        Fraction of receivers drawn within `SHORT_LINK_M` of their transmitter [1]. In large buildings, most other links
-        are in outage.
-    scene : SceneSettings
-        Conversion of maps to scenes; drywall without a material.
-    trace : TraceSettings
-    cir_paths : int
-        Number of paths in the impulse responses of the complete map, the strongest of each link; 0 stores none.
-
-    Raises
-    ------
-    SettingsError
-        For a value out of range.
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> settings = sp.lab.DatasetSettings(links_per_home=100, stages=(0, 0.25, 0.5), sensor="mixed")
-    >>> settings.trace.frequency_hz
-    28000000000.0
-    """
-
-    links_per_home: Count = 400
-    transmitters_per_home: Annotated[int, Within(1, 1000)] = 4
-    stages: tuple[int, ...] | tuple[float, ...] = (0, 50, 100, 150, 200)
-    seed: Seed = 0
-    tx_height_m: Height = DEFAULT_HEIGHT_M
-    rx_height_m: Height = DEFAULT_HEIGHT_M
-    margin_m: Annotated[float, Within(0.0, 1000.0)] = 3.0
-    sensor: SensorSettings | Literal["mixed"] = field(default_factory=SensorSettings)
-    short_link_fraction: Fraction = 0.0
-    scene: SceneSettings = field(default_factory=SceneSettings)
-    trace: TraceSettings = field(default_factory=TraceSettings)
-    cir_paths: Annotated[int, Within(0, 1000)] = 0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        enough = self.links_per_home >= self.transmitters_per_home
-        remedy = f"give at least {self.transmitters_per_home}, one for each of the transmitters_per_home."
-        require(enough, "links_per_home", self.links_per_home, remedy)
-        remedy = "give increasing whole numbers of 0 or more, such as (0, 50, 100, 150, 200), or fractions in [0, 1]."
-        require(isinstance(self.stages, tuple) and are_stages(self.stages), "stages", self.stages, remedy)
-        object.__setattr__(self, "stages", tuple(map(plain, self.stages)))
-        mixed = isinstance(self.sensor, str) and self.sensor == "mixed"
-        remedy = "give SensorSettings(...), or 'mixed'."
-        require(mixed or isinstance(self.sensor, SensorSettings), "sensor", self.sensor, remedy)
-        self.scene.traced_material.require_frequency(self.trace.frequency_hz)
 
 
 @dataclass(frozen=True)

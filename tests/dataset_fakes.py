@@ -15,9 +15,9 @@ from types import SimpleNamespace
 import numpy as np
 from link_tables import make_table
 
-from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.settings import DatasetSettings
+from sionna_partial.lab.datasets.table import LinkTable
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import DatasetSettings
 
 KILLS, HANGS, RAISES, KILLS_ONCE, UNWRITABLE = 666, 667, 668, 669, 670
 """Seeds of homes that end their process, never end, raise, end their process at the first try, and find a full disk."""
@@ -34,17 +34,17 @@ def processes_make_fakes(folder: Path) -> str:
 
 
 _CODE = """
-if "home_links import serve" in " ".join(sys.orig_argv):
+if "home_processes import serve" in " ".join(sys.orig_argv):
     import dataset_fakes
     dataset_fakes.install()
 """
 
 
 def install() -> None:
-    from sionna_partial.lab.datasets import home_links
+    from sionna_partial.lab.datasets import home_links, home_processes
 
     home_links.make_home = make_home  # type: ignore[assignment]
-    home_links.home_links = fake_links  # type: ignore[assignment]
+    home_processes.home_links = fake_links  # type: ignore[assignment]
 
 
 def make_home(seed: int, kind: str | None = None) -> SimpleNamespace:

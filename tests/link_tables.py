@@ -6,8 +6,9 @@ import json
 import numpy as np
 from predictor_links import corridor_of, corridors, make_context, make_links, quick_predictor
 
-from sionna_partial.lab.datasets.shards import COLUMNS, INDEX_FILE, LinkTable, shard_path, write_shard
-from sionna_partial.lab.evaluation import Baselines, Majority
+from sionna_partial.lab.baselines import Baselines, Majority
+from sionna_partial.lab.datasets.shards import INDEX_FILE, shard_path, write_shard
+from sionna_partial.lab.datasets.table import COLUMNS, LinkTable
 
 
 def make_table(homes=4, links=300, stages=(0, 100), seed=0):

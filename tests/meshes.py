@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.files import temporary_folder
-from sionna_partial.maps.environment import SceneMesh, merged_mesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh, merged_mesh
 
 OBSERVED = [(0.0, 0.0), (5.0, 0.0), (5.0, 4.0), (0.0, 4.0)]
 """Floor of the room."""

@@ -11,7 +11,7 @@ import pytest
 
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction import map_networks
+from sionna_partial.prediction import map_training
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
 from sionna_partial.prediction.paper_networks import free_space_gain_db
 from sionna_partial.prediction.predictor import Predictor
@@ -169,8 +169,8 @@ def quick_predictor():
 def shallow_map_networks() -> Iterator[None]:
     """Let map networks have few layers, and see few maps at once: TensorFlow traces each layer of a training."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(map_networks, "_WIDTHS", (4, 8))
-        patch.setattr(map_networks, "MAPS_AT_ONCE", 4)
+        patch.setattr(map_training, "_WIDTHS", (4, 8))
+        patch.setattr(map_training, "MAPS_AT_ONCE", 4)
         yield
 
 

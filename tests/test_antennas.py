@@ -13,8 +13,8 @@ from typer.testing import CliRunner
 import sionna_partial as sp
 from sionna_partial.cli.app import app
 from sionna_partial.errors import SettingsError
-from sionna_partial.scene.scene import export_scene
-from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.llvm import load_sionna
+from sionna_partial.scene.export import export_scene
 from sionna_partial.tracing.power import gain_at_azimuth, gain_between, gain_towards
 
 TX, DEPTH = (1.03, 2.93, 1.4), 2

@@ -45,7 +45,7 @@ from sionna_partial.apps.app.session import Session
 from sionna_partial.errors import MapError, PositionError, SettingsError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.plots.coverage_plot import plot_report
+from sionna_partial.plots.report import plot_report
 
 ROOM = np.pad(np.zeros((30, 40), int), 1, constant_values=1)
 ROOM[1:20, 20] = 1
@@ -423,9 +423,9 @@ def test_the_page_shows_answers_and_takes_values(window: Window) -> None:
     assert page.links.text.count("<a ") == len(FILES)
     session.radios.put([("", 1.0, 1.0)])
     page.show()
-    page.fields["x_m"].set_from_json("value_throttled", 3.0)
-    page.pattern.value = "tr38901"
-    page.aims["azimuth_deg"].set_from_json("value_throttled", 90.0)
+    page.transmitters.fields["x_m"].set_from_json("value_throttled", 3.0)
+    page.transmitters.pattern.value = "tr38901"
+    page.transmitters.aims["azimuth_deg"].set_from_json("value_throttled", 90.0)
     changed = Transmitter(3.0, 1.0, antenna=sp.Antenna("tr38901", azimuth_deg=90.0))
     assert session.transmitters == {"tx1": changed}
     session.jobs.close()

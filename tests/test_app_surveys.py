@@ -17,10 +17,11 @@ from test_app import PARTIAL, Window, open_plan
 import sionna_partial as sp
 from sionna_partial.apps.app import answer as answer_module
 from sionna_partial.apps.app.answer import measured_powers_dbm
+from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.apps.app.server import _take_upload
 from sionna_partial.errors import SettingsError
 from sionna_partial.files import unzipped
-from sionna_partial.plots.coverage_plot import plot_report
+from sionna_partial.plots.report import plot_report
 
 BOTH = "x,y,bssid,ssid,rssi\n" + "".join(
     f"{x_m},{y_m},{bssid},home,{rssi}\n"
@@ -78,6 +79,37 @@ class TestSurveys:
         window.session.surveys.learn(b"x,y,ssid,rssi\n1.5,2.0,attic,-40\n3.0,2.5,cellar,-50\n", "survey.csv")
         window.settle()
         assert window.session.measured.tx.tolist() == [[3.0, 1.0, 1.5]]
+
+    def test_transmitters_of_the_survey_are_added(self, window: Window) -> None:
+        session, head = window.session, "ap,tx_x,tx_y,tx_z,x,y,rssi\n"
+        rows = ("Attic,1.2,1.0,1.5,1.5,2.0,-40\n", "02:0a,1.0,2.5,2.0,3.0,2.5,-50\n", "02:0a,1.0,2.5,2.0,3.0,2.0,-51\n")
+        session.surveys.learn((head + "".join(rows)).encode())
+        assert window.settle() == "Ready."
+        assert session.positions_m == {"tx1": (1.0, 1.0, 1.5), "tx2": (3.0, 1.0, 1.5), "tx3": (1.0, 2.5, 2.0)}
+        assert session.measured_names() == ["tx1", "tx3", "tx3"]
+        assert session.warnings == ["Transmitters of the survey are added: tx3."]
+        session.surveys.learn((head + rows[0]).encode())
+        for name in ("tx1", "tx2", "tx3"):
+            session.radios.remove(name)
+        session.surveys.learn((head + "".join(rows)).encode())
+        assert window.settle() == "Ready."
+        assert [*session.transmitters] == ["tx1", "Attic"]  # the most measured one first
+        session.surveys.learn((head + "ap,9.0,9.0,1.5,1.5,2.0,-40\n").encode())
+        assert "none within 0.5 m" in window.settle()
+        assert session.jobs.status.is_error
+        assert len(session.measured) == 3
+        many = [f"a{at},{1.0 + 0.6 * (at % 5)},{0.7 + 0.6 * (at // 5)},1.5,1.5,2.9,-40\n" for at in range(15)]
+        session.surveys.learn((head + "".join(many)).encode())
+        window.settle()
+        assert len(session.transmitters) == MOST_TRANSMITTERS
+        assert any("are not added" in each for each in session.warnings)
+
+    def test_powers_without_any_transmitter(self) -> None:
+        window = Window()
+        window.session.maps.open_map(PARTIAL, "room.yaml")
+        window.session.surveys.learn(b"x,y,rssi\n1.5,2.0,-40\n")
+        assert "there is no transmitter yet" in window.settle()
+        window.session.jobs.close()
 
     def test_powers_at_pixels_of_the_plan(self, window: Window) -> None:
         session = window.session

@@ -14,9 +14,9 @@ import pytest
 from rosbag_files import KINDS, START_S, Messages, messages_of, write_bag
 
 from sionna_partial.errors import MapError, MeasurementError
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.importers.bags import map_from_bag, map_from_occupancy
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.measurements.measurements import measurements_of
 from sionna_partial.measurements.recordings import load_survey, measurements_from_bag, poses_from_bag
 

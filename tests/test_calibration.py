@@ -14,8 +14,8 @@ import sionna_partial as sp
 from sionna_partial.calibration import material_fit
 from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.errors import MeasurementError, SionnaPartialError
-from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.scene_mesh import merged_mesh
 from sionna_partial.tracing.power import reflection_loss_db
 
 SETTINGS = sp.TraceSettings(max_depth=2)

@@ -5,12 +5,11 @@ import pytest
 from coverage_cases import shipped
 
 import sionna_partial as sp
-from sionna_partial.channels import dft_codebook, sample_channels
-from sionna_partial.channels.samples import ChannelSamples
+from sionna_partial.channels.samples import ChannelSamples, sample_channels
 from sionna_partial.errors import MemoryLimitError, SettingsError
 from sionna_partial.lab.training.paths import example, fit_path_model
 from sionna_partial.resources import scenes_folder
-from sionna_partial.tracing.antennas import planar_array
+from sionna_partial.tracing.antennas import dft_codebook, planar_array
 
 TX = (7.0, 9.8, 1.5)
 

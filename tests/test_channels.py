@@ -14,12 +14,13 @@ from test_trace import _room
 from traced import made_links
 
 import sionna_partial as sp
-from sionna_partial.channels import dft_codebook, load_channels, save_channels
+from sionna_partial.channels.files import load_channels, save_channels
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.errors import MemoryLimitError, OutputError, SettingsError
-from sionna_partial.scene.scene import export_scene
-from sionna_partial.tracing import responses
-from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.llvm import load_sionna
+from sionna_partial.scene.export import export_scene
+from sionna_partial.tracing import array_paths, responses
+from sionna_partial.tracing.antennas import dft_codebook
 from sionna_partial.tracing.interactions import DIFFRACTION
 
 TX = np.array([1.03, 2.93, 1.4])
@@ -255,15 +256,15 @@ class TestResponses:
             lambda: several.beam_gains(np.eye(4), **arrays).gain_db,
         )
         whole = [call().to_numpy() for call in calls]
-        monkeypatch.setattr(responses, "BLOCK_BYTES", 16 * 16 * 5)
+        monkeypatch.setattr(array_paths, "BLOCK_BYTES", 16 * 16 * 5)
         monkeypatch.setattr(responses, "WORK_BYTES", 1)
         for before, call in zip(whole, calls, strict=True):
             np.testing.assert_allclose(call().to_numpy(), before, rtol=1e-5, atol=1e-12)
 
     def test_memory_stays_within_the_limit(self, monkeypatch: pytest.MonkeyPatch) -> None:
         """Many taps, frequencies and pairs of antennas; blocks of a quarter of their size need no 0.05 GB."""
-        for name in ("BLOCK_BYTES", "WORK_BYTES"):
-            monkeypatch.setattr(responses, name, getattr(responses, name) // 4)
+        for module, name in ((array_paths, "BLOCK_BYTES"), (responses, "WORK_BYTES")):
+            monkeypatch.setattr(module, name, getattr(module, name) // 4)
         links, antennas = links_of(2), {"tx_array": array_of(16, 16), "rx_array": array_of(8, 16)}
         calls = (
             lambda: links.taps(1e8, 0, 125_000, memory_gb=0.05),

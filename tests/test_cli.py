@@ -23,15 +23,10 @@ import sionna_partial as sp
 from sionna_partial import __version__, cli
 from sionna_partial.cli.options import parse_frequency
 from sionna_partial.exploration.explore import explore
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.settings import (
-    DatasetSettings,
-    Material,
-    SceneSettings,
-    SensorSettings,
-    TraceSettings,
-)
+from sionna_partial.settings import Material, SceneSettings, SensorSettings, TraceSettings
 
 pytestmark = pytest.mark.usefixtures("command_line")
 

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 import sionna_partial as sp
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 
 REPORTS = Path(__file__).parent / "reports"
 WIDTH_M, DEPTH_M, HEIGHT_M, CELL_M = 8.0, 6.0, 2.7, 0.05

@@ -21,7 +21,7 @@ from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.tracing.trace import trace_links
 
 
 def predicted(partial, tx=TX, **options):

@@ -14,7 +14,9 @@ from sionna_partial.constants import LinkState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import mix_state_colours, plot_comparison, plot_coverage, plot_report
+from sionna_partial.plots.coverage_plot import plot_comparison, plot_coverage
+from sionna_partial.plots.layers import mix_state_colours
+from sionna_partial.plots.report import plot_report
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
 
 LOS, NLOS, OUTAGE = (

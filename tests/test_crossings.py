@@ -14,8 +14,8 @@ from meshes import meshed as mesh_of
 import sionna_partial as sp
 from sionna_partial.files import temporary_folder
 from sionna_partial.tracing.line import are_in_wall, is_free_between
+from sionna_partial.tracing.positions import clear_of_walls
 from sionna_partial.tracing.power import transmission_coefficients
-from sionna_partial.tracing.simulation import clear_of_walls
 from sionna_partial.tracing.walls import Interior
 
 BRICK = sp.Material(3.91, 0.031, 0.1)

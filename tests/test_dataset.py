@@ -23,18 +23,19 @@ from link_tables import assert_same
 
 from sionna_partial.errors import BackendError, MapError, OutputError, SettingsError
 from sionna_partial.files import locked_folder
-from sionna_partial.lab.datasets import dataset, home_links
+from sionna_partial.lab.datasets import dataset, home_processes
 from sionna_partial.lab.datasets.dataset import DatasetReport, build_dataset
-from sionna_partial.lab.datasets.home_links import HomeSource, HomeTask, run_home
+from sionna_partial.lab.datasets.home_links import HomeSource
+from sionna_partial.lab.datasets.home_processes import HomeTask, run_home
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import read_dataset, read_shard, shard_path, write_shard
-from sionna_partial.settings import DatasetSettings
 
 SETTINGS = DatasetSettings(links_per_home=5, transmitters_per_home=1, stages=(0, 50))
 SEEDS = range(8)
 NAMES = tuple(f"make_home({seed})" for seed in SEEDS)
 BUILD = """
 import sys
-from sionna_partial.settings import DatasetSettings
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.dataset import build_dataset
 build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=2)
 """
@@ -102,7 +103,7 @@ class TestBuild:
         index = json.loads((unbroken / "dataset.json").read_text())
         assert [home["name"] for home in index["homes"]] == [*NAMES]
         assert index["settings"]["stages"] == [0, 50]
-        assert index["versions"].keys() == set(home_links.PACKAGES)
+        assert index["versions"].keys() == set(home_processes.PACKAGES)
         assert sorted(path.name for path in unbroken.iterdir()) == [".lock", "dataset.json", "shards"]
         before = files(unbroken)
         report = build_dataset(unbroken, SEEDS, SETTINGS)
@@ -205,7 +206,7 @@ class TestRefused:
                 build_dataset(unbroken, homes, settings)
         with locked_folder(unbroken), pytest.raises(OutputError, match="is being written by another process: wait"):
             build_dataset(unbroken, SEEDS, SETTINGS)
-        versions = home_links.installed_versions() | {"sionna-rt": "9.9"}
+        versions = home_processes.installed_versions() | {"sionna-rt": "9.9"}
         monkeypatch.setattr(dataset, "installed_versions", lambda: versions)
         with pytest.raises(SettingsError, match=r'versions\.sionna-rt was ".*" when .* begun, and is "9\.9": take'):
             build_dataset(unbroken, SEEDS, SETTINGS)
@@ -250,14 +251,14 @@ def test_numbers_of_numpy_are_noted_as_numbers() -> None:
 
 
 def task(name: str, seed: int, folder: Path = Path("nowhere"), digest: str = "") -> HomeTask:
-    return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_links.installed_versions(), 4.0)
+    return HomeTask(str(folder), digest, HomeSource(name, seed), SETTINGS, home_processes.installed_versions(), 4.0)
 
 
 def test_worker_that_cannot_make_homes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "other").mkdir()
     (tmp_path / "dataset.json").write_text("{}")
     (tmp_path / "other" / "dataset.json").write_text("[]")
-    known = home_links.installed_versions()
+    known = home_processes.installed_versions()
     for folder, versions, message in (
         ("elsewhere", {}, "cannot read .*: give a folder on a file system that all workers share"),
         ("other", {}, "sees another "),
@@ -265,7 +266,7 @@ def test_worker_that_cannot_make_homes(tmp_path: Path, monkeypatch: pytest.Monke
     ):
         mine = task("make_home(1)", 1, tmp_path / folder, hashlib.sha256(b"{}").hexdigest())
         mine = replace(mine, versions=known)
-        monkeypatch.setattr(home_links, "installed_versions", lambda found=known | versions: found)
+        monkeypatch.setattr(home_processes, "installed_versions", lambda found=known | versions: found)
         result = run_home(mine)
         assert result.outcome == "unusable"
         assert re.search(message, result.error)

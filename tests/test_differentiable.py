@@ -12,8 +12,9 @@ from scipy import stats
 
 import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState
-from sionna_partial.differentiable import LinkDistribution, moved_lengths_m, moved_paths
+from sionna_partial.differentiable import LinkDistribution
 from sionna_partial.errors import SettingsError
+from sionna_partial.prediction.moved_links import moved_lengths_m, moved_paths
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.tracing.path_set import PARAMETERS, PathSet

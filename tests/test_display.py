@@ -16,7 +16,7 @@ from public_names import EVERY
 
 import sionna_partial as sp
 from sionna_partial import display, process
-from sionna_partial.apps.live.coverage import LiveSettings
+from sionna_partial.apps.live.incoming import LiveSettings
 from sionna_partial.display import LONGEST, THUMBNAIL_PX, counting, reporting
 from sionna_partial.errors import SettingsError
 from sionna_partial.process import njit

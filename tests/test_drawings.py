@@ -16,11 +16,12 @@ from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.importers import drawing_lines
-from sionna_partial.maps.importers.drawing_lines import skip_reason
 from sionna_partial.maps.importers.drawings import map_from_drawing
+from sionna_partial.maps.importers.wall_layers import skip_reason
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 

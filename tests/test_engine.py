@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
+from sionna_partial.llvm import MITSUBA_VARIANT
 from sionna_partial.scene.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
-from sionna_partial.tracing.engine import MITSUBA_VARIANT, SceneSolver, engine_fault
+from sionna_partial.tracing.engine import SceneSolver, engine_fault
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.edges import find_wedges
 

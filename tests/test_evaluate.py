@@ -8,19 +8,17 @@ from predictor_links import LOS, NLOS, OUTAGE, QUICK, QUIET, assert_valid, make_
 
 from sionna_partial.constants import LinkState
 from sionna_partial.errors import PredictorError
-from sionna_partial.lab.evaluation import (
-    WITH_INDOOR,
-    WITHOUT_INDOOR,
+from sionna_partial.lab.baselines import (
     Baselines,
     Majority,
     baseline_predictions,
-    evaluate,
     indoor_gain_db,
     indoor_los_probability,
-    measure,
     nothing_seen,
     tr38901_indoor,
 )
+from sionna_partial.lab.evaluation import WITH_INDOOR, WITHOUT_INDOOR, evaluate
+from sionna_partial.lab.metrics import measure
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.resources import PREDICTORS_FOLDER

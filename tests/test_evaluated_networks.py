@@ -11,7 +11,7 @@ import pytest
 
 from sionna_partial.files import unzipped
 from sionna_partial.prediction.evaluate import Network
-from sionna_partial.prediction.map_networks import kernel_starts, u_net
+from sionna_partial.prediction.map_training import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import WEIGHTS_FILE
 from sionna_partial.resources import PREDICTORS_FOLDER

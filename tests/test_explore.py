@@ -12,6 +12,7 @@ from small_maps import HOUSE, VACUUM
 from sionna_partial.constants import CellState
 from sionna_partial.errors import SettingsError, SionnaPartialError
 from sionna_partial.exploration.explore import Exploration, explore, explore_trajectory
+from sionna_partial.maps.grid import cell_centres_m
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -207,8 +208,10 @@ class TestTrajectory:
 class TestSensor:
     def test_wall_noise_grows_with_range_noise(self, home):
         lidars = [SensorSettings(noise_m, field_of_view_deg=360.0, range_m=12.0) for noise_m in (0.0, 0.02, 0.05)]
-        found = [explore(home, (200,), 3, sensor=lidar)[0].wall_noise for lidar in lidars]
-        assert home.wall_noise == 0.0
+        maps = [home, *(explore(home, (200,), 3, sensor=lidar)[0] for lidar in lidars)]
+        free_m = [cell_centres_m(each, np.argwhere(each.state == CellState.FREE)) for each in maps]
+        exact, *found = (each.noise_near(at_m).mean() for each, at_m in zip(maps, free_m, strict=True))
+        assert exact == 0.0
         assert found[0] <= LEAST_NOISE < 0.5 < found[1] < found[2] - 0.02
 
     @pytest.mark.parametrize("fusion", get_args(Fusion))

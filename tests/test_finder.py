@@ -9,8 +9,8 @@ from test_trace import all_paths
 
 import sionna_partial as sp
 from sionna_partial.errors import SettingsError
-from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.tracing import simulation
 
 TX = np.array([1.03, 1.52, 1.4])

@@ -20,11 +20,13 @@ from sionna_partial.lab.datasets.home_links import (
     home_sources,
     map_area,
 )
-from sionna_partial.lab.datasets.shards import CIR, LinkTable, read_shard, write_shard
+from sionna_partial.lab.datasets.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings
+from sionna_partial.lab.datasets.shards import read_shard, write_shard
+from sionna_partial.lab.datasets.table import CIR, LinkTable
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
-from sionna_partial.settings import MIXED_SENSORS, SHORT_LINK_M, DatasetSettings, SensorSettings, TraceSettings
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.settings import SensorSettings, TraceSettings
+from sionna_partial.tracing.trace import trace_links
 from sionna_partial.worlds.homes import make_home
 
 SETTINGS = DatasetSettings(

@@ -45,8 +45,10 @@ ROOMS = {
     ),
     "maps": (
         *(
-            "mesh.cut",
             "environment",
+            "mesh.cut",
+            "mesh.scene_mesh",
+            "straight_runs",
             "wall_cells",
             "import_report",
             "grid",
@@ -55,15 +57,19 @@ ROOMS = {
             "mesh.upright",
             "mesh.files",
             "ros_map",
+            "ros_map_writer",
             "map_files",
         ),
     ),
-    "maps.importers": (*("drawing_lines", "drawings", "ifc_layers", "ifc", "bags", "vacuum", "points", "simulators"),),
+    "maps.importers": (
+        *("wall_layers", "drawing_units", "drawing_lines", "drawings", "pictures", "ifc_layers", "ifc"),
+        *("bags", "vacuum", "cloud_files", "points", "simulators"),
+    ),
     "worlds": ("buildings", "homes", "camera", "robot"),
-    "scene": ("outlines", "scene"),
+    "scene": ("outlines", "scene", "export"),
     "tracing": (
         *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls", "engine", "antennas"),
-        *("responses", "links"),
+        *("antenna_files", "array_paths", "responses", "links"),
         *(
             "plan.room",
             "plan.obstacles",
@@ -75,32 +81,48 @@ ROOMS = {
         ),
         *("plan.arrivals", "plan.joining", "plan.edges"),
         *("mesh.sequences", "mesh.reflections", "stock", "finder"),
-        *("path_set", "simulation", "gradients"),
+        *("path_set", "positions", "simulation", "trace", "gradients"),
     ),
     "prediction": (
         *("evaluate", "unobserved", "space", "features", "rule"),
-        *("paper_networks", "map_networks", "predictor_files", "unseen_walls", "predictor", "path_model"),
-        "wall_materials",
+        *("paper_networks", "map_networks", "map_training", "predictor_files", "unseen_walls", "predictor"),
+        *("path_model", "wall_materials", "moved_links"),
     ),
-    "measurements": ("surveys", "measurements", "recordings", "walks", "evidence", "assimilation", "localisation"),
-    "coverage": ("coverage.link_budget", "coverage.dataset", "link_model", "coverage.job"),
-    "channels": ("files", "joint", "samples"),
+    "measurements": (
+        *("surveys", "measurements", "selection", "recordings", "walks", "kinds", "evidence", "assimilation"),
+        "localisation",
+    ),
+    "coverage": (
+        "coverage.link_budget",
+        "coverage.dataset",
+        "coverage.radio",
+        "link_model",
+        "coverage.grid",
+        "coverage.job",
+    ),
+    "channels": ("files", "joint", "draws", "samples"),
     "networks": ("coverage.network",),
     "differentiable": ("differentiable",),
-    "calibration": ("material_fit", "calibration"),
-    "placement": ("placement", "several"),
+    "calibration": ("link_paths", "material_fit", "calibration"),
+    "placement": ("area", "placement", "several"),
     "exploration": ("next_views", "explore"),
     "lab": (
-        *("datasets.shards", "datasets.home_links", "datasets.dataset", "evaluation"),
+        *("datasets.settings", "datasets.table", "datasets.shards", "datasets.traces"),
+        *("datasets.home_links", "datasets.home_processes"),
+        *("datasets.dataset", "metrics", "baselines", "evaluation"),
         *("training.predictor", "training.paths", "training.walls"),
     ),
-    "plots": ("style", "logo", "coverage_plot", "coverage_viewer", "exploration_plot", "result_plots"),
+    "plots": (
+        *("style", "logo", "layers", "panel", "coverage_plot", "report", "coverage_viewer"),
+        *("exploration_plot", "result_plots"),
+    ),
     "results": ("export", "demo", "info", "lab.reports"),
     "apps": ("refining",),
-    "apps.live": ("answers", "coverage", "topics"),
+    "apps.live": ("answers", "incoming", "coverage", "topics", "dds", "rosbridge"),
     "apps.app": (
         *("jobs", "radio", "files", "drawing", "survey", "marks", "answer"),
-        *("state", "predicting", "maps", "planning", "session", "picture", "page", "server"),
+        *("state", "predicting", "maps", "planning", "session", "picture"),
+        *("widgets", "sections", "page", "server"),
     ),
     "cli": ("options", "prediction", "learning", "planning", "app"),
     "command": ("__main__",),
@@ -134,7 +156,7 @@ HOMES = {
 
 STRAYS = {
     ("scene.scene", "sionna"): "the table of ITU materials",
-    ("lab.datasets.home_links", "drjit"): "the threads of a worker",
+    ("lab.datasets.home_processes", "drjit"): "the threads of a worker",
 }
 """Modules that import one of them all the same, and what for."""
 
@@ -144,8 +166,8 @@ PLOTS_ARE_FOR = ("plots.", "apps.app.", "cli.", "export", "demo", "lab.reports")
 IMPORTERS = {
     f"maps.importers.{reader}"
     for reader in (
-        *("bags:map_from_bag", "drawings:map_from_drawing", "drawings:read_picture", "ifc:map_from_ifc"),
-        *("points:is_cloud", "points:map_from_points", "vacuum:read_vacuum_map"),
+        *("bags:map_from_bag", "drawings:map_from_drawing", "pictures:read_picture", "ifc:map_from_ifc"),
+        *("cloud_files:is_cloud", "points:map_from_points", "vacuum:read_vacuum_map"),
     )
 }
 """What `load_map` imports when it meets a file of that kind."""
@@ -321,7 +343,11 @@ for name in ("", *typer.main.get_command(app).commands):
         assert not (package | reader | prediction) & clients
         assert not libraries(reader) & {"numba", "rosbags", "ezdxf", "laspy", "pypcd4", "trimesh"}
         own = [name for name in prediction if name.startswith("sionna_partial.") and not name.endswith(".")]
-        assert len(own) <= 68
+        assert len(own) <= 74
+
+    def test_figures_need_no_optional_package(self) -> None:
+        loaded = libraries(modules_after("from sionna_partial.plots import plot_placement, plot_report, plot_map")[-1])
+        assert not loaded & {package for packages in EXTRAS.values() for package in packages}
 
     def test_predictions_do_without_tensorflow_and_dask(self) -> None:
         """With the networks of opaque walls at 28 GHz, with the unseen walls below 24 GHz."""

@@ -10,7 +10,8 @@ import pytest
 
 import sionna_partial as sp
 from sionna_partial.constants import CellState
-from sionna_partial.maps.import_report import ImportNotes, MapWarning, rooms_of
+from sionna_partial.maps.environment import ImportNotes, MapWarning
+from sionna_partial.maps.import_report import rooms_of
 from sionna_partial.maps.partial_map import PartialMap
 
 

@@ -14,12 +14,13 @@ from traced import made_links
 
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.lab.datasets.home_links import home_links
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, link_features
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
-from sionna_partial.settings import DatasetSettings, TraceSettings
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.trace import trace_links
 from sionna_partial.worlds.homes import make_home
 
 FREE, WALL, UNKNOWN = CellState.FREE, CellState.WALL, CellState.UNKNOWN

@@ -11,7 +11,7 @@ from extruded import drawn
 from predictor_links import QUIET
 
 import sionna_partial as sp
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction import predictor as predictors
 

@@ -13,7 +13,8 @@ from PIL import Image
 import sionna_partial as sp
 from sionna_partial.apps.live import topics
 from sionna_partial.apps.live.answers import LiveGrid, LiveTransmitter, LiveViews
-from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live.coverage import LiveCoverage
+from sionna_partial.apps.live.incoming import LiveSettings
 from sionna_partial.apps.live.topics import Listener, Topics
 from sionna_partial.errors import SettingsError
 

@@ -20,20 +20,19 @@ from typer.testing import CliRunner
 
 import sionna_partial as sp
 from sionna_partial import cli
-from sionna_partial.apps.live import topics as topics_module
-from sionna_partial.apps.live.coverage import LiveCoverage, LiveSettings
+from sionna_partial.apps.live import rosbridge
+from sionna_partial.apps.live.coverage import LiveCoverage
+from sionna_partial.apps.live.dds import Dds, filled, struct
+from sionna_partial.apps.live.incoming import LiveSettings
+from sionna_partial.apps.live.rosbridge import Rosbridge
 from sionna_partial.apps.live.topics import (
     CONNECTION_TYPE,
     FILTER_TYPE,
     GRID_TYPE,
     POSE_TYPE,
     VIEWS_TYPE,
-    Dds,
     Listener,
-    Rosbridge,
     Topics,
-    filled,
-    struct,
 )
 
 pytest.importorskip("cyclonedds")
@@ -54,7 +53,8 @@ LIVE = ["--tx", "1.5", "1.5", "1.5", "--spacing", "0.25", "--frequency", "28GHz"
 ROBOT = """
 import sys, time
 from test_live_transports import GRID, GRID_TYPE
-from sionna_partial.apps.live.topics import Dds, Topics, filled
+from sionna_partial.apps.live.dds import Dds, filled
+from sionna_partial.apps.live.topics import Topics
 robot = Dds(Topics(map="/unused"), {})
 writer = robot._writer("/map", GRID_TYPE)
 writer.write(filled(GRID_TYPE, GRID))
@@ -197,7 +197,7 @@ class TestRosbridge:
     def test_too_large_and_no_server(
         self, server: Server, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
     ) -> None:
-        monkeypatch.setattr(topics_module, "MAX_BYTES", 100)
+        monkeypatch.setattr(rosbridge, "MAX_BYTES", 100)
         server.texts = ["x" * 200]
         with socket.create_server(("127.0.0.1", 0)) as free:
             closed = f"ws://127.0.0.1:{free.getsockname()[1]}"

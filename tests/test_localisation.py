@@ -23,7 +23,7 @@ from sionna_partial.measurements.localisation import (
 )
 from sionna_partial.measurements.measurements import measurements_of
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 
 HOUSE = drawn(
     """

@@ -20,10 +20,11 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError, SettingsError
 from sionna_partial.maps import map_files
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.importers.bags import map_from_occupancy
 from sionna_partial.maps.importers.simulators import map_from_habitat, map_from_slam
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import Material
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)

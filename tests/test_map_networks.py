@@ -13,6 +13,7 @@ from sionna_partial.constants import CellState
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_networks as module
+from sionna_partial.prediction import map_training as training
 from sionna_partial.prediction.evaluate import Network
 from sionna_partial.prediction.map_networks import (
     LINE_POINTS,
@@ -21,16 +22,14 @@ from sionna_partial.prediction.map_networks import (
     MAP_FEATURES,
     MAP_NETWORK,
     MapFeatures,
-    context_networks,
     expert_parts,
-    fit_context_networks,
     line_points_m,
     link_outputs,
     mean_features,
     predict_by_context,
     scaled_inputs,
-    symmetric,
 )
+from sionna_partial.prediction.map_training import context_networks, fit_context_networks, symmetric
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, import_keras
 from sionna_partial.prediction.space import MapSpace
 from sionna_partial.settings import PredictorSettings
@@ -49,7 +48,7 @@ def networks():
     """Return networks with random weights everywhere, biases included, so that their outputs are about 1."""
     rng = np.random.default_rng(0)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(module, "_WIDTHS", (4, 8))
+        patch.setattr(training, "_WIDTHS", (4, 8))
         found = context_networks(0)
     for weight in (weight for network in found.values() for weight in network.weights):
         shape = tuple(weight.shape)
@@ -218,8 +217,8 @@ TRAINING, OTHERS = (24, 60, 1), (6, 100, 2)
 
 def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
     others, state, _ = make_room_links(*OTHERS)
-    monkeypatch.setattr(module, "LEARNING_RATE", 0.01)
-    monkeypatch.setattr(module, "_WIDTHS", (8, 16))
+    monkeypatch.setattr(training, "LEARNING_RATE", 0.01)
+    monkeypatch.setattr(training, "_WIDTHS", (8, 16))
     found = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=16))
     networks = {name: Network.from_keras(network) for name, network in found.items()}
     probabilities, means_db, _ = predict_by_context(networks, others, FREQUENCY_HZ, MapFeatures(networks))
@@ -240,7 +239,7 @@ def test_crps_is_the_integral_of_the_squared_difference_of_distributions():
     errors_db, stds_db = np.array([0.0, 2.5, -7.0, 20.0]), np.array([1.0, 4.0, 3.0, 0.5])
     below = norm.cdf(gain_db / stds_db[:, None])
     expected = trapezoid((below - (gain_db >= errors_db[:, None])) ** 2, gain_db)
-    np.testing.assert_allclose(module._crps(errors_db, stds_db), expected, atol=2e-3)
+    np.testing.assert_allclose(training._crps(errors_db, stds_db), expected, atol=2e-3)
 
 
 def test_examples_are_passes_of_all_maps_with_points_in_their_images():
@@ -250,7 +249,7 @@ def test_examples_are_passes_of_all_maps_with_points_in_their_images():
     rx_m = np.random.default_rng(5).uniform(0.0, 4.0, (60, 3))
     phi = features((tuple(partial), index), rx_m, tx_m=(1.0, 2.0, 1.5))
     numbers = -np.arange(60.0)  # as gains
-    examples, seen = module._Examples(phi, np.ones(60, np.uint8), numbers, PredictorSettings("map")), []
+    examples, seen = training._Examples(phi, np.ones(60, np.uint8), numbers, PredictorSettings("map")), []
     assert len(examples) == 3
     for columns, images, image, cells, weights in examples.batches(4, np.random.default_rng(4)):
         drawn = -columns["true_gain_db"].astype(int)

@@ -8,12 +8,12 @@ import pytest
 from numpy.typing import NDArray
 
 from sionna_partial.calibration import material_fit
+from sionna_partial.calibration.link_paths import LinkPaths
 from sionna_partial.calibration.material_fit import (
     BLOCKED_DB,
     LOSSLESS,
     MISSED_DB,
     GainErrors,
-    LinkPaths,
     MaterialTarget,
     Point,
     Posterior,

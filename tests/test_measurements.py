@@ -13,7 +13,8 @@ from PIL import Image
 
 import sionna_partial as sp
 from sionna_partial.errors import MeasurementError
-from sionna_partial.measurements.measurements import Measurements, measurements_of, merged, nearest_transmitters
+from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
+from sionna_partial.measurements.selection import nearest_transmitters
 
 TX = np.array([[1.0, 2.0, 1.5], [1.0, 2.0, 1.5], [3.0, 4.0, 2.0]])
 RX = np.array([[2.0, 2.0, 1.5], [4.0, 1.0, 1.5], [5.0, 5.0, 1.0]])

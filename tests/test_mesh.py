@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from meshes import areas_m2, box, open_edges, scene_mesh, surface_m2
 
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.settings import Material
 
 CONCRETE = Material(itu="concrete")

@@ -11,7 +11,7 @@ import trimesh
 from extruded import blocks_of
 from numpy.typing import NDArray
 
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.scene.scene import write_mesh_scene
 from sionna_partial.settings import Material, TraceSettings
 from sionna_partial.tracing.engine import open_scene

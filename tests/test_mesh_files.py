@@ -10,8 +10,8 @@ import trimesh
 from meshes import room, surface_m2
 
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.mesh.files import confined_path, read_mesh
-from sionna_partial.maps.partial_map import MapWarning
 
 FORMATS = ("ply", "glb", "gltf", "obj", "stl")
 PLY = """ply

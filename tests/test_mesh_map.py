@@ -16,11 +16,12 @@ from small_maps import states
 from sionna_partial.constants import CellState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, cut_to_known, mesh_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.tracing.trace import trace_links
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 ROOM = scene_mesh(*room().geometry.values())

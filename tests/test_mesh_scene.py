@@ -9,8 +9,8 @@ import pytest
 from meshes import box, surface_m2
 
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.mesh.files import read_exported_mesh, read_mitsuba_scene
-from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.settings import Material
 
 SCENES = Path(sysconfig.get_paths()["purelib"]) / "sionna" / "rt" / "scenes"

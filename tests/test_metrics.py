@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from predictor_links import LOS, NLOS, OUTAGE, make_links
 
-from sionna_partial.lab.evaluation import (
+from sionna_partial.lab.metrics import (
     CONFIDENCE_BINS,
     DEFINITIONS,
     PIT_BINS,
@@ -15,7 +15,7 @@ from sionna_partial.lab.evaluation import (
     pit_fractions,
     reliability,
 )
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 
 def prediction(p_outage, p_los, p_nlos, los_db=(-60.0, 2.0), nlos_db=(-90.0, 8.0)):

@@ -12,8 +12,8 @@ from pillar_room import RX_M, TX_M, small_room
 import sionna_partial as sp
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.errors import BackendError, SettingsError
-from sionna_partial.maps.environment import merged_mesh
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.scene_mesh import merged_mesh
 from sionna_partial.settings import DRYWALL
 from sionna_partial.tracing import path_set
 from sionna_partial.tracing.path_set import MATERIAL_PARAMETERS, PARAMETERS, PathParameters, PathSet

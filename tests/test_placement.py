@@ -16,15 +16,10 @@ from sionna_partial.constants import CellState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.placement.placement import (
-    CLEARANCE_M,
-    STARTS,
-    PlacementArea,
-    link_values,
-    placement_area,
-    placement_score,
-)
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.placement.area import CLEARANCE_M, PlacementArea, placement_area
+from sionna_partial.placement.placement import STARTS, link_values, placement_score
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import PlacementSettings, TraceSettings
 
 PROBABILITIES = np.array([[0.1, 1.0, 0.0, 0.5], [0.6, 0.0, 0.0, 0.3], [0.3, 0.0, 1.0, 0.2]])

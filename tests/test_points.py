@@ -13,10 +13,12 @@ from small_maps import states
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
+from sionna_partial.maps.environment import MapWarning
+from sionna_partial.maps.importers import cloud_files
 from sionna_partial.maps.importers import points as points_module
 from sionna_partial.maps.importers.points import map_from_points
 from sionna_partial.maps.map_files import load_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
+from sionna_partial.maps.partial_map import PartialMap
 
 FREE, WALL, UNKNOWN = (int(state) for state in CellState)
 INSIDE, IN_WALL, OUTSIDE = (2.0, 1.5), (2.0, 3.01), (2.0, 4.5)
@@ -188,8 +190,9 @@ def test_walls_alone() -> None:
 def test_parts_and_order_change_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write(tmp_path / "room.xyz", ROOM)
     whole, text = map_from_points(ROOM), load_map(path)
-    monkeypatch.setattr(points_module, "PART", 700)
-    monkeypatch.setattr(points_module, "PART_BYTES", 5000)
+    for module in (points_module, cloud_files):
+        monkeypatch.setattr(module, "PART", 700)
+    monkeypatch.setattr(cloud_files, "PART_BYTES", 5000)
     assert map_from_points(np.random.default_rng(1).permutation(ROOM)) == whole
     assert load_map(path) == text
 

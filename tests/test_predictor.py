@@ -20,7 +20,8 @@ from predictor_links import (
 import sionna_partial as sp
 from sionna_partial.errors import PredictorError
 from sionna_partial.prediction.paper_networks import STD_RANGE_DB, parts
-from sionna_partial.prediction.predictor import SHIPPED, LinkPrediction, Predictor
+from sionna_partial.prediction.predictor import SHIPPED, Predictor
+from sionna_partial.prediction.rule import LinkPrediction
 
 pytestmark = QUIET
 

@@ -6,7 +6,8 @@ import pytest
 from link_tables import fitted_baselines, make_table
 from predictor_links import QUIET, quick_predictor
 
-from sionna_partial.lab.evaluation import DEFINITIONS, WITH_INDOOR, evaluate
+from sionna_partial.lab.evaluation import WITH_INDOOR, evaluate
+from sionna_partial.lab.metrics import DEFINITIONS
 from sionna_partial.lab.reports import REPORT_FILES, as_json, markdown, markdown_table, save_report, summary
 
 pytestmark = QUIET

@@ -12,7 +12,8 @@ import sionna_partial as sp
 from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.calibration.material_fit import Posterior
 from sionna_partial.errors import SettingsError
-from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability, evaluate
+from sionna_partial.lab.evaluation import evaluate
+from sionna_partial.lab.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration, Reliability
 from sionna_partial.plots.result_plots import (
     ANGLES_DEG,
     plot_calibration,

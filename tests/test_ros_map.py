@@ -17,11 +17,12 @@ from scipy.ndimage import label
 
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, OutputError
-from sionna_partial.maps import ros_map
+from sionna_partial.maps import environment
+from sionna_partial.maps.environment import MapWarning, turn_grid
 from sionna_partial.maps.importers.bags import map_from_occupancy
 from sionna_partial.maps.map_files import load_map, save_map
-from sionna_partial.maps.partial_map import MapWarning, PartialMap
-from sionna_partial.maps.ros_map import turn_grid, write_ros_map
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.ros_map_writer import write_ros_map
 
 SHEET: dict[str, Any] = {
     "image": "map.pgm",
@@ -378,7 +379,7 @@ def test_small_tilt_is_below_the_resolution(caplog: pytest.LogCaptureFixture) ->
 
 
 def test_too_many_cells(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(ros_map, "MAX_CELLS", 30)
+    monkeypatch.setattr(environment, "MAX_CELLS", 30)
     with pytest.raises(MapError, match=r"origin = \[0.0, 1.0, 0.5\] has a yaw for which the map needs 7 x 8 cells,"):
         turn_grid(PARTIAL.state, 0.1, (0.0, 1.0, 0.5))
 

@@ -16,16 +16,13 @@ from numpy.typing import NDArray
 
 from sionna_partial.constants import CellState
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.environment import FAR_M, merged_mesh
+from sionna_partial.maps.environment import FAR_M
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.mesh.cells import MeshReading, mesh_map
+from sionna_partial.maps.mesh.scene_mesh import merged_mesh
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import (
-    build_scene,
-    export_scene,
-    scene_settings_of,
-    write_scene,
-)
+from sionna_partial.scene.export import export_scene
+from sionna_partial.scene.scene import build_scene, scene_settings_of, write_scene
 from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings
 from sionna_partial.worlds.homes import make_home
 

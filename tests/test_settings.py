@@ -14,13 +14,8 @@ import sionna_partial as sp
 from sionna_partial.checks import Checked, shown
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.errors import SettingsError
-from sionna_partial.settings import (
-    ITU_BANDS_GHZ,
-    DatasetSettings,
-    Material,
-    SceneSettings,
-    TraceSettings,
-)
+from sionna_partial.lab.datasets.settings import DatasetSettings
+from sionna_partial.settings import ITU_BANDS_GHZ, Material, SceneSettings, TraceSettings
 
 
 def test_link_and_cell_states() -> None:

@@ -17,22 +17,19 @@ from link_tables import assert_same, make_dataset, make_table
 
 from sionna_partial.errors import PredictorError
 from sionna_partial.lab.datasets import shards
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import (
-    COLUMNS,
     FORMAT,
-    LinkTable,
-    LinkTraces,
     file_stem,
-    open_links,
     read_dataset,
     read_shard,
-    require_like,
-    settings_for,
     shard_metadata,
     shard_path,
     write_shard,
 )
-from sionna_partial.settings import DatasetSettings, Material, PredictorSettings
+from sionna_partial.lab.datasets.table import COLUMNS, LinkTable
+from sionna_partial.lab.datasets.traces import LinkTraces, open_links, require_like, settings_for
+from sionna_partial.settings import Material, PredictorSettings
 
 NOTES = {"home": {"name": "villa", "seed": 3}, "settings": {"stages": [0, 50]}}
 

@@ -11,7 +11,7 @@ from predictor_links import QUIET, assert_symmetric
 
 import sionna_partial as sp
 from sionna_partial.lab.datasets.home_links import home_links
-from sionna_partial.lab.datasets.shards import LinkTable
+from sionna_partial.lab.datasets.table import LinkTable
 from sionna_partial.lab.evaluation import WITH_INDOOR, Evaluation
 from sionna_partial.prediction.map_networks import MapFeatures
 from sionna_partial.prediction.space import MapSpace

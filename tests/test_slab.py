@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from sionna_partial.tracing.engine import load_sionna
+from sionna_partial.llvm import load_sionna
 from sionna_partial.tracing.power import VACUUM_F_M, reflection_loss_db
 
 FREQUENCY_HZ = 28e9

@@ -11,10 +11,12 @@ from test_trace import NO_FLOOR, WAVELENGTH_M, _room
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.errors import BackendError, SettingsError
+from sionna_partial.llvm import load_sionna
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.scene.scene import build_scene, export_scene, write_scene
+from sionna_partial.scene.export import export_scene
+from sionna_partial.scene.scene import build_scene, write_scene
 from sionna_partial.settings import ITU_BANDS_GHZ, SceneSettings, TraceSettings
-from sionna_partial.tracing.engine import load_sionna, open_scene
+from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.interactions import (
     DIFFRACTION,
     DIFFUSE,

@@ -8,7 +8,8 @@ import pytest
 import sionna_partial as sp
 from sionna_partial.checks import no_progress
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.prediction.features import LinkFeatures, features_of_paths, path_unobserved_m
+from sionna_partial.prediction.features import LinkFeatures, features_of_paths
+from sionna_partial.prediction.unobserved import path_unobserved_m
 from sionna_partial.resources import scenes_folder
 
 

@@ -14,15 +14,16 @@ from scipy.special import fresnel
 
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.errors import MemoryLimitError, PositionError, PredictorError, SettingsError
+from sionna_partial.llvm import load_sionna
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import link_features
 from sionna_partial.settings import Material, SceneSettings, TraceSettings
 from sionna_partial.tracing import engine, simulation
-from sionna_partial.tracing.engine import load_sionna
 from sionna_partial.tracing.gradients import gain_gradients
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.power import reflection_loss_db
-from sionna_partial.tracing.simulation import Simulation, trace_links
+from sionna_partial.tracing.simulation import Simulation
+from sionna_partial.tracing.trace import trace_links
 
 WAVELENGTH_M = SPEED_OF_LIGHT_M_S / 28e9
 all_paths = functools.partial(TraceSettings, power_tolerance_db=0.0)

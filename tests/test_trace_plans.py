@@ -13,7 +13,7 @@ from sionna_partial.scene.scene import SceneGeometry, write_scene
 from sionna_partial.settings import SceneSettings
 from sionna_partial.tracing.engine import SceneSolver
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.tracing.trace import trace_links
 
 MARGIN_M = 1e-3
 """Paths that pass the end of a wall by less than this may be found or not: the solver has single precision."""

@@ -8,7 +8,8 @@ from link_tables import make_dataset, make_table
 from predictor_links import QUICK, QUIET, shallow_map_networks
 
 from sionna_partial.errors import OutputError, PredictorError, PredictorWarning, SionnaPartialError
-from sionna_partial.lab.evaluation import Baselines, evaluate
+from sionna_partial.lab.baselines import Baselines
+from sionna_partial.lab.evaluation import evaluate
 from sionna_partial.lab.training.predictor import split_homes, train
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings

@@ -7,7 +7,7 @@ import sionna_partial as sp
 from sionna_partial.constants import CellState
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.measurements.walks import Walks
-from sionna_partial.tracing.simulation import clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
 
 TX = np.array([1.03, 2.41, 1.5])
 

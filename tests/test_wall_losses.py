@@ -9,12 +9,13 @@ import pytest
 from predictor_links import QUIET
 
 import sionna_partial as sp
+from sionna_partial.arrays import Floats
 from sionna_partial.constants import CellState, LinkState
 from sionna_partial.lab.datasets.home_links import home_links
-from sionna_partial.lab.datasets.shards import LinkTraces, settings_for
-from sionna_partial.lab.evaluation import measure
+from sionna_partial.lab.datasets.traces import LinkTraces, settings_for
+from sionna_partial.lab.metrics import measure
 from sionna_partial.prediction.features import LinkFeatures, mean_wall_loss_db
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.prediction.unseen_walls import (
     DISPERSION,
     LARGEST_LOSS_DB,
@@ -22,6 +23,8 @@ from sionna_partial.prediction.unseen_walls import (
     SEEN_STD_DB,
     UNSEEN_STD,
     WALL_LOSSES,
+    WallTrace,
+    by_mean_losses,
 )
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
@@ -74,11 +77,15 @@ def some_links(count: int, wall_loss_db: float = 5.0) -> LinkFeatures:
     return replace(phi, context=replace(phi.context, wall_loss_db=np.full(count, wall_loss_db)))
 
 
+def predicted(phi: LinkFeatures, walls: Floats, max_walls: int = 8) -> LinkPrediction:
+    return LinkPrediction.of_parts(*by_mean_losses(WallTrace.of(phi), walls, max_walls))
+
+
 def test_without_unseen_walls_and_in_outage_nothing_is_uncertain() -> None:
     phi = some_links(3)
     states = np.array([LinkState.LOS, LinkState.NLOS, LinkState.OUTAGE], dtype=np.uint8)
     phi = replace(phi, link_state=states, gain_db=np.append(phi.gain_db[:2], -150.0))
-    found = LinkPrediction.of_mean_losses(phi, np.array([0.0, 0.0, 2.0]))
+    found = predicted(phi, np.array([0.0, 0.0, 2.0]))
     assert found.p_los.tolist() == [1.0, 0.0, 0.0]
     assert found.p_outage.tolist() == [0.0, 0.0, 1.0]
     np.testing.assert_allclose(found.gain_mean_db, phi.gain_db)
@@ -87,7 +94,7 @@ def test_without_unseen_walls_and_in_outage_nothing_is_uncertain() -> None:
 
 def test_links_through_more_walls_than_a_path_may_cross_are_often_in_outage() -> None:
     phi, walls = some_links(6, 2.0), np.array([0.0, 1.0, 4.0, 8.0, 16.0, 24.0])
-    few, default, most = (LinkPrediction.of_mean_losses(phi, walls, max_walls) for max_walls in (4, 8, 16))
+    few, default, most = (predicted(phi, walls, max_walls) for max_walls in (4, 8, 16))
     for found in (few, default, most):
         np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0)
         assert (np.diff(found.p_outage) >= 0.0).all()
@@ -104,7 +111,7 @@ def test_intervals_hold_gains_behind_walls_of_unknown_number() -> None:
     gain_db = phi.gain_db - loss_db / (1.0 + loss_db / LARGEST_LOSS_DB)
     gain_db += rng.normal(size=4000) * np.hypot(SEEN_STD_DB, UNSEEN_STD * 5.0 * np.sqrt(count))
     state = np.where(count == 0, LinkState.LOS, LinkState.NLOS).astype(np.uint8)
-    found = LinkPrediction.of_mean_losses(phi, walls, max_walls=16)
+    found = predicted(phi, walls, max_walls=16)
     assert 0.85 < measure(found, state, gain_db).coverage_90 < 0.97
 
 

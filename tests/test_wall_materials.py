@@ -11,9 +11,10 @@ import sionna_partial as sp
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.measurements.assimilation import Assimilation
 from sionna_partial.prediction.features import features_of_paths
-from sionna_partial.prediction.predictor import LinkPrediction
-from sionna_partial.prediction.wall_materials import COMMON, P_SAME, RESIDUAL_DB, WallMaterials
-from sionna_partial.tracing.links import path_gain_db
+from sionna_partial.prediction.map_networks import rule_values
+from sionna_partial.prediction.rule import LinkPrediction, predicted
+from sionna_partial.prediction.wall_materials import COMMON, P_SAME, RESIDUAL_DB, WallMaterials, with_extra_losses
+from sionna_partial.tracing.paths import path_gain_db
 
 WIFI = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False)
 EVERY_PATH = sp.TraceSettings(2.4e9, max_depth=2, diffraction=False, power_tolerance_db=0.0)
@@ -51,7 +52,7 @@ class TestCandidates:
             np.add.at(
                 power, block.path_rx, block.power * 10.0 ** (-(extra_db[0] * walls + extra_db[1] * reflections) / 10.0)
             )
-        assert np.allclose(phi.with_extra_losses(*extra_db).gain_db, path_gain_db(power))
+        assert np.allclose(with_extra_losses(phi, np.full(2, extra_db[0]), extra_db[1]).gain_db, path_gain_db(power))
 
     @pytest.mark.parametrize("material", ["drywall", "concrete"])
     def test_a_candidate_is_near_the_trace_with_each_material(self, material):
@@ -172,7 +173,10 @@ class TestPrediction:
         model = sp.LinkModel(sp.PartialMap(state, FLAT.resolution_m), "paper", WIFI)
         phi, found = model.features(TX, RX), model.predict(TX, RX)
         expert, materials = sp.Predictor.load("paper").predict(phi), model.wall_materials
-        under = [expert.by_rule(each) for each in materials.under(phi, model.partial.unnamed_walls)]
+        under = [
+            LinkPrediction.of_parts(*predicted(rule_values(each), expert.by_state))
+            for each in materials.under(phi, model.partial.unnamed_walls)
+        ]
         expected = LinkPrediction.over_materials(under, materials.prior, RESIDUAL_DB)
         assert phi.path_power is not None
         assert np.allclose(found.gain_nlos_mean_db, expected.gain_nlos_mean_db)

@@ -4,24 +4,29 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from sionna_partial.arrays import Bools, Floats, read_only
+from sionna_partial.calibration.link_paths import (
+    MeasuredBuilding,
+    link_gains_db,
+    require_positions,
+    start_materials,
+    usable_links,
+)
 from sionna_partial.calibration.material_fit import (
     INCOMPLETE_WEIGHT,
     LOSSLESS,
-    LinkPaths,
     MaterialTarget,
     Point,
     Posterior,
     descend,
-    link_gains_db,
     lossless_scale_s_m,
     prior_posterior,
     search,
@@ -29,43 +34,20 @@ from sionna_partial.calibration.material_fit import (
 from sionna_partial.checks import Progress, require
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.display import Pictured, part_of, reporting
-from sionna_partial.errors import MeasurementError
 from sionna_partial.link_model import LinkModel
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import Measurements, measurements_of, merged
-from sionna_partial.prediction.features import path_unobserved_m
-from sionna_partial.scene.scene import constants_of
+from sionna_partial.measurements.measurements import measurements_of, merged
 from sionna_partial.settings import Material, SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.path_set import PATHS_PER_BLOCK, PathSet
-from sionna_partial.tracing.paths import SEEN_M
 from sionna_partial.tracing.power import Polarisation, reflection_loss_db
-from sionna_partial.tracing.simulation import Simulation, nearest_m, simulation_of
+from sionna_partial.tracing.simulation import Simulation, simulation_of
 
 DETERMINED = 0.35
 """Largest standard deviation of a determined parameter, as a fraction of its prior."""
 
-_log = logging.getLogger(__name__)
-
-
 LEAST_OFFSET_DB, FEWEST_DIRECT = 6.0, 3
 """Smallest median error of LOS links that no material explains [dB], and number of such links."""
 
-_NUMBERS = (
-    *("permittivity", "permittivity_std", "conductivity_s_m", "conductivity_std_s_m", "loss", "noise_db", "offset_db"),
-)
-
-FEWEST_LINKS = 10
-
-OBSERVED_FRACTION = 0.5
-"""Smallest fraction of a used link's power on paths through observed space."""
-
-OUTAGE = "measured outage"
-"""Reason for omitting a link before the trace."""
-
-_NO_MATERIAL = "that shows a material: measure links that walls reflect, and trace with max_depth of 1 or more."
-
-_REFLECTING = Material(10.0, 1.0)
-"""Material of the trace that finds paths: no reflection is too weak."""
+_log = logging.getLogger(__name__)
 
 
 @read_only
@@ -164,7 +146,8 @@ class MaterialCalibration(Pictured, plot="plots.result_plots:plot_calibration"):
 
     def record(self) -> dict[str, Any]:
         """Return the result as plain data, without the map and the gains of single links."""
-        plain = {name: np.asarray(getattr(self, name)).tolist() for name in _NUMBERS}
+        numbers = "permittivity", "permittivity_std", "conductivity_s_m", "conductivity_std_s_m"
+        plain = {name: np.asarray(getattr(self, name)).tolist() for name in (*numbers, "loss", "noise_db", "offset_db")}
         rmse_db = {
             when: float(np.sqrt(np.mean((gain_db - self.gain_db)[self.used] ** 2)))
             for when, gain_db in (("before", self.gain_before_db), ("after", self.gain_after_db))
@@ -376,118 +359,3 @@ def _undetermined(start: Sequence[Material], fit: _Fit) -> dict[str, str]:
                     f"{' S/m' * row}. Do not take its value for a property of the material."
                 )
     return undetermined
-
-
-@dataclass(frozen=True)
-class MeasuredBuilding:
-    """A map, and its custom materials by their names in the scene."""
-
-    partial: PartialMap
-    start: dict[str, Material]
-
-    def with_materials(self, materials: Sequence[Material]) -> PartialMap:
-        """Return the map with other materials."""
-        new = dict(zip(self.start, materials, strict=True))
-        return replace(self.partial, **self.partial.environment.with_materials(new))
-
-    def paths(
-        self, measured: Measurements, trace_settings: TraceSettings, scene_settings: SceneSettings, report: Progress
-    ) -> LinkPaths:
-        """Find the paths of the measured links that may have relevant power.
-
-        The fewer ends transmit, except with diffraction, which is not reciprocal in Sionna RT.
-        """
-        traced = [*self.start.values()]  # what reflects all lets nothing through
-        if not trace_settings.through_walls:
-            traced = [replace(_REFLECTING, thickness_m=each.thickness_m) for each in traced]
-        every = replace(trace_settings, power_tolerance_db=0.0)  # which paths are weak depends on the materials
-        simulation = Simulation(self.with_materials(traced), every, scene_settings)
-        if not set(self.start) <= set(simulation.materials):
-            raise MeasurementError(f"the map has no walls, floor or ceiling {_NO_MATERIAL}")
-        tx, rx = measured.tx, measured.rx
-        if len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0)):
-            tx, rx = rx, tx
-        tx_m, index = np.unique(tx, axis=0, return_inverse=True)
-        links = [np.flatnonzero(index.ravel() == number) for number in range(len(tx_m))]
-        nothing = PathSet(simulation, tx_m, rx, [])
-        kept, new = nothing, [nothing]
-        columns = np.array([simulation.materials.index(name) for name in self.start], dtype=int)
-
-        def link_paths(paths: PathSet) -> LinkPaths:
-            return LinkPaths(paths, columns, paths.path_rx.astype(np.int64))
-
-        def strong() -> PathSet:
-            paths = PathSet.joined(new)
-            return PathSet.joined([kept, paths.kept(link_paths(paths).strong())])
-
-        for block in simulation.path_blocks(tx_m, rx, part_of(report, 0.02, 0.3), links):
-            new.append(block)
-            if sum(map(len, new)) > PATHS_PER_BLOCK:
-                kept, new = strong(), [nothing]
-        return link_paths(strong())
-
-
-def require_positions(partial: PartialMap, measured: Measurements, frequency_hz: float) -> None:
-    partial.require_positions("tx", measured.tx, least=0)
-    partial.require_positions("rx", measured.rx, least=0)
-    distance_m, limit_m = np.linalg.norm(measured.tx - measured.rx, axis=1), nearest_m(frequency_hz)
-    if (distance_m < limit_m).any():
-        index = int(distance_m.argmin())
-        raise MeasurementError(
-            f"rx[{index}] = {tuple(measured.rx[index].tolist())} is {distance_m[index]:.3g} m from its transmitter, "
-            f"where the path gain has no meaning: leave out links shorter than {limit_m:.3g} m."
-        )
-    _require_enough(~measured.is_outage, {OUTAGE: int(measured.is_outage.sum())})
-
-
-def start_materials(
-    partial: PartialMap, start: Material | None, scene_settings: SceneSettings, frequency_hz: float
-) -> dict[str, Material]:
-    """Return the materials of a scene by their names there, with constants instead of formulas."""
-    materials = partial.environment.scene_materials(scene_settings.traced_material)
-    materials = {name: start or each for name, each in materials.items()}
-    for material in materials.values():
-        material.require_frequency(frequency_hz)
-    return {name: custom_material(each, frequency_hz) for name, each in materials.items()}
-
-
-def custom_material(material: Material, frequency_hz: float) -> Material:
-    permittivity, conductivity_s_m = constants_of(material, frequency_hz)
-    return Material(float(permittivity), float(conductivity_s_m), material.thickness_m)
-
-
-def usable_links(
-    partial: PartialMap, paths: LinkPaths, measured: Measurements, repeats: NDArray[np.int64]
-) -> tuple[Bools, dict[str, int]]:
-    """Return which links (N,) determine materials, and count the others by reason."""
-    count, ones = len(measured), np.ones(len(paths.columns))
-    power = paths.power(4.0 * ones, 0.1 * ones)
-    found = paths.paths
-    start_m, end_m = found.base.tx_m[found.path_tx], found.rx_m[found.path_rx]
-    observed = path_unobserved_m(partial, start_m, found.interactions, found.vertices_m, end_m) < SEEN_M
-    total = np.bincount(paths.link, weights=power, minlength=count)
-    observed_power = np.bincount(paths.link, weights=power * observed, minlength=count)
-    unseen_los = np.zeros(count, dtype=bool)
-    unseen_los[paths.link[paths.is_direct & ~observed]] = True
-    reasons = {
-        OUTAGE: measured.is_outage,
-        "no path on the map": total == 0.0,
-        "runs through unobserved space": unseen_los | (observed_power < OBSERVED_FRACTION * total),
-    }
-    used, left_out = np.ones(count, dtype=bool), {}
-    for reason, applies in reasons.items():
-        left_out[reason] = int(repeats[used & applies].sum())
-        used &= ~applies
-    _require_enough(used, left_out)
-    if paths.is_direct[used[paths.link]].all():
-        raise MeasurementError(f"the {int(used.sum())} usable links of measurements have no reflection {_NO_MATERIAL}")
-    return used, left_out
-
-
-def _require_enough(used: Bools, left_out: Mapping[str, int]) -> None:
-    if used.sum() < FEWEST_LINKS:
-        counts = ", ".join(f"{number} ({reason})" for reason, number in left_out.items())
-        raise MeasurementError(
-            f"measurements has {int(used.sum())} usable links of {len(used)}, fewer than {FEWEST_LINKS}; left out: "
-            f"{counts}. Measure more links, behind corners and in line of sight, in the part that has been observed."
-        )

@@ -7,18 +7,18 @@ before a descent.
 
 import itertools
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.special import log_ndtr
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats
+from sionna_partial.calibration.link_paths import LinkPaths, link_gains_db
 from sionna_partial.checks import Progress
 from sionna_partial.constants import SPEED_OF_LIGHT_M_S
 from sionna_partial.display import Shown
-from sionna_partial.tracing.path_set import PathParameters, PathSet
-from sionna_partial.tracing.power import VACUUM_F_M, reflection_loss_db
+from sionna_partial.tracing.power import reflection_loss_db
 
 NOISES_DB = np.geomspace(0.7, 15.0, 24)
 MISSED_FRACTIONS, BLOCKED_FRACTIONS = (0.0, 0.1, 0.25, 0.5, 0.75), (0.0, 0.05, 0.2)
@@ -63,77 +63,6 @@ MOST_FRINGES, FEW_STEPS, FEW_FRINGES = 8, 3, 2
 """Number of fringes that are searched, of steps in each, and of fringes that are descended to the end."""
 
 CELLS_A_REPORT = 64
-
-KEPT_FRACTION = 0.96
-"""Fraction of a link's power on the kept paths, for all `EXTREMES`."""
-
-EXTREMES = tuple((permittivity, loss) for permittivity in (1.2, 3.0, 8.0, 30.0) for loss in (0.0, 0.03, 3.0))
-"""Extreme materials: relative permittivity, and its imaginary part."""
-
-
-@dataclass(frozen=True, eq=False)
-class LinkPaths:
-    """P paths of N measured links, as functions of unknown materials.
-
-    Parameters
-    ----------
-    paths : PathSet
-    columns : (M,) int array
-        Unknown materials of the scene.
-    link : (P,) int64 array
-        Link of each path.
-    """
-
-    paths: PathSet
-    columns: Indices
-    link: NDArray[np.int64]
-
-    @property
-    def is_direct(self) -> Bools:
-        return self.paths.is_direct
-
-    def of_links(self, chosen: Bools) -> "LinkPaths":
-        kept = chosen[self.link]
-        return LinkPaths(self.paths.kept(kept), self.columns, (np.cumsum(chosen) - 1)[self.link[kept]])
-
-    def power(self, permittivity: Floats, conductivity_s_m: Floats) -> Floats:
-        return self.paths.at(self._parameters(permittivity, conductivity_s_m))[0]
-
-    def slopes(self, permittivity: Floats, conductivity_s_m: Floats) -> tuple[Floats, Floats]:
-        """Return |a|^2 (P,), and its derivatives (P, 2 M) by permittivities, then conductivities."""
-        parameters = self._parameters(permittivity, conductivity_s_m)
-        slopes = self.paths.slopes(parameters, ("relative_permittivity", "conductivity_s_m")).values()
-        return self.paths.at(parameters)[0], np.concatenate([each[:, self.columns] for each in slopes], axis=1)
-
-    def strong(self) -> Bools:
-        """Return which paths (P,) have `KEPT_FRACTION` of a link's power for some of `EXTREMES`."""
-        strong, ones = np.zeros(len(self.link), dtype=bool), np.ones(len(self.columns))
-        scale_s_m = 2.0 * np.pi * float(self.paths.base.frequency_hz) * VACUUM_F_M
-        for permittivity, loss in EXTREMES:
-            strong |= _strongest(self.link, self.power(permittivity * ones, loss * scale_s_m * ones), KEPT_FRACTION)
-        return strong
-
-    def _parameters(self, permittivity: Floats, conductivity_s_m: Floats) -> PathParameters:
-        values = {"relative_permittivity": permittivity, "conductivity_s_m": conductivity_s_m}
-        all_values = {name: getattr(self.paths.base, name).copy() for name in values}
-        for name, own in values.items():
-            all_values[name][self.columns] = own
-        return replace(self.paths.base, **all_values)
-
-
-def link_gains_db(power: Floats, link: NDArray[np.int64], links: int) -> Floats:
-    """Return the gains (N,) [dB] from the power of the paths (P,); -inf without paths."""
-    with np.errstate(divide="ignore"):
-        return 10.0 * np.log10(np.bincount(link, weights=power, minlength=links))
-
-
-def _strongest(link: NDArray[np.int64], power: Floats, fraction: float) -> Bools:
-    order = np.lexsort((-power, link))
-    total = np.bincount(link, weights=power)
-    before = np.cumsum(power[order]) - power[order] - (np.cumsum(total) - total)[link[order]]
-    strong = np.zeros(len(link), dtype=bool)
-    strong[order] = (before < fraction * total[link[order]]) & (power[order] > 0.0)
-    return strong
 
 
 @dataclass(frozen=True)

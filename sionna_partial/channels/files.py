@@ -28,8 +28,9 @@ from sionna_partial.files import (
     write_netcdf,
 )
 from sionna_partial.resources import optional_packages
+from sionna_partial.tracing.array_paths import ArrayPaths
 from sionna_partial.tracing.links import TracedLinks
-from sionna_partial.tracing.responses import ArrayPaths, require_memory
+from sionna_partial.tracing.responses import require_memory
 
 Layout = Literal["sionna", "deepmimo"]
 

@@ -17,7 +17,7 @@ from scipy.special import ndtri
 from sionna_partial.arrays import Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 DECORRELATION_M = 1.0
 """Decorrelation length d0 of the field [m], with the correlation exp(-(d / d0)^2 / 2)."""

@@ -11,16 +11,8 @@ import sionna_partial as sp
 import sionna_partial.cli.options as opt
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ
 from sionna_partial.display import counting
-from sionna_partial.settings import (
-    HOME_KINDS,
-    SHORT_LINK_M,
-    DatasetSettings,
-    HomeKind,
-    NetworkKind,
-    PredictorSettings,
-    SceneSettings,
-    TraceSettings,
-)
+from sionna_partial.lab.datasets.settings import SHORT_LINK_M, DatasetSettings
+from sionna_partial.settings import HOME_KINDS, HomeKind, NetworkKind, PredictorSettings, SceneSettings, TraceSettings
 
 DEFAULT_HOMES = 100
 """Default number of procedural homes."""
@@ -128,7 +120,7 @@ def train(
     the homes.
     """
     with opt.reporting_to(out, "reading links") as report:
-        from sionna_partial.lab.datasets.shards import open_links, settings_for
+        from sionna_partial.lab.datasets.traces import open_links, settings_for
         from sionna_partial.lab.reports import summary
 
         links, traces = open_links(folders)

@@ -238,7 +238,7 @@ def _live_settings(
         int, typer.Option(help="Largest value of a grid [percent]; in nav2, 100 is a wall.")
     ] = MAX_COST,
 ) -> Any:
-    from sionna_partial.apps.live.coverage import LiveSettings
+    from sionna_partial.apps.live.incoming import LiveSettings
 
     options = {"views_every_s": views_every, "max_cost": max_cost}
     return LiveSettings(frame, threshold, spacing, rx_height, tx_power, **options)  # type: ignore[arg-type]
@@ -284,11 +284,11 @@ def live(
     robot: Any = None
     settings = replace(settings, every_unknown=topics.unknown)
     if bag is None and rosbridge:
-        from sionna_partial.apps.live.topics import Rosbridge
+        from sionna_partial.apps.live.rosbridge import Rosbridge
 
         robot = Rosbridge(rosbridge, topics, positions)
     elif bag is None:
-        from sionna_partial.apps.live.topics import Dds
+        from sionna_partial.apps.live.dds import Dds
 
         robot = Dds(topics, positions, domain)
 

@@ -128,7 +128,7 @@ def predict(
 
 def _write(coverage: Any, path: Path, partial: Any, budget: "_Budget | None", logo: Path | None) -> None:
     """Write one file of a coverage map."""
-    from sionna_partial.plots.coverage_plot import report_pdf
+    from sionna_partial.plots.report import report_pdf
     from sionna_partial.plots.style import figure_png
 
     if path.suffix == REPORT:
@@ -391,7 +391,7 @@ def channels(
     with opt.reporting_to(out.parent, "loading Sionna RT") as report:
         from sionna_partial.channels.files import checked_target
         from sionna_partial.tracing.antennas import planar_array
-        from sionna_partial.tracing.simulation import valid_links
+        from sionna_partial.tracing.positions import valid_links
 
         checked_target(out, layout)
         arrays = [
@@ -430,7 +430,7 @@ def _parse_shape(name: str, text: str) -> tuple[int, int]:
 def _free_grid(partial: Any, spacing_m: float, height_m: float) -> Any:
     import numpy as np
 
-    from sionna_partial.coverage.job import grid_axes
+    from sionna_partial.coverage.grid import grid_axes
 
     x_m, y_m = np.meshgrid(*grid_axes(partial, spacing_m))
     grid_m = np.column_stack([x_m.ravel(), y_m.ravel(), np.full(x_m.size, height_m)])

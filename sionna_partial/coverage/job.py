@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import pandas as pd
 import xarray as xr
-from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import maximum_filter
+from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import (
     Progress,
     float_array,
@@ -25,49 +23,41 @@ from sionna_partial.checks import (
     require_choice,
     require_memory,
     require_names,
-    require_number,
     transmitter_names,
     with_height,
 )
-from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB, CellState
-from sionna_partial.coverage.dataset import (
-    ANTENNA,
-    ATTRIBUTES,
-    DISTRIBUTION,
-    OFFSET,
-    ROOM,
-    WALL_PARTS,
-    flags,
+from sionna_partial.constants import DEFAULT_HEIGHT_M, MEMORY_GB
+from sionna_partial.coverage.dataset import ANTENNA, OFFSET
+from sionna_partial.coverage.grid import (
+    RECEIVERS,
+    GridArea,
+    Receivers,
+    checked_area,
+    coverage_map,
+    grid_receivers,
     join_transmitters,
     link_columns,
     provenance,
+    receivers_at_once,
     with_posterior,
 )
 from sionna_partial.display import part_of, reporting
-from sionna_partial.errors import MemoryLimitError, PositionError, SettingsError
+from sionna_partial.errors import PositionError
 from sionna_partial.link_model import LinkModel, PredictedLinks, link_model_of
-from sionna_partial.maps.partial_map import PartialMap, require_height
+from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.assimilation import Assimilation
-from sionna_partial.measurements.evidence import GAIN_OFFSET_STD_DB
+from sionna_partial.measurements.kinds import GAIN_OFFSET_STD_DB
 from sionna_partial.measurements.localisation import TransmitterPosterior, locate_transmitter
-from sionna_partial.measurements.measurements import (
-    Measurements,
-    measurements_of_each,
-    measurements_of_others,
-    nearest_transmitters,
-)
-from sionna_partial.prediction.predictor import LinkPrediction, Predictor
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import measurements_of_each, measurements_of_others, nearest_transmitters
+from sionna_partial.prediction.predictor import Predictor
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.antennas import Antenna, AntennaPattern
-from sionna_partial.tracing.simulation import SHORTEST_M, Simulation, clear_of_walls, nearest_m
-
-RECEIVERS = ("indoor", "anywhere", "inside", "near")
-
-NEAR_M, NEAR_SPACINGS = 1.0, 2
-"""Distance from free cells up to which receivers are "near" [m], and at least, in spacings."""
+from sionna_partial.tracing.positions import clear_of_walls, nearest_m
+from sionna_partial.tracing.simulation import Simulation
 
 OneAntenna: TypeAlias = Antenna | AntennaPattern | str | None
-Area: TypeAlias = tuple[float, float, float, float]
 TxAntenna: TypeAlias = OneAntenna | Sequence[OneAntenna] | Mapping[str, OneAntenna]
 
 POSITIONS = 4
@@ -82,16 +72,6 @@ UNSURE_P = 0.05
 LOCATING_FRACTION = 0.3
 """Fraction of the progress bar for finding a transmitter."""
 
-LIBRARIES_GB, CELL_BYTES, RECEIVER_BYTES, WORK_BYTES = 1.0, 40, 400, 120_000
-"""Memory of the libraries [GB], of a map cell, a receiver and a receiver in a block [bytes], from
-`benchmarks/scale.py`."""
-
-BLOCK_RECEIVERS = (500, 8_000)
-"""Smallest and largest size of a block."""
-
-MAX_RECEIVERS = 2_000_000
-
-_WHOSE = {"indoor": "given that the receiver is indoors", "anywhere": "of a receiver that may be outdoors, in outage"}
 
 _log = logging.getLogger(__name__)
 
@@ -203,7 +183,7 @@ def predict_map(
     model = link_model_of(scene, predictor, trace_settings, scene_settings)
     require_choice("receivers", receivers, RECEIVERS)
     require_memory(memory_gb)
-    where = GridArea(rx_height_m, spacing_m, _checked_area(model.partial, area_m), receivers)
+    where = GridArea(rx_height_m, spacing_m, checked_area(model.partial, area_m), receivers)
     names, transmitters = _transmitters(model, tx, tx_antenna, measurements, where)
     block = receivers_at_once(model.partial, transmitters[0].grid, memory_gb)
     maps, weights = [], []
@@ -220,27 +200,6 @@ def predict_map(
     if model.simulation.material_unknown:
         coverage.attrs |= model.wall_materials.attributes(np.mean(weights, axis=0), model.partial.unnamed_walls)
     return coverage
-
-
-@dataclass(frozen=True)
-class GridArea:
-    """Height, spacing and bounds of receivers [m], and which they are."""
-
-    rx_height_m: float
-    spacing_m: float
-    bounds_m: Area | None = None
-    receivers: str = RECEIVERS[0]
-
-
-@dataclass(frozen=True)
-class Receivers:
-    """Receivers on a grid: (ny, nx) arrays, and the (N, 3) positions of the valid ones."""
-
-    x_m: Floats
-    y_m: Floats
-    cell_state: States
-    valid: Bools
-    rx_m: Floats
 
 
 @dataclass(frozen=True)
@@ -281,7 +240,7 @@ class CoverageJob:
         if transmitter.position_m is None:
             posterior = self.located(transmitter, report)
             source = self._source(transmitter, *posterior.draw(POSITIONS), posterior.position_m)
-            grid = grid_receivers(model, source.tx_m, self.area)
+            grid = grid_receivers(model.simulation, source.tx_m, self.area)
         else:
             source = self._source(transmitter, transmitter.position_m[None], np.ones(1), [None], transmitter.position_m)
         blocks, complete = [], True
@@ -435,7 +394,7 @@ def _transmitters(
     for antenna in {*antennas}:
         antenna.warn_of_frequency(frequency_hz)
     sources_m = [np.empty((0, 3)) if at_m is None else at_m[None] for at_m in positions_m]
-    grids = [grid_receivers(model, tx_m, area) for tx_m in sources_m]
+    grids = [grid_receivers(model.simulation, tx_m, area) for tx_m in sources_m]
     measured: list[Measurements | None] = [None] * len(sources_m)
     if measurements is not None:
         measured = measurements_of_each(partial, sources_m, measurements, frequency_hz)
@@ -467,19 +426,6 @@ def antennas_of(tx_antenna: TxAntenna, names: list[str] | None) -> list[Antenna]
     return [Antenna.of(by_name[name] if by_name else tx_antenna[at]) for at, name in enumerate(names)]  # type: ignore[index]
 
 
-def receivers_at_once(partial: PartialMap, receivers: Receivers, memory_gb: float) -> int:
-    count, (fewest, most) = len(receivers.rx_m), BLOCK_RECEIVERS
-    kept_gb = LIBRARIES_GB + (CELL_BYTES * partial.state.size + RECEIVER_BYTES * receivers.valid.size) / 1e9
-    needed_gb = kept_gb + WORK_BYTES * min(count, fewest) / 1e9
-    if needed_gb > memory_gb:
-        raise MemoryLimitError(
-            f"memory_gb = {memory_gb:g} is too little: {count:,} receivers on a map of {partial.state.size:,} cells "
-            f"take about {needed_gb:.2g} GB. Give more memory_gb, a larger spacing_m, or a part of the map."
-        )
-    fitting = (memory_gb - kept_gb) / WORK_BYTES * 1e9
-    return int(min(max(fitting, fewest), most))
-
-
 def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str, Any]:
     of_each = [(each.noise_db, each.offset_db, each.shadow_scale) for each in source.assimilations]
     noise_db, offset_db, shadow_scale = source.weights @ of_each
@@ -499,134 +445,3 @@ def _measurement_attributes(measured: Measurements, source: _Source) -> dict[str
         OFFSET: float(offset_db),
         "measured_shadow_scale": float(shadow_scale),
     }
-
-
-def grid_receivers(model: LinkModel, tx_m: Floats, area: GridArea) -> Receivers:
-    """Return the receivers; those near a wall or transmitter (T, 3) [m] are masked."""
-    partial, frequency_hz = model.partial, model.simulation.trace_settings.frequency_hz
-    require_height(partial, "rx_height_m", area.rx_height_m)
-    x_m, y_m = grid_axes(partial, area.spacing_m, area.bounds_m)
-    points = np.stack([*np.meshgrid(x_m, y_m), np.full((len(y_m), len(x_m)), area.rx_height_m)], axis=-1)
-    limit_m = nearest_m(frequency_hz)
-    cell_state = partial.state_at(points)
-    far = np.ones(cell_state.shape, dtype=bool)
-    for each_m in tx_m:
-        far &= np.linalg.norm(points - each_m, axis=-1) >= limit_m
-    valid = far & clear_of_walls(partial, points)
-    if area.receivers == "inside" and partial.is_complete:
-        valid &= cell_state != CellState.UNKNOWN
-    elif area.receivers == "near":
-        valid &= _near_free_cells(partial, points, max(NEAR_M, NEAR_SPACINGS * area.spacing_m))
-    if not far.any() and limit_m > SHORTEST_M:
-        raise PositionError(
-            f"every receiver is within {limit_m:.3g} m of the transmitter, where Friis' formula does not hold at "
-            f"frequency_hz = {frequency_hz:g}: give a higher frequency, or a larger map."
-        )
-    if not valid.any():
-        raise PositionError(
-            "no receiver can stand anywhere, all are inside walls or at the transmitter: "
-            f"spacing_m = {area.spacing_m:g}, give a smaller one."
-        )
-    return Receivers(x_m, y_m, cell_state, valid, points[valid])
-
-
-def _near_free_cells(partial: PartialMap, points_m: Floats, limit_m: float) -> Bools:
-    """Return which points are within a distance of free cells along x and y; all, if there are none."""
-    free, cells = partial.state == CellState.FREE, math.ceil(limit_m / partial.resolution_m)
-    near = maximum_filter(free, size=2 * cells + 1) | ~free.any()
-    return np.asarray(near[partial.cell_index(points_m)])
-
-
-def _checked_area(partial: PartialMap, area_m: ArrayLike | None) -> Area | None:
-    if area_m is None:
-        return None
-    x0, y0, x1, y1 = partial.bounds_m
-    remedy = f"give x and y of two corners on the map, which spans x {x0:g} to {x1:g} m and y {y0:g} to {y1:g} m."
-    corners = float_array("area_m", area_m, SettingsError, remedy)
-    require(corners.shape == (4,), "area_m", area_m, remedy)
-    low, high, slack_m = corners[:2], corners[2:], partial.resolution_m / 2
-    inside = (low >= np.array([x0, y0]) - slack_m) & (high <= np.array([x1, y1]) + slack_m)
-    require(bool((inside & (low < high)).all()), "area_m", area_m, remedy)
-    return tuple(corners.tolist())  # type: ignore[return-value]
-
-
-def grid_axes(partial: PartialMap, spacing_m: float, area_m: Area | None = None) -> tuple[Floats, Floats]:
-    low = partial.resolution_m / 10
-    require_number("spacing_m", spacing_m, low, 1e6)
-    x0, y0, x1, y1 = partial.bounds_m if area_m is None else area_m
-    nx, ny = (math.ceil(length / spacing_m - 0.5 - 1e-9) for length in (x1 - x0, y1 - y0))
-    size = f"the {'map' if area_m is None else 'area'} is {x1 - x0:g} x {y1 - y0:g} m"
-    require(min(nx, ny) > 0, "spacing_m", spacing_m, f"{size}; give {min(x1 - x0, y1 - y0):g} or less.")
-    enough = 1.1 * math.sqrt((x1 - x0) * (y1 - y0) / MAX_RECEIVERS)
-    remedy = f"{size}, which makes {nx * ny:,} receivers, more than {MAX_RECEIVERS:,}; give {enough:.2g} or more."
-    require(nx * ny <= MAX_RECEIVERS, "spacing_m", spacing_m, remedy)
-    x_cells, y_cells = (np.arange(count, dtype=np.float64) + 0.5 for count in (nx, ny))
-    return x0 + spacing_m * x_cells, y0 + spacing_m * y_cells
-
-
-def coverage_map(
-    partial: PartialMap, receivers: Receivers, columns: Mapping[str, NDArray[Any]], attributes: Mapping[str, Any]
-) -> xr.Dataset:
-    layers: dict[str, NDArray[Any]] = {
-        "observed": receivers.cell_state != CellState.UNKNOWN,
-        "valid": receivers.valid,
-        "cell_state": receivers.cell_state,
-        "wall_parts": _wall_parts(partial, receivers, attributes["spacing_m"]),
-    }
-    for name, values in columns.items():
-        layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
-        layers[name][receivers.valid] = values
-    axes = {
-        name: xr.IndexVariable(
-            name,
-            pd.Index(values),
-            {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
-            {"_FillValue": None},
-        )
-        for name, values in (("x", receivers.x_m), ("y", receivers.y_m))
-    }
-    variables: dict[str, Any] = {name: (("y", "x"), layers[name], dict(ATTRIBUTES[name])) for name in ATTRIBUTES}
-    if partial.room is not None:
-        row, column = partial.cell_index(np.stack(np.meshgrid(receivers.x_m, receivers.y_m), axis=-1))
-        names = {"none": 0}
-        for number, name in enumerate(partial.room_names, 1):
-            word = "_".join(name.split())
-            names[word if word and word not in names else f"{word}_{number}"] = number
-        variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **flags(names)}
-    for name in (*DISTRIBUTION, "link_state"):
-        variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
-    # fastpath: xarray would first import Dask, which takes a second, to see that these are no arrays of Dask
-    arrays = {
-        name: xr.Variable(axes_of, values, about, fastpath=True) for name, (axes_of, values, about) in variables.items()
-    }
-    return xr.Dataset(arrays, coords=axes, attrs=dict(attributes))
-
-
-def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:
-    """Return (ny, nx) bits: the parts of the cell that contain a wall."""
-    walls = np.pad(partial.state == CellState.WALL, ((1, 0), (1, 0))).cumsum(axis=0, dtype=np.int32)
-    walls = walls.cumsum(axis=1, dtype=np.int32)
-    ny, nx = partial.shape
-    columns = _part_spans(receivers.x_m, partial.origin_m[0], partial.resolution_m, nx, spacing_m)
-    bits = np.zeros(receivers.valid.shape, dtype=np.int64)
-    rows = _part_spans(receivers.y_m, partial.origin_m[1], partial.resolution_m, ny, spacing_m)
-    for row, (bottom, top) in enumerate(rows):
-        strip = walls[top] - walls[bottom]
-        for column, (left, right) in enumerate(columns):
-            bits |= (strip[:, right] > strip[:, left]).astype(np.int64) << (WALL_PARTS * row + column)
-    return bits
-
-
-def _part_spans(
-    centre_m: Floats, origin_m: float, resolution_m: float, count: int, spacing_m: float
-) -> list[tuple[Indices, Indices]]:
-    """Return the first map cell, and one after the last, of each part of the receivers' cells."""
-    edge = (centre_m - origin_m - spacing_m / 2) / resolution_m
-    step = spacing_m / resolution_m / WALL_PARTS
-    return [
-        (
-            np.clip(np.floor(edge + part * step + 1e-6), 0, count).astype(np.intp),
-            np.clip(np.ceil(edge + (part + 1) * step - 1e-6), 0, count).astype(np.intp),
-        )
-        for part in range(WALL_PARTS)
-    ]

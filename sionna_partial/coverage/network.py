@@ -19,7 +19,7 @@ from sionna_partial.coverage.dataset import ANTENNA, TX_COORDINATES, transmitter
 from sionna_partial.coverage.link_budget import LinkBudget, Scheme, schemes, transmit_powers_dbm
 from sionna_partial.errors import SettingsError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 
 MOST_DRAWS = 1_000
 _RECEIVERS_AT_ONCE = 5_000

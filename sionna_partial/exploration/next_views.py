@@ -39,11 +39,13 @@ from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.grid import cell_centres_m, unknown_pockets
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.measurements.localisation import TransmitterPosterior
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, measurements_of
+from sionna_partial.measurements.measurements import Measurements, measurements_of
+from sionna_partial.measurements.selection import SAME_TX_M
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.unobserved import GRAZE, in_cells, line_fractions, map_line_fractions
 from sionna_partial.settings import SceneSettings, SensorSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.simulation import Simulation, clear_of_walls
+from sionna_partial.tracing.positions import clear_of_walls
+from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.camera import unknown_in_view
 from sionna_partial.worlds.robot import (
     FORWARD_M,

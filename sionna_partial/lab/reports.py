@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from sionna_partial.files import atomic_files
-from sionna_partial.lab.datasets.shards import stage_name
-from sionna_partial.lab.evaluation import DEFINITIONS, Difference, Evaluation, Row
+from sionna_partial.lab.datasets.table import stage_name
+from sionna_partial.lab.evaluation import Difference, Evaluation, Row
+from sionna_partial.lab.metrics import DEFINITIONS
 
 REPORT_FILES = ("report.md", "report.json", "stages.png", "calibration.png")
 

@@ -1,13 +1,9 @@
 """ImportReport: elements of a file that a reader used and skipped, and the size of the resulting map."""
 
-from __future__ import annotations
-
 import math
-import os
-import warnings
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple, TypeVar
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -15,6 +11,7 @@ import scipy
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import CellState
 from sionna_partial.display import Shown
+from sionna_partial.maps.environment import Elements, ImportSource
 from sionna_partial.process import njit
 
 MAX_ROOM_CELLS = 1_000_000
@@ -35,12 +32,7 @@ ENCLOSED_FRACTION = 0.1
 FREE_FRACTION = 0.01
 """Smallest free fraction of the extent of any map."""
 
-ODD_CELLS = 1000
-"""Number of cells from which a map should have free and wall cells."""
-
 SHOWN_ROWS = 30
-
-_Map = TypeVar("_Map", bound=Any)
 
 
 class Rooms(NamedTuple):
@@ -89,36 +81,6 @@ def _join(clearance, order, nx, ratio, smallest):
     for cell in order:
         areas += parent[cell] == cell and clearance[cell] >= smallest
     return openings[:count].copy(), areas
-
-
-class MapWarning(UserWarning):
-    """A map file that was read with corrections, or whose map is not plausible.
-
-    `report` is the `ImportReport` of the map, or None.
-    """
-
-    report: ImportReport | None = None
-
-
-@dataclass(frozen=True)
-class Elements:
-    """Elements of one name or type, their number, and the reason for skipping them."""
-
-    name: str
-    count: int
-    reason: str = ""
-
-
-@dataclass(frozen=True)
-class ImportSource:
-    """Facts about a file that its reader reports: see `ImportReport`."""
-
-    file: str
-    unit_m: float = 1.0
-    unit_source: str = "format"
-    used: tuple[Elements, ...] = ()
-    skipped: tuple[Elements, ...] = ()
-    notes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -190,36 +152,6 @@ class ImportReport(ImportSource, Shown):
         return f"a unit of {self.unit_m:g} m ({self.unit_source})"
 
 
-@dataclass
-class ImportNotes:
-    """Notes of a reader for an `ImportReport`."""
-
-    file: str | os.PathLike[str]
-    unit_m: float = 1.0
-    unit_source: str = "format"
-    notes: list[str] = field(default_factory=list)
-    _counts: dict[tuple[str, str], int] = field(default_factory=dict)
-
-    def use(self, name: str, count: int = 1) -> None:
-        self.skip(name, count, "")
-
-    def skip(self, name: str, count: int, reason: str) -> None:
-        self._counts[name, reason] = self._counts.get((name, reason), 0) + count
-
-    def attached_to(self, partial: _Map, *, size: str = "", doors: str = "", area: str = "", free: str = "") -> _Map:
-        """Return a PartialMap with its report, and warn of implausible results, as `ImportReport.faults`."""
-        rows = [Elements(name, count, reason) for (name, reason), count in sorted(self._counts.items()) if count]
-        used, skipped = (tuple(row for row in rows if bool(row.reason) == skip) for skip in (False, True))
-        source = ImportSource(str(self.file), self.unit_m, self.unit_source, used, skipped, tuple(self.notes))
-        partial = replace(partial, import_source=source)
-        if size or doors or area or free:
-            for fault in partial.import_report.faults(size, doors, area, free):
-                warning = MapWarning(f"path = '{self.file}' {fault}")
-                warning.report = partial.import_report
-                warnings.warn(warning, stacklevel=4)
-        return partial
-
-
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
     free = state == CellState.FREE
     rooms = rooms_of(free, resolution_m)
@@ -229,24 +161,6 @@ def report_of(source: ImportSource, state: States, resolution_m: float) -> Impor
     return ImportReport(
         **vars(source), extent_m=extent_m, rooms=rooms.number, free_area_m2=area_m2, door_widths_m=doors_m
     )
-
-
-def warn_of_odd_states(what: str, state: States) -> None:
-    """Warn of a map without walls or free cells, or that looks inverted."""
-    count = np.bincount(state.ravel(), minlength=len(CellState))
-    free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
-    if state.size < ODD_CELLS:
-        return
-    if not free + wall:
-        seen = "has no free cell and no wall, so that everything is unknown"
-    elif not wall:
-        seen = f"has {free:,} free cells and no wall, so that nothing obstructs or reflects"
-    elif wall > 2 * free:
-        seen = f"has {wall:,} wall cells and {free:,} free ones, as if inverted"
-    else:
-        return
-    remedy = "look at its states, and at negate and the thresholds of a ROS map."
-    warnings.warn(f"{what} {seen}: {remedy}", MapWarning, stacklevel=3)
 
 
 def _listed(rows: tuple[Elements, ...]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
+from sionna_partial.arrays import States
 from sionna_partial.checks import require_bool, shown
 from sionna_partial.constants import (
     BAG_SUFFIXES,
@@ -25,6 +27,7 @@ from sionna_partial.constants import (
     PICTURE_SUFFIXES,
     POINT_SUFFIXES,
     VACUUM_SUFFIXES,
+    CellState,
 )
 from sionna_partial.display import later
 from sionna_partial.errors import MapError, OutputError
@@ -37,10 +40,11 @@ from sionna_partial.files import (
     output_path,
     read_bytes,
 )
-from sionna_partial.maps.environment import MAX_CELLS, MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, grid_array, layers_of
-from sionna_partial.maps.import_report import ImportSource, warn_of_odd_states
+from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportSource, MapWarning, grid_array, layers_of
+from sionna_partial.maps.mesh.scene_mesh import MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.ros_map import bare_image, read_ros_map, write_ros_map
+from sionna_partial.maps.ros_map import bare_image, read_ros_map
+from sionna_partial.maps.ros_map_writer import write_ros_map
 from sionna_partial.settings import Material
 
 ACCEPTED = (
@@ -158,11 +162,29 @@ def load_map(
     if partial.import_source is None:
         partial = replace(partial, import_source=ImportSource(str(source)))
     if partial.environment.is_extruded:
-        warn_of_odd_states(f"path = '{source}'", partial.state)
+        _warn_of_odd_states(f"path = '{source}'", partial.state)
     if wall_height_m is not None:
         partial = replace(partial, wall_height_m=wall_height_m)
         partial = replace(partial, **partial.environment.with_height(partial.wall_height_m))
     return partial if obstacle_height_m is None else partial.with_obstacle_height(obstacle_height_m)
+
+
+def _warn_of_odd_states(what: str, state: States) -> None:
+    """Warn of a map without walls or free cells, or that looks inverted."""
+    count = np.bincount(state.ravel(), minlength=len(CellState))
+    free, wall = int(count[CellState.FREE]), int(count[CellState.WALL])
+    if state.size < ODD_CELLS:
+        return
+    if not free + wall:
+        seen = "has no free cell and no wall, so that everything is unknown"
+    elif not wall:
+        seen = f"has {free:,} free cells and no wall, so that nothing obstructs or reflects"
+    elif wall > 2 * free:
+        seen = f"has {wall:,} wall cells and {free:,} free ones, as if inverted"
+    else:
+        return
+    remedy = "look at its states, and at negate and the thresholds of a ROS map."
+    warnings.warn(f"{what} {seen}: {remedy}", MapWarning, stacklevel=3)
 
 
 def save_map(partial: PartialMap, path: str | os.PathLike[str], *, extra: Mapping[str, object] | None = None) -> None:
@@ -276,7 +298,7 @@ def _read_mesh(source: Path, **options: Any) -> PartialMap:
 
 
 def _read_ply(source: Path, **options: Any) -> PartialMap:
-    is_cloud = later("maps.importers.points:is_cloud")(source)
+    is_cloud = later("maps.importers.cloud_files:is_cloud")(source)
     return (_read_cloud if is_cloud else _read_mesh)(source, **options)
 
 
@@ -354,7 +376,7 @@ _READERS = {
         VACUUM_SUFFIXES, _Reader("the map of a vacuum robot", _importer("maps.importers.vacuum:read_vacuum_map"))
     ),
     **dict.fromkeys(
-        PICTURE_SUFFIXES, _Reader("a picture", _importer("maps.importers.drawings:read_picture"), ("resolution_m",))
+        PICTURE_SUFFIXES, _Reader("a picture", _importer("maps.importers.pictures:read_picture"), ("resolution_m",))
     ),
     **dict.fromkeys(BAG_SUFFIXES, _BAG),
 }

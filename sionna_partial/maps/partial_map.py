@@ -19,18 +19,21 @@ from sionna_partial.errors import MapError, PositionError
 from sionna_partial.maps.environment import (
     LAYERS,
     FloorPlan,
-    SceneMesh,
+    ImportSource,
     checked_state,
     equal_fields,
     fractions_by_material,
+    frontier_cells,
     layer_cells,
     layer_values,
     metres,
+    uniform_cells,
 )
+from sionna_partial.maps.environment import MapWarning as MapWarning
 from sionna_partial.maps.grid import cells_within, free_standing, has_unknown_room, states_by_height, unit_hint, window
-from sionna_partial.maps.import_report import ImportReport, ImportSource, report_of
-from sionna_partial.maps.import_report import MapWarning as MapWarning
-from sionna_partial.maps.wall_cells import frontier_cells, noise_field, thick_walls, uniform_cells, wall_noise
+from sionna_partial.maps.import_report import ImportReport, report_of
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
+from sionna_partial.maps.wall_cells import noise_field, thick_walls
 from sionna_partial.settings import Material
 
 MAX_INTERIOR_CELLS = 2**53
@@ -147,7 +150,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return equal_fields(self, other)
 
     def layers(self) -> dict[str, tuple[States, str, list[Any]]]:
-        """Return each layer's cells, the field with its values, and these as plain data."""
+        """Return the layers by name: cells (ny, nx), the field that they index, and its values as plain data."""
         found = {}
         for name, (counted, _, _) in LAYERS.items():
             if (cells := getattr(self, name)) is not None:
@@ -284,11 +287,6 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return not has_unknown_room(self.state, self.resolution_m)
 
     @cached_property
-    def wall_noise(self) -> float:
-        """Range noise from the depth of uneven walls: 0 (exact; always where the map is complete) to 1."""
-        return 0.0 if self.is_complete else wall_noise(self.state, self.resolution_m)
-
-    @cached_property
     def _noise_field(self) -> Floats:
         return noise_field(self.state, self.resolution_m)
 
@@ -328,7 +326,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
 
     @property
     def wall_class_count(self) -> int:
-        """Number of classes of walls without a named material: thick walls are the second."""
+        """Number of classes of walls without a named material: 1, or 2 where some walls are thick."""
         return 1 + bool(self.thick_walls.any())
 
     @cached_property
@@ -348,7 +346,10 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         return classes
 
     def wall_classes(self, points_m: NDArray[np.floating]) -> NDArray[np.uint8]:
-        """Return the walls at points (..., 3) [m], or NaN: 0 with a named material, 1 thin or 2 thick without."""
+        """Return the class (...,) of the wall at each point (..., 3) [m]: 0 named material, else 1 thin or 2 thick.
+
+        Points of NaN get any class.
+        """
         if self.wall_fractions.keys() == {None} and self.wall_class_count == 1:
             return np.ones(points_m.shape[:-1], dtype=np.uint8)
         cells = np.nan_to_num((points_m[..., :2] - self.origin_m) / self.resolution_m)

@@ -1,17 +1,14 @@
-"""ROS map_server maps: a YAML file and an image, read as nav2_map_server reads them, and written."""
+"""ROS map_server maps: a YAML file and an image, read as nav2_map_server reads them."""
 
-import logging
 import math
 import os
 import warnings
-from collections.abc import Callable, Iterable, Mapping
-from contextlib import ExitStack
-from dataclasses import asdict, fields
+from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
@@ -19,22 +16,15 @@ from PIL import Image
 from sionna_partial.arrays import Bools, Floats, Indices, States, with_neighbours
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
-from sionna_partial.errors import MapError, OutputError, SettingsError
-from sionna_partial.files import atomic_write, is_path, lies_in, open_regular, read_bytes
-from sionna_partial.maps.environment import MAX_CELLS
-from sionna_partial.maps.import_report import ODD_CELLS, ImportNotes
-from sionna_partial.maps.partial_map import MAX_INTERIOR_CELLS, MapWarning, PartialMap
-from sionna_partial.maps.wall_cells import frontier_cells
+from sionna_partial.errors import MapError, SettingsError
+from sionna_partial.files import is_path, lies_in, open_regular, read_bytes
+from sionna_partial.maps.environment import MAX_CELLS, ODD_CELLS, ImportNotes, MapWarning, turn_grid
+from sionna_partial.maps.partial_map import MAX_INTERIOR_CELLS, PartialMap
 from sionna_partial.settings import Material
-
-logger = logging.getLogger(__name__)
 
 MODES = ("trinary", "scale", "raw")
 
 UNKNOWN_SHADE = 205
-
-OCCUPIED_THRESHOLD, FREE_THRESHOLD = 0.65, 0.196
-"""Thresholds of written maps (map_server's; the shade 205 stays unknown)."""
 
 MAX_YAML_BYTES = 1_000_000
 
@@ -85,17 +75,6 @@ class _EachKeyOnce(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
 
-class _Plain(yaml.SafeDumper):
-    """Dumper that writes NumPy numbers and arrays as Python numbers and lists."""
-
-
-_Plain.add_multi_representer(
-    np.generic,  # type: ignore[type-abstract]
-    lambda dumper, value: dumper.represent_data(value.item()),
-)
-_Plain.add_multi_representer(np.ndarray, lambda dumper, value: dumper.represent_data(value.tolist()))
-
-
 class _Pixels(NamedTuple):
     """Decoded image, row 0 at the top.
 
@@ -106,6 +85,12 @@ class _Pixels(NamedTuple):
     per_shade: int = 1
     opaque: int = 0
     alpha: NDArray[np.uint8] | None = None
+
+    @property
+    def brightness(self) -> Floats:
+        """Brightness of each level, 0 to 1."""
+        full = 255 * self.per_shade + self.opaque
+        return np.arange(full + 1) / full
 
 
 def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) -> PartialMap:
@@ -141,7 +126,7 @@ def read_ros_map(path: Path, *, strict: bool = False, confined: bool = False) ->
 
         mesh = read_exported_mesh(path.parent, raw["mesh"], raw.get("scene_offset"))
     layers: dict[str, Any] = {}
-    for name, (listed, target, made) in _LAYERS.items():
+    for name, (listed, target, made) in LAYER_KEYS.items():
         if name in raw:
             given = raw[name]
             image = _image_path(path, given.get("image") if isinstance(given, dict) else None, confined=confined)
@@ -183,111 +168,6 @@ def _layer(
     if abs(origin[2] - turns * math.pi / 2) * math.hypot(*cells.shape) > 0.5:
         raise _refuse(path, "origin", [*origin], f"with {name} its yaw must be a quarter turn, or 0.")
     return np.rot90(cells, -turns)
-
-
-def write_ros_map(partial: PartialMap, path: Path, extra: Mapping[str, object] | None = None) -> None:
-    """Write a map as `path` (YAML) and a PGM image of the same stem.
-
-    With a mesh, the YAML completes the exported scene beside it.
-    """
-    sheet: dict[str, object] = {"wall_height": partial.wall_height_m}
-    if partial.interior_cells is not None:
-        sheet["interior_cells"] = int(partial.interior_cells)
-    if partial.material is not None:
-        sheet["material"] = asdict(partial.material)
-    sheet |= partial.environment.sheet()
-    images = {}
-    for name, (cells, _, values) in partial.layers().items():
-        image = f"{path.stem}_{name}.pgm"
-        sheet[name] = {"image": image, _LAYERS[name][0]: values}
-        images[path.with_name(image)] = cells
-    shades = np.empty(len(CellState), dtype=np.uint8)
-    shades[[CellState.FREE, CellState.WALL, CellState.UNKNOWN]] = 254, 0, UNKNOWN_SHADE
-    sheet = ros_sheet(path, "trinary", partial.resolution_m, partial.origin_m) | sheet
-    images[path.with_suffix(".pgm")] = shades[partial.state]
-    write_ros_files(path, _yaml_text(sheet, {} if extra is None else extra), images)
-
-
-def ros_sheet(path: Path, mode: str, resolution_m: float, origin_m: Iterable[float]) -> dict[str, object]:
-    """Return the map_server keys of a YAML, for a PGM image of the same stem."""
-    return {
-        "image": path.with_suffix(".pgm").name,
-        "mode": mode,
-        "resolution": resolution_m,
-        "origin": [*origin_m, 0.0],
-        "negate": 0,
-        "occupied_thresh": OCCUPIED_THRESHOLD,
-        "free_thresh": FREE_THRESHOLD,
-    }
-
-
-def write_ros_files(path: Path, text: str, images: Mapping[Path, NDArray[np.uint8]]) -> None:
-    with atomic_write(path, "w") as sheet, ExitStack() as together:
-        sheet.write(text)
-        sheet.flush()  # a full disk fails here, not after the pictures are there
-        for image, pixels in images.items():
-            picture = together.enter_context(atomic_write(image))
-            picture.write(b"P5\n%d %d\n255\n" % pixels.shape[::-1])
-            picture.write(np.flipud(pixels).tobytes())
-
-
-def _yaml_text(sheet: Mapping[str, object], extra: Mapping[str, object]) -> str:
-    names = [] if not isinstance(extra, Mapping) else [*extra]
-    own = sorted({*sheet, "interior_cells", "material", "mesh", *_LAYERS}.intersection(map(str, names)))
-    if own or names != [name for name in names if isinstance(name, str)] or not isinstance(extra, Mapping):
-        what = f"holds {own[0]!r}, which the map sets itself" if own else "has keys that are no text"
-        raise OutputError(f"extra = {shown(extra)} {what}: give a mapping of further keys.")
-    try:
-        text: str = yaml.dump({**sheet, **extra}, Dumper=_Plain, sort_keys=False, default_flow_style=None)
-        size = len(text.encode())
-    except (yaml.YAMLError, ValueError, TypeError, RecursionError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise OutputError(
-            f"extra cannot be written as YAML ({reason}): give numbers, texts, lists and mappings."
-        ) from error
-    if size > MAX_YAML_BYTES:
-        raise OutputError(
-            f"extra makes a YAML of {size:,} bytes, more than {MAX_YAML_BYTES:,}: leave large values out."
-        )
-    return text
-
-
-def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, float]) -> tuple[States, float, Any]:
-    """Rotate a grid (ny, nx) by the yaw of its origin (x, y, yaw) onto the world axes; UNKNOWN outside.
-
-    Quarter turns are exact. A tilt that moves no cell by more than half its size is ignored. Any other yaw samples the
-    grid at cells of half the size: walls stay at least two cells thick, more than a diagonal step needs (sqrt 2). Gaps
-    where walls meet only at a corner are closed.
-
-    Returns the state, the edge of its cells [m], and world x and y of its lower-left corner [m].
-    """
-    x, y, yaw = origin
-    ny, nx = state.shape
-    turns = round(yaw / (math.pi / 2))
-    if abs(yaw - turns * math.pi / 2) * math.hypot(ny, nx) <= 0.5:
-        left, down = ((0, 0), (ny, 0), (nx, ny), (0, nx))[turns % 4]
-        return np.rot90(state, -turns), resolution_m, (x - left * resolution_m, y - down * resolution_m)
-    cell_m = resolution_m / 2
-    turn = np.array([[math.cos(yaw), math.sin(yaw)], [-math.sin(yaw), math.cos(yaw)]])  # acts on (y, x)
-    corners = np.array([(0, 0), (ny, 0), (0, nx), (ny, nx)]) @ turn.T * resolution_m
-    low = corners.min(axis=0)
-    rows, columns = (int(n) for n in np.ceil((corners.max(axis=0) - low) / cell_m - 1e-9))
-    if rows * columns > MAX_CELLS:
-        what = f"has a yaw for which the map needs {rows} x {columns} cells, more than {MAX_CELLS:,}"
-        raise MapError(f"origin = {list(origin)} {what}: set the yaw to 0, or cut or coarsen the map.")
-    logger.warning("origin yaw %g rad: the map is turned onto cells of %g m.", yaw, cell_m)
-    first = turn.T @ ((low + cell_m / 2) / resolution_m) - 0.5
-
-    def turned(grid: States) -> States:
-        shape, unknown = (rows, columns), CellState.UNKNOWN
-        return scipy.ndimage.affine_transform(
-            grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown
-        )
-
-    result = turned(state)
-    frontier = with_neighbours(frontier_cells(state))
-    result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
-    return result, cell_m, (x + float(low[1]), y + float(low[0]))
 
 
 def states_from_percent(percent: NDArray[np.integer], occupied_percent: float, free_percent: float) -> States:
@@ -391,12 +271,12 @@ def _room_name(path: Path, field: str, value: object) -> str:
     return value
 
 
-_LAYERS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
+LAYER_KEYS: dict[str, tuple[str, str, Callable[[Path, str, Any], Any]]] = {
     "wall_material": ("materials", "wall_materials", _material),
     "obstacle": ("heights", "obstacle_heights_m", _height_m),
     "room": ("names", "room_names", _room_name),
 }
-"""Layers by their keys in the YAML: key of their values, field of the map, reader."""
+"""Layers by their keys in the YAML: key of their values, field of the map, reader of a value."""
 
 
 def _read_yaml(path: Path) -> dict[Any, Any]:
@@ -513,8 +393,7 @@ def bare_image(path: Path) -> MapError:
 
 def _classify(pixels: _Pixels, sheet: _Sheet) -> States:
     """Classify pixels as nav2's loadMapFromFile does, unknown between the thresholds."""
-    full = 255 * pixels.per_shade + pixels.opaque
-    shade = np.arange(full + 1) / full
+    shade = pixels.brightness
     if sheet.mode == "raw":
         occupied, free = np.rint(100 * sheet.occupied_thresh), np.rint(100 * sheet.free_thresh)
         table = states_from_percent(np.rint(255 * shade).astype(int), occupied, free)
@@ -534,15 +413,14 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict:
 
     Transparent pixels are unknown, and the shade 205, 127 or 128 if far more frequent than its neighbours.
     """
-    full = 255 * pixels.per_shade + pixels.opaque
-    shade = np.arange(full + 1) / full
+    shade = pixels.brightness
     if sheet.mode == "raw":
         percent = np.rint(255.0 * shade)
         unknown = percent > 100
     else:
-        percent, unknown = 100.0 * (shade if sheet.negate else 1.0 - shade), np.zeros(full + 1, dtype=bool)
+        percent, unknown = 100.0 * (shade if sheet.negate else 1.0 - shade), np.zeros(len(shade), dtype=bool)
     opaque = np.ones(pixels.level.shape, dtype=bool) if pixels.alpha is None else pixels.alpha == 255
-    count = np.bincount(pixels.level[opaque], minlength=full + 1)
+    count = np.bincount(pixels.level[opaque], minlength=len(shade))
     if sheet.mode != "raw":
         marks = [255 - UNKNOWN_SHADE if sheet.negate else UNKNOWN_SHADE, 127, 128]
         levels = np.array(marks) * pixels.per_shade + pixels.opaque
@@ -574,8 +452,8 @@ def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
 
 
 def _warn_of_dark_unknown(state: States, pixels: _Pixels, sheet: _Sheet) -> None:
-    full = 255 * pixels.per_shade + pixels.opaque
-    occupancy = pixels.level / full if sheet.negate else 1.0 - pixels.level / full
+    shade = pixels.brightness[pixels.level]
+    occupancy = shade if sheet.negate else 1.0 - shade
     dark = (state == CellState.UNKNOWN) & (occupancy > DARK_OCCUPANCY)
     dark &= True if pixels.alpha is None else pixels.alpha > 0
     if sheet.mode == "raw" or dark.sum() <= max((state == CellState.WALL).sum(), FEW_CELLS):

@@ -16,12 +16,7 @@ from sionna_partial.display import Shown
 from sionna_partial.errors import MeasurementError, PositionError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.measurements.evidence import (
-    FREE_P_POWERS,
-    KINDS,
-    KINDS_THROUGH_WALLS,
     LEAST_EXPLAINED,
-    P_POWERS,
-    UNSEEN_P_POWERS,
     UNSEEN_RANGE_M,
     Compared,
     Fit,
@@ -29,9 +24,10 @@ from sionna_partial.measurements.evidence import (
     Sample,
     hypotheses,
 )
+from sionna_partial.measurements.kinds import FREE_P_POWERS, KINDS, KINDS_THROUGH_WALLS, P_POWERS, UNSEEN_P_POWERS
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.walks import Walks
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.settings import FREQUENCIES_HZ
 
 LEAST_WEIGHT = 0.01

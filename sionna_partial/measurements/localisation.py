@@ -18,19 +18,12 @@ from sionna_partial.checks import Progress
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.evidence import (
-    FREE_P_POWERS,
-    LIKELY_NOISE_DB,
-    Kind,
-    correlation,
-    grouped,
-    kinds_through_walls,
-    positive,
-)
+from sionna_partial.measurements.evidence import LIKELY_NOISE_DB, correlation, grouped, positive
+from sionna_partial.measurements.kinds import FREE_P_POWERS, Kind, kinds_through_walls
 from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.walks import Walks
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.prediction.wall_materials import FADINGS_DB, OWN_WEIGHT, RESIDUAL_DB, Residuals, log_std_prior
 
 Links = tuple[LinkPrediction, Floats, Floats]

@@ -18,8 +18,8 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_HEIGHT_M
 from sionna_partial.errors import MeasurementError
 from sionna_partial.files import is_path
+from sionna_partial.maps.environment import MapWarning
 from sionna_partial.maps.importers.bags import GRID, Message, Recording, open_recording
-from sionna_partial.maps.partial_map import MapWarning
 from sionna_partial.measurements.measurements import Measurements, load_measurements, measurements_of
 
 if TYPE_CHECKING:

@@ -20,7 +20,8 @@ from sionna_partial.display import Pictured, reporting
 from sionna_partial.files import atomic_write
 from sionna_partial.link_model import LinkModel, link_model_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.placement.placement import RECEIVERS, PlacementArea, Search
+from sionna_partial.placement.area import PlacementArea
+from sionna_partial.placement.placement import RECEIVERS, Search
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PlacementSettings, SceneSettings, TraceSettings, takes_settings
 from sionna_partial.tracing.simulation import Simulation

@@ -15,16 +15,8 @@ from matplotlib.colors import ListedColormap, Normalize, to_hex
 
 from sionna_partial.arrays import Floats
 from sionna_partial.coverage.dataset import COMPONENTS, DISTRIBUTION, transmitters_of
-from sionna_partial.plots.coverage_plot import (
-    Layer,
-    coverage_layers,
-    extent_m,
-    headline,
-    likely_area,
-    outside,
-    unobserved_area,
-    wall_cells,
-)
+from sionna_partial.plots.layers import Layer, coverage_layers, headline
+from sionna_partial.plots.panel import extent_m, likely_area, outside, unobserved_area, wall_cells
 from sionna_partial.plots.style import server_colours
 from sionna_partial.resources import optional_packages
 

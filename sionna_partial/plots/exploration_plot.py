@@ -25,7 +25,7 @@ from sionna_partial.exploration.explore import Exploration
 from sionna_partial.exploration.next_views import NextView, NextViews
 from sionna_partial.files import atomic_write, output_path
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import extent_m
+from sionna_partial.plots.panel import extent_m
 from sionna_partial.plots.style import (
     BLUE,
     RED,

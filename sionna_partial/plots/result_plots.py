@@ -16,8 +16,8 @@ from matplotlib.ticker import MaxNLocator, PercentFormatter
 from sionna_partial.calibration.calibration import MaterialCalibration
 from sionna_partial.checks import require, require_type
 from sionna_partial.constants import CellState
-from sionna_partial.lab.datasets.shards import stage_name
-from sionna_partial.lab.evaluation import CONFIDENCE_BINS, PIT_BINS, Calibration
+from sionna_partial.lab.datasets.table import stage_name
+from sionna_partial.lab.metrics import CONFIDENCE_BINS, PIT_BINS, Calibration
 from sionna_partial.placement.placement import TransmitterPlacement
 from sionna_partial.placement.several import NetworkPlacement
 from sionna_partial.plots.style import (

@@ -1,6 +1,5 @@
 """Features of links: TracedLinks + PartialMap -> LinkFeatures; walls and space along the paths are the LinkContext."""
 
-import itertools
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields, replace
@@ -9,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
 from sionna_partial.checks import number_of, require_type, shown
@@ -17,37 +15,24 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState, LinkState
 from sionna_partial.display import Shown
 from sionna_partial.errors import PredictorError
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.wall_cells import LEAST_NOISE
-from sionna_partial.prediction.space import MapSpace
+from sionna_partial.prediction.space import MapSpace, possible_states
 from sionna_partial.prediction.unobserved import (
-    GRAZE,
-    in_cells,
+    attenuation,
     is_enclosed,
-    lengths_in_unknown_m,
-    map_line_fractions,
-    parts_at_walls,
+    path_unobserved_m,
     unobserved_lengths_m,
     walled_lengths_m,
 )
 from sionna_partial.settings import FREQUENCIES_HZ, SceneSettings, TraceSettings
 from sionna_partial.tracing.interactions import REFRACTION
-from sionna_partial.tracing.links import LinkSums, TracedLinks
-from sionna_partial.tracing.paths import SEEN_M, LocatedPaths, SolvedPaths, path_gain_db
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import LinkSums, LocatedPaths, SolvedPaths, path_gain_db
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 ATTENUATION_LENGTHS_M = (math.inf, 4.0, 1.0, 0.25, 0.0)
 """Attenuation lengths of unobserved space [m]: a path through u metres has the weight exp(-u / length)."""
 
 _PATHS_AT_ONCE = 100_000
-
-_ASIDE_CELLS = 1.5
-"""Offset of the parallel lines in `_crosses_wall` [cells]."""
-
-_OPAQUE_CELLS = 3.0
-"""Length of a line in known walls that excludes LOS, unless it is traced on exact walls [cells]."""
-
-_BEYOND_CELLS = 2
-"""Margin around a map, so that walls that reach its border do not separate the outside [cells]."""
 
 
 @read_only
@@ -137,9 +122,8 @@ class LinkContext(Shown):
             space = spaces[number]
             exposure[here] = np.stack([space.exposure_at(end_m) for end_m in ends], axis=1)
             route[here] = space.routes_of(*ends)
-            seen = unobserved_distance_m[here] == 0.0
-            lines = seen, walled_m[here], wall_noise[here]
-            possible[here] = _possible_states(partial, ends, link_state[here], lines)
+            lines = unobserved_distance_m[here] == 0.0, walled_m[here], wall_noise[here]
+            possible[here] = possible_states(partial, ends, link_state[here], *lines)
         found = (tx_seen, rx_seen, complete, walled_m, wall_noise, exposure, route, possible)
         return cls(tx_m, rx_m, *found, map_index=map_index, spaces=spaces, **traced)
 
@@ -225,105 +209,6 @@ def mean_wall_loss_db(partial: PartialMap, trace_settings: TraceSettings, scene_
     return sum(fraction * wall_loss_db(material or default, frequency_hz) for material, fraction in fractions)
 
 
-def path_unobserved_m(
-    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
-) -> Floats:
-    """Return the length (P,) of paths in unknown cells [m]; 0 for links that a complete map encloses.
-
-    Paths lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
-    """
-    total_m = np.zeros(len(start_m))
-    rows = np.flatnonzero(~is_enclosed(partial, start_m, end_m))
-    here_m = start_m[rows]
-    for depth in range(interactions.shape[1] if len(rows) else 0):
-        there = interactions[rows, depth] > 0
-        there_m = vertices_m[rows[there], depth]
-        total_m[rows[there]] += lengths_in_unknown_m(partial, here_m[there], there_m)
-        here_m[there] = there_m
-    total_m[rows] += lengths_in_unknown_m(partial, here_m, end_m[rows])
-    return total_m
-
-
-def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
-    tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
-    return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)
-
-
-def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
-    return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)
-
-
-def _possible_states(
-    partial: PartialMap, ends_m: tuple[Floats, Floats], link_state: States, lines: tuple[Bools, Floats, Floats]
-) -> Bools:
-    """Return the possible link states (N, 3) on a map.
-
-    - A direct line across a known wall has no LOS. It crosses one if both parallel lines 1.5 cells aside meet known
-      walls, and it does so itself (`walled_m`) or is blocked in the trace; at a corner or along a face, one line stays
-      clear. Outlines of noisy walls leak: three cells in known walls also exclude LOS, unless traced along exact walls.
-    - A wholly observed direct line (`seen`) without walls has LOS as traced.
-    - Known walls, with gaps of up to two cells closed, separate regions. If the ends are in different regions, or in a
-      wholly observed one, a traced outage is certain; a wholly observed region has no other outage.
-
-    Mesh cells do not give the heights of surfaces: only the second rule applies.
-    """
-    los, states, (seen, walled_m, wall_noise) = link_state == LinkState.LOS, np.arange(len(LinkState)), lines
-    possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
-    if partial.environment.is_extruded:
-        walled = walled_m > 0.0
-        doubtful = (walled & ~(seen & los)) | ~los
-        blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))
-        opaque = walled_m >= _OPAQUE_CELLS * partial.resolution_m
-        opaque &= ~los | (wall_noise > LEAST_NOISE)
-        blocked |= opaque
-        walled_off, enclosed = _regions(partial, *ends_m)
-        outage = (walled_off | enclosed) & (link_state == LinkState.OUTAGE)
-        possible[outage] = states == LinkState.OUTAGE
-        possible[enclosed & ~outage, LinkState.OUTAGE] = False
-        seen = seen & ~walled
-    possible[blocked | (seen & ~los), LinkState.LOS] = False
-    possible[seen & los] = states == LinkState.LOS
-    return possible
-
-
-def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
-    crosses = np.zeros((2, len(rx_m)), dtype=bool)
-    for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
-        starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
-        along = ends - starts
-        lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
-        aside = _ASIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
-        for side, step in enumerate((aside, -aside)):
-            crosses[side, rows] |= map_line_fractions(walls, starts + step, ends + step)[:, CellState.WALL] > GRAZE
-    return np.asarray(crosses.all(axis=0))
-
-
-def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
-    """Return whether the ends (N,) are in different regions, and whether both are in a wholly observed one."""
-    state = np.pad(partial.wall_levels[0][1].state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
-    regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
-    observed = np.ones(count + 1, dtype=bool)
-    observed[regions[state == CellState.UNKNOWN]] = False
-    tx, rx = (_region_at(partial, regions, points_m) for points_m in (tx_m, rx_m))
-    known = (tx > 0) & (rx > 0)
-    return known & (tx != rx), known & (tx == rx) & observed[tx]
-
-
-def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
-    """Return the region (N,) at or beside points (N, 3) [m]; 0 if there is none or more than one.
-
-    `regions` include the margin `_BEYOND_CELLS`, and are 0 within a cell of a wall.
-    """
-    row, column = (index + _BEYOND_CELLS for index in partial.cell_index(points_m))
-    around = [
-        regions[np.clip(row + up, 0, len(regions) - 1), np.clip(column + right, 0, regions.shape[1] - 1)]
-        for up, right in itertools.product((-1, 0, 1), repeat=2)
-    ]
-    largest = np.max(around, axis=0)
-    alone = np.all([(each == 0) | (each == largest) for each in around], axis=0)
-    return np.where(alone, largest, 0)
-
-
 @read_only
 @dataclass(frozen=True, eq=False)
 class LinkFeatures(Shown):
@@ -398,39 +283,14 @@ class LinkFeatures(Shown):
         return self if self.distance_m.ndim == 1 else self.take(slice(None))
 
     def take(self, index: NDArray[np.generic] | slice) -> "LinkFeatures":
-        """Select links of the flat order."""
+        """Select links by an index array, mask or slice of the flat order, transmitter by transmitter."""
         context = None if self.context is None else self.context.take(index)
         columns = {name: getattr(self, name).ravel()[index] for name in _PAPER}
         path_power = None if self.path_power is None else self.path_power[index]
         return LinkFeatures(**columns, context=context, frequency_hz=self.frequency_hz, path_power=path_power)
 
-    def with_extra_losses(
-        self, crossing_db: ArrayLike, reflection_db: float, fractions: ArrayLike = (1.0, 0.0)
-    ) -> "LinkFeatures":
-        """Return the features with additional losses per crossing of a thin or thick wall and per reflection [dB].
-
-        `fractions` (2,) are from `PartialMap.unnamed_walls`.
-        """
-        assert self.path_power is not None
-        power, sizes = self.path_power, self.path_power.shape[1:]
-        losses_db = [*np.broadcast_to(crossing_db, 2)[: len(sizes) - 1], reflection_db]
-        for loss_db, size in zip(reversed(losses_db), reversed(sizes), strict=True):
-            power = power @ 10.0 ** (-loss_db * np.arange(size) / 10.0)
-        gain_db = path_gain_db(power)
-        states = np.where(gain_db > GAIN_FLOOR_DB, self.link_state, LinkState.OUTAGE)
-        context = self.context
-        if context is not None:
-            change_db = float(np.dot(np.broadcast_to(crossing_db, 2), fractions))
-            straight_db = context.straight_gain_db - change_db / np.sum(fractions) * context.straight_walls
-            context = replace(
-                context,
-                straight_gain_db=np.maximum(straight_db, GAIN_FLOOR_DB),
-                wall_loss_db=context.wall_loss_db + change_db,
-            )
-        return replace(self, gain_db=gain_db, link_state=states, context=context)
-
     def free_space_shift_db(self, frequency_hz: float) -> float:
-        """Return the free-space gain at `frequency_hz` less that at the frequency of the links [dB]."""
+        """Return the difference of free-space gains: at `frequency_hz` minus at the frequency of the links [dB]."""
         return 0.0 if self.frequency_hz is None else 20.0 * math.log10(self.frequency_hz / frequency_hz)
 
     @classmethod
@@ -533,8 +393,7 @@ def link_features(partial: PartialMap, links: TracedLinks) -> LinkFeatures:
 def with_path_power(phi: LinkFeatures, partial: PartialMap, links: TracedLinks) -> LinkFeatures:
     """Return the features (T N,) of traced links with their power by walls of unknown material."""
     sums = LinkSums(len(phi) // max(1, len(links.rx)), len(links.rx), *_limits(partial, links.trace_settings))
-    paths = SolvedPaths(*(getattr(links, field.name) for field in fields(SolvedPaths)))
-    sums.add(paths, partial.wall_classes(links.vertices_m))
+    sums.add(links.solved, partial.wall_classes(links.vertices_m))
     return replace(phi, path_power=sums.path_power)
 
 

@@ -22,8 +22,8 @@ from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.features import LinkFeatures
 from sionna_partial.prediction.paper_networks import free_space_gain_db
-from sionna_partial.prediction.predictor import LinkPrediction
 from sionna_partial.prediction.predictor_files import shipped_bytes
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.process import core_count
 from sionna_partial.resources import PREDICTORS_FOLDER

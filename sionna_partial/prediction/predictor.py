@@ -3,39 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, lru_cache
 from os import PathLike
 from pathlib import Path
-from types import ModuleType
-from typing import TYPE_CHECKING, Any, ClassVar, Self, TypeAlias, overload
+from typing import TYPE_CHECKING, Any, TypeAlias, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
-from scipy.special import ndtr
+from numpy.typing import ArrayLike
 
-from sionna_partial.arrays import Bools, Floats, States, read_only
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import Progress, shown
-from sionna_partial.constants import CARRIER_FREQUENCY_HZ, GAIN_FLOOR_DB, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
 from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PredictorError, SettingsError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.evaluate import Network
-from sionna_partial.prediction.features import (
-    LinkFeatures,
-    link_numbers,
-    link_states,
-    require_each,
-)
-from sionna_partial.prediction.map_networks import (
-    LINK_NETWORK,
-    MapFeatures,
-    fit_context_networks,
-    kind_of,
-    predict_by_context,
-    rule_values,
-)
+from sionna_partial.prediction.features import LinkFeatures, link_numbers, link_states, require_each
+from sionna_partial.prediction.map_networks import LINK_NETWORK, MapFeatures, kind_of, predict_by_context
+from sionna_partial.prediction.map_training import fit_context_networks
 from sionna_partial.prediction.paper_networks import (
     assemble,
     evaluate_indoor,
@@ -47,7 +34,7 @@ from sionna_partial.prediction.paper_networks import (
     parts,
 )
 from sionna_partial.prediction.predictor_files import SUFFIX, digest, keras_model, pack, read_files, write_files
-from sionna_partial.prediction.rule import mixture, over_materials, predicted, traced_parts
+from sionna_partial.prediction.rule import LinkPrediction
 from sionna_partial.prediction.unseen_walls import (
     WALL_LOSSES,
     DirectLines,
@@ -57,235 +44,13 @@ from sionna_partial.prediction.unseen_walls import (
     by_mean_losses,
 )
 from sionna_partial.resources import PREDICTORS_FOLDER
-from sionna_partial.settings import PredictorSettings, TraceSettings
+from sionna_partial.settings import PredictorSettings
 
 if TYPE_CHECKING:
     import keras
 
 SHIPPED = ("map", "paper")
 """Names of the shipped predictors, the default first."""
-
-
-@read_only
-@dataclass(frozen=True, eq=False)
-class LinkPrediction(Shown):
-    """Predictive distribution of link state and path gain; every array is (N,) or (T, N) float64.
-
-    `Predictor.predict` returns it for receivers indoors, `anywhere` for receivers that may be outdoors.
-
-    Parameters
-    ----------
-    p_los, p_nlos, p_outage : arrays
-        Probabilities of the link states; they sum to 1.
-    gain_mean_db, gain_std_db : arrays
-        Mean and standard deviation over all link states, with -150 dB for an outage [dB].
-    gain_los_mean_db, gain_los_std_db, gain_nlos_mean_db, gain_nlos_std_db : arrays
-        Mean and standard deviation given LOS, and given NLOS [dB].
-    by_material : (tuple of LinkPrediction, (K,) float64 array), optional
-        For walls of unknown material, the distributions for each candidate, without the residual of gains about a
-        trace, and the probabilities of the candidates.
-
-    Examples
-    --------
-    >>> import sionna_partial as sp
-    >>> phi = sp.LinkFeatures([1, 0], unobserved_distance_m=[0.0, 4.5], distance_m=[3.0, 6.0], gain_db=[-71.0, -150.0])
-    >>> sp.Predictor.load("paper").predict(phi).p_los.round() + 0.0
-    array([1., 0.])
-    """
-
-    p_los: Floats
-    p_nlos: Floats
-    p_outage: Floats
-    gain_mean_db: Floats
-    gain_std_db: Floats
-    gain_los_mean_db: Floats
-    gain_los_std_db: Floats
-    gain_nlos_mean_db: Floats
-    gain_nlos_std_db: Floats
-
-    by_material: tuple[tuple[LinkPrediction, ...], Floats] | None = None
-
-    COLUMNS: ClassVar[tuple[str, ...]]
-    """Names of the arrays."""
-
-    @property
-    def materials(self) -> tuple[tuple[LinkPrediction, ...], Floats]:
-        """`by_material`, or this distribution as the only one."""
-        return self.by_material or ((self,), np.ones(1))
-
-    @classmethod
-    def over_materials(cls, parts: Sequence[LinkPrediction], weights: Floats, residual_db: float) -> LinkPrediction:
-        """Return the mixture over materials; `residual_db` is the standard deviation about the true trace."""
-        mixed = cls.of_parts(*over_materials([part.by_state for part in parts], weights, residual_db))
-        return replace(mixed, by_material=(tuple(parts), weights))
-
-    @classmethod
-    def of_columns(cls, column: Callable[[str], Any]) -> LinkPrediction:
-        """Return the distribution whose arrays a function gives by name."""
-        return LinkPrediction(**{name: column(name) for name in cls.COLUMNS})
-
-    def mapped(self, change: Callable[[LinkPrediction], LinkPrediction]) -> LinkPrediction:
-        """Apply `change` to this distribution and to its parts by material."""
-        return self._combined([self], lambda links: change(links[0]))
-
-    @classmethod
-    def _combined(
-        cls, some: Sequence[LinkPrediction], combine: Callable[[Sequence[LinkPrediction]], LinkPrediction]
-    ) -> LinkPrediction:
-        """Combine distributions, and their parts for each material; one without parts is the same for all."""
-        whole, found = combine(some), [links.by_material for links in some if links.by_material is not None]
-        if not found:
-            return whole
-        weights = found[0][1]
-        under = [(links,) * len(weights) if links.by_material is None else links.by_material[0] for links in some]
-        return replace(whole, by_material=(tuple(combine(parts) for parts in zip(*under, strict=True)), weights))
-
-    @property
-    def link_state(self) -> States:
-        """Most probable LinkState (N,)."""
-        return np.argmax([self.p_outage, self.p_los, self.p_nlos], axis=0).astype(np.uint8)
-
-    @classmethod
-    def of_parts(cls, probabilities: Any, means_db: Any, stds_db: Any, *, ops: ModuleType = np) -> Self:
-        """Combine distributions given LinkState (3, N); `ops` is NumPy, or keras.ops for tensors."""
-        mean_db = ops.maximum(ops.sum(probabilities * means_db, axis=0), GAIN_FLOOR_DB)
-        variance = ops.sum(probabilities * (stds_db**2 + (means_db - mean_db) ** 2), axis=0)
-        spread = variance > 0.0
-        return cls(
-            p_los=probabilities[LinkState.LOS],
-            p_nlos=probabilities[LinkState.NLOS],
-            p_outage=probabilities[LinkState.OUTAGE],
-            gain_mean_db=mean_db,
-            gain_std_db=ops.where(spread, ops.sqrt(ops.where(spread, variance, 1.0)), 0.0),
-            gain_los_mean_db=means_db[LinkState.LOS],
-            gain_los_std_db=stds_db[LinkState.LOS],
-            gain_nlos_mean_db=means_db[LinkState.NLOS],
-            gain_nlos_std_db=stds_db[LinkState.NLOS],
-        )
-
-    @property
-    def by_state(self) -> tuple[Floats, Floats, Floats]:
-        """Arguments of `of_parts`: probabilities, means and standard deviations [dB], each (3, N)."""
-        nothing = np.zeros_like(self.p_outage)
-        return (
-            np.stack([self.p_outage, self.p_los, self.p_nlos]),
-            np.stack([nothing + GAIN_FLOOR_DB, self.gain_los_mean_db, self.gain_nlos_mean_db]),
-            np.stack([nothing, self.gain_los_std_db, self.gain_nlos_std_db]),
-        )
-
-    @classmethod
-    def of_trace(cls, phi: LinkFeatures) -> LinkPrediction:
-        """Return the trace as a prediction without uncertainty, as on a complete map (paper, eq. 9)."""
-        return cls.of_parts(*traced_parts(phi.link_state, phi.gain_db))
-
-    def by_rule(self, phi: LinkFeatures) -> LinkPrediction:
-        """Return the mixture of this distribution, as the expert for unobserved space, with the trace."""
-        values = rule_values(phi, phi.frequency_hz or CARRIER_FREQUENCY_HZ)
-        return LinkPrediction.of_parts(*predicted(values, self.by_state))
-
-    @classmethod
-    def of_mean_losses(
-        cls, phi: LinkFeatures, walls: Floats, max_walls: int = TraceSettings.max_walls
-    ) -> LinkPrediction:
-        """Predict links by the mean loss of walls; `walls` (N,) are the expected numbers of unseen walls."""
-        return cls.of_parts(*by_mean_losses(WallTrace.of(phi), walls, max_walls))
-
-    def probability_above(self, threshold_db: float | Floats) -> Floats:
-        """Return the probability (N,) that the path gain exceeds a threshold t [dB]; an outage has -150 dB.
-
-        ``p_los Phi((m_los - t) / s_los) + p_nlos Phi((m_nlos - t) / s_nlos) + p_outage (-150 > t)`` with means m,
-        standard deviations s and the normal distribution function Phi.
-        """
-        probability = self.p_outage * (threshold_db < GAIN_FLOOR_DB)
-        for p_state, mean_db, std_db in (
-            (self.p_los, self.gain_los_mean_db, self.gain_los_std_db),
-            (self.p_nlos, self.gain_nlos_mean_db, self.gain_nlos_std_db),
-        ):
-            above_db, spread = mean_db - threshold_db, std_db > 0.0
-            normal = ndtr(above_db / np.where(spread, std_db, 1.0))
-            probability = probability + p_state * np.where(spread, normal, above_db > 0.0)
-        return probability
-
-    def amplified(self, change_db: ArrayLike) -> LinkPrediction:
-        """Return the distribution with gains higher by `change_db`, a number or (N,) [dB].
-
-        Outages stay, and no gain falls below -150 dB.
-        """
-        has_path = np.arange(len(LinkState))[:, None] != LinkState.OUTAGE
-
-        def amplified(links: LinkPrediction) -> LinkPrediction:
-            probabilities, means_db, stds_db = links.by_state
-            means_db = np.maximum(means_db + np.where(has_path, change_db, 0.0), GAIN_FLOOR_DB)
-            return LinkPrediction.of_parts(probabilities, means_db, stds_db)
-
-        return self.mapped(amplified)
-
-    def take(self, index: NDArray[np.generic] | slice | tuple[slice, slice]) -> LinkPrediction:
-        """Select links by an index array, a mask (N,), or slices."""
-        return self._by_column(lambda column: column[index])
-
-    @classmethod
-    def concatenate(cls, parts: Sequence[LinkPrediction]) -> LinkPrediction:
-        """Join links."""
-
-        def join(parts: Sequence[LinkPrediction]) -> LinkPrediction:
-            return cls.of_columns(lambda name: np.concatenate([getattr(part, name) for part in parts]))
-
-        return cls._combined(parts, join)
-
-    @classmethod
-    def mixture(cls, parts: Sequence[LinkPrediction], weights: Floats) -> LinkPrediction:
-        """Return the mixture of K distributions of the same links by weights (K,) or (K, N), which sum to 1."""
-        if len(parts) == 1:
-            return parts[0]
-        return cls._combined(parts, lambda some: cls.of_parts(*mixture([part.by_state for part in some], weights)))
-
-    def reshaped(self, shape: tuple[int, ...]) -> LinkPrediction:
-        """Return the links in another shape."""
-        return self._by_column(lambda column: column.reshape(shape))
-
-    def _by_column(self, change: Callable[[Floats], Floats]) -> LinkPrediction:
-        return self.mapped(lambda links: self.of_columns(lambda name: change(getattr(links, name))))
-
-    def where(self, taken: Bools, other: LinkPrediction) -> LinkPrediction:
-        """Return `other` where a mask (N,) is True, this distribution elsewhere."""
-
-        def choose(links: Sequence[LinkPrediction]) -> LinkPrediction:
-            here, there = links
-            return self.of_columns(lambda name: np.where(taken, getattr(there, name), getattr(here, name)))
-
-        return self._combined([self, other], choose)
-
-    def anywhere(self, p_indoor: ArrayLike) -> LinkPrediction:
-        """Return the distribution for receivers that may be outdoors, in outage (paper, "Indoor-Outdoor Estimation").
-
-        Parameters
-        ----------
-        p_indoor : (N,) array-like
-            Probability that each receiver is indoors.
-
-        Returns
-        -------
-        LinkPrediction
-
-        Raises
-        ------
-        PredictorError
-            For another shape, or a value outside [0, 1].
-        """
-        indoors = link_numbers("p_indoor", p_indoor, self.p_los.shape)
-        require_each((indoors >= 0.0) & (indoors <= 1.0), "p_indoor", indoors, "it lies between 0 and 1.")
-
-        def outdoors(links: LinkPrediction) -> LinkPrediction:
-            probabilities, means_db, stds_db = links.by_state
-            probabilities = indoors * probabilities
-            probabilities[LinkState.OUTAGE] += 1.0 - indoors
-            return LinkPrediction.of_parts(probabilities, means_db, stds_db)
-
-        return self.mapped(outdoors)
-
-
-LinkPrediction.COLUMNS = tuple(field.name for field in fields(LinkPrediction) if field.name != "by_material")
 
 
 @dataclass(frozen=True, eq=False)
@@ -633,7 +398,8 @@ class MeanLosses:
     def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
         """Predict the same links for several wall losses."""
         walls = self._walls.counts(DirectLines.of(features[0]))
-        return [LinkPrediction.of_mean_losses(phi, walls, self._max_walls) for phi in features]
+        traces = map(WallTrace.of, features)
+        return [LinkPrediction.of_parts(*by_mean_losses(trace, walls, self._max_walls)) for trace in traces]
 
 
 AnyPredictor: TypeAlias = Predictor | OtherPredictor | MeanLosses

@@ -1,4 +1,4 @@
-"""Fields of the known and unknown space of a map: exposure to unobserved space, routes between points, images.
+"""Fields of the known and unknown space of a map: exposure, routes between points, images; possible link states.
 
 Fields live on cells of 0.3 m that are centred on the mean known cell of the map, so that neither the grid of the map
 nor its origin or orientation matter. A random walk, whose steps known walls stop, defines two of them:
@@ -20,11 +20,19 @@ from numpy.typing import NDArray
 from scipy import ndimage, sparse
 from scipy.sparse.linalg import splu
 
-from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.constants import CellState
+from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.wall_cells import LEAST_NOISE
 from sionna_partial.prediction.evaluate import array_ops
-from sionna_partial.prediction.unobserved import centred_grid, overlaps
+from sionna_partial.prediction.unobserved import (
+    GRAZE,
+    centred_grid,
+    in_cells,
+    map_line_fractions,
+    overlaps,
+    parts_at_walls,
+)
 
 CELL_M = 0.3
 WALK_M = 2.0
@@ -47,6 +55,15 @@ _SEPARATE = 1e-9
 
 _FREE_ROUTE = math.log(2.0 * math.pi * (WALK_M / CELL_M) ** 2) - 0.5 * math.log(math.pi / 2.0)
 """Route in unobserved space without walls, less distance and half of its logarithm, in `WALK_M` (asymptote of K0)."""
+
+_BESIDE_CELLS = 1.5
+"""Offset of the parallel lines in `_crosses_wall` [map cells]."""
+
+_OPAQUE_CELLS = 3.0
+"""Length of a line in known walls that excludes LOS, unless it is traced on exact walls [map cells]."""
+
+_BEYOND_CELLS = 2
+"""Margin around a map, so that walls that reach its border do not separate the outside [map cells]."""
 
 _FACTORS_KEPT = 8
 """Number of maps with factors in memory, some 10 MB each."""
@@ -239,3 +256,79 @@ def _conductances(walls: Bools, shape: tuple[int, ...]) -> tuple[Floats, Floats]
         return np.maximum(centre_is_open * is_open.mean(axis=1), _SEPARATE).astype(np.float32)
 
     return across(walls, shape[0], shape[1]), across(walls.T, shape[1], shape[0]).T
+
+
+def possible_states(
+    partial: PartialMap,
+    ends_m: tuple[Floats, Floats],
+    link_state: States,
+    seen: Bools,
+    walled_m: Floats,
+    wall_noise: Floats,
+) -> Bools:
+    """Return the possible link states (N, 3) on a map, for traced states (N,) between two ends (N, 3) [m].
+
+    - A direct line across a known wall has no LOS. It crosses one if both parallel lines 1.5 cells aside meet known
+      walls, and it does so itself (`walled_m`) or is blocked in the trace; at a corner or along a face, one line stays
+      clear. Outlines of noisy walls leak: three cells in known walls also exclude LOS, unless traced along exact walls.
+    - A wholly observed direct line (`seen`) without walls has LOS as traced.
+    - Known walls, with gaps of up to two cells closed, separate regions. If the ends are in different regions, or in a
+      wholly observed one, a traced outage is certain; a wholly observed region has no other outage.
+
+    Mesh cells do not give the heights of surfaces: only the second rule applies.
+    """
+    los, states = link_state == LinkState.LOS, np.arange(len(LinkState))
+    possible, blocked = np.ones((len(los), len(LinkState)), dtype=bool), np.zeros(len(los), dtype=bool)
+    if partial.environment.is_extruded:
+        walled = walled_m > 0.0
+        doubtful = (walled & ~(seen & los)) | ~los
+        blocked[doubtful] = _crosses_wall(partial, *(end_m[doubtful] for end_m in ends_m))
+        opaque = walled_m >= _OPAQUE_CELLS * partial.resolution_m
+        opaque &= ~los | (wall_noise > LEAST_NOISE)
+        blocked |= opaque
+        walled_off, enclosed = _regions(partial, *ends_m)
+        outage = (walled_off | enclosed) & (link_state == LinkState.OUTAGE)
+        possible[outage] = states == LinkState.OUTAGE
+        possible[enclosed & ~outage, LinkState.OUTAGE] = False
+        seen = seen & ~walled
+    possible[blocked | (seen & ~los), LinkState.LOS] = False
+    possible[seen & los] = states == LinkState.LOS
+    return possible
+
+
+def _crosses_wall(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> Bools:
+    crosses = np.zeros((2, len(rx_m)), dtype=bool)
+    for walls, rows, *ends_m in parts_at_walls(partial, tx_m, rx_m):
+        starts, ends = (in_cells(partial, end_m) for end_m in ends_m)
+        along = ends - starts
+        lengths = np.maximum(np.linalg.norm(along, axis=1, keepdims=True), GRAZE)
+        aside = _BESIDE_CELLS * np.stack([-along[:, 1], along[:, 0]], axis=1) / lengths
+        for side, step in enumerate((aside, -aside)):
+            crosses[side, rows] |= map_line_fractions(walls, starts + step, ends + step)[:, CellState.WALL] > GRAZE
+    return np.asarray(crosses.all(axis=0))
+
+
+def _regions(partial: PartialMap, tx_m: Floats, rx_m: Floats) -> tuple[Bools, Bools]:
+    """Return whether the ends (N,) are in different regions, and whether both are in a wholly observed one."""
+    state = np.pad(partial.wall_levels[0][1].state, _BEYOND_CELLS, constant_values=CellState.UNKNOWN)
+    regions, count = ndimage.label(~ndimage.binary_dilation(state == CellState.WALL, np.ones((3, 3), dtype=bool)))
+    observed = np.ones(count + 1, dtype=bool)
+    observed[regions[state == CellState.UNKNOWN]] = False
+    tx, rx = (_region_at(partial, regions, points_m) for points_m in (tx_m, rx_m))
+    known = (tx > 0) & (rx > 0)
+    return known & (tx != rx), known & (tx == rx) & observed[tx]
+
+
+def _region_at(partial: PartialMap, regions: NDArray[np.int32], points_m: Floats) -> NDArray[np.int32]:
+    """Return the region (N,) at or beside points (N, 3) [m]; 0 if there is none or more than one.
+
+    `regions` include the margin `_BEYOND_CELLS`, and are 0 within a cell of a wall.
+    """
+    row, column = (index + _BEYOND_CELLS for index in partial.cell_index(points_m))
+    around = [
+        regions[np.clip(row + up, 0, len(regions) - 1), np.clip(column + right, 0, regions.shape[1] - 1)]
+        for up, right in itertools.product((-1, 0, 1), repeat=2)
+    ]
+    largest = np.max(around, axis=0)
+    alone = np.all([(each == 0) | (each == largest) for each in around], axis=0)
+    return np.where(alone, largest, 0)

@@ -9,9 +9,11 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices, States
 from sionna_partial.constants import CellState
+from sionna_partial.maps.environment import uniform_cells
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import uniform_cells
 from sionna_partial.process import core_count, in_order, njit
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import SEEN_M
 
 _FREE, _WALL, _UNKNOWN = int(CellState.FREE), int(CellState.WALL), int(CellState.UNKNOWN)
 
@@ -234,3 +236,31 @@ def overlaps(edges: Floats, count: int) -> Floats:
     cells = np.arange(count)
     low, high = np.maximum(edges[:-1, None], cells), np.minimum(edges[1:, None], cells + 1)
     return np.maximum(high - low, 0.0) / np.diff(edges)[:, None]
+
+
+def path_unobserved_m(
+    partial: PartialMap, start_m: Floats, interactions: NDArray[np.uint8], vertices_m: Floats, end_m: Floats
+) -> Floats:
+    """Return the length (P,) of paths in unknown cells [m]; 0 for links that a complete map encloses.
+
+    Paths lead from `start_m` (P, 3) by `vertices_m` (P, D, 3), where `interactions` (P, D) is not 0, to `end_m` (P, 3).
+    """
+    total_m = np.zeros(len(start_m))
+    rows = np.flatnonzero(~is_enclosed(partial, start_m, end_m))
+    here_m = start_m[rows]
+    for depth in range(interactions.shape[1] if len(rows) else 0):
+        there = interactions[rows, depth] > 0
+        there_m = vertices_m[rows[there], depth]
+        total_m[rows[there]] += lengths_in_unknown_m(partial, here_m[there], there_m)
+        here_m[there] = there_m
+    total_m[rows] += lengths_in_unknown_m(partial, here_m, end_m[rows])
+    return total_m
+
+
+def traced_unobserved_m(partial: PartialMap, links: TracedLinks, paths: Indices) -> Floats:
+    tx_m, rx_m = links.tx.reshape(-1, 3)[links.path_tx[paths]], links.rx[links.path_rx[paths]]
+    return path_unobserved_m(partial, tx_m, links.interactions[paths], links.vertices_m[paths], rx_m)
+
+
+def attenuation(unobserved_m: Floats, length_m: float) -> Floats:
+    return np.exp(-unobserved_m / length_m) if length_m > 0.0 else (unobserved_m < SEEN_M).astype(np.float64)

@@ -24,7 +24,7 @@ from sionna_partial.files import atomic_write
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.evaluate import Network, array_ops
 from sionna_partial.prediction.features import LinkFeatures, context_of
-from sionna_partial.prediction.map_networks import kernel_starts, u_net
+from sionna_partial.prediction.map_training import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.rule import RARE, Parts

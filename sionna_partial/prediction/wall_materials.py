@@ -7,16 +7,18 @@ residuals of a trace are a Gaussian process, white noise, a common offset and a 
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Floats
-from sionna_partial.prediction.features import LinkFeatures
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.prediction.features import LinkFeatures, context_of
 from sionna_partial.settings import DRYWALL, WALL_MATERIALS
+from sionna_partial.tracing.paths import path_gain_db
 from sionna_partial.tracing.power import wall_loss_db
 
 COMMON = {"drywall": 0.4, "brick": 0.35, "concrete": 0.25}
@@ -105,8 +107,9 @@ class WallMaterials:
         return cls((losses_db - traced_db)[pairs.T], reflection_db, prior, names[pairs.T], traced_db)
 
     def under(self, phi: LinkFeatures, fractions: Floats) -> list[LinkFeatures]:
+        """Return the features under each candidate; `fractions` (2,) of walls are from `PartialMap.unnamed_walls`."""
         pairs = zip(self.crossing_db, self.reflection_db.tolist(), strict=True)
-        return [phi.with_extra_losses(*pair, fractions) for pair in pairs]
+        return [with_extra_losses(phi, *pair, fractions) for pair in pairs]
 
     def attributes(self, weights: Floats, fractions: Floats) -> dict[str, str | float]:
         mean_db = float(weights @ self.crossing_db @ fractions / fractions.sum())
@@ -115,6 +118,27 @@ class WallMaterials:
     def text(self, weights: Floats) -> str:
         thin, thick = (_probabilities(weights, names) for names in self.names.T)
         return thin if thin == thick else f"{thin}; thick walls {thick}"
+
+
+def with_extra_losses(
+    phi: LinkFeatures, crossing_db: Floats, reflection_db: float, fractions: ArrayLike = (1.0, 0.0)
+) -> LinkFeatures:
+    """Return features with additional losses (2,) per crossing of a thin or thick wall and per reflection [dB]."""
+    assert phi.path_power is not None
+    power, sizes, context = phi.path_power, phi.path_power.shape[1:], context_of(phi)
+    losses_db = [*crossing_db[: len(sizes) - 1], reflection_db]
+    for loss_db, size in zip(reversed(losses_db), reversed(sizes), strict=True):
+        power = power @ 10.0 ** (-loss_db * np.arange(size) / 10.0)
+    gain_db = path_gain_db(power)
+    states = np.where(gain_db > GAIN_FLOOR_DB, phi.link_state, LinkState.OUTAGE)
+    change_db = float(np.dot(crossing_db, fractions))
+    straight_db = context.straight_gain_db - change_db / np.sum(fractions) * context.straight_walls
+    context = replace(
+        context,
+        straight_gain_db=np.maximum(straight_db, GAIN_FLOOR_DB),
+        wall_loss_db=context.wall_loss_db + change_db,
+    )
+    return replace(phi, gain_db=gain_db, link_state=states, context=context)
 
 
 def _probabilities(weights: Floats, names: NDArray[np.str_]) -> str:

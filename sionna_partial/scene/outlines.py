@@ -18,18 +18,21 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from sionna_partial.arrays import Bools, Floats, Indices, States, cross, span_in_strip
-from sionna_partial.constants import CellState
-from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import (
-    CENTRED_NOISE,
+from sionna_partial.arrays import (
+    Bools,
+    Floats,
+    Indices,
+    States,
     canonical,
     counted_near,
-    fit_runs,
-    noise_field,
+    cross,
     row_runs,
-    wall_cells,
+    span_in_strip,
 )
+from sionna_partial.constants import CellState
+from sionna_partial.maps.partial_map import PartialMap
+from sionna_partial.maps.straight_runs import fit_runs
+from sionna_partial.maps.wall_cells import CENTRED_NOISE, noise_field, wall_cells
 from sionna_partial.process import njit
 
 _KEY = 1 << 32

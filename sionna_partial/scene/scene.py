@@ -2,7 +2,6 @@
 
 import itertools
 import logging
-import os
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -15,22 +14,18 @@ import shapely
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, Indices
+from sionna_partial.arrays import Bools, Floats, Indices, row_runs
 from sionna_partial.checks import settings_or_default
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, CellState
-from sionna_partial.files import atomic_folder
 from sionna_partial.llvm import load_llvm
-from sionna_partial.maps.environment import SceneMesh
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap, require_map
-from sionna_partial.maps.ros_map import write_ros_map
-from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.scene.outlines import Outlines, Plan, cut_by_material, lattice_outlines, prepare_plan, wall_outlines
 from sionna_partial.settings import DRYWALL, ITU_BANDS_GHZ, Material, SceneSettings
 
 _log = logging.getLogger(__name__)
 
 FLAT_SHAPES = ("floor", "ceiling")
-
 
 SIONNA_LOAD_GHZ = 3.5
 """Frequency at which Sionna RT evaluates materials while loading [GHz]."""
@@ -156,7 +151,7 @@ def build_scene(partial: PartialMap, settings: SceneSettings | None = None) -> S
         wall_material=walls.material,
         materials=(settings.traced_material, *partial.wall_materials),
         top_m=walls.top_m,
-        lids=tuple(_lids(partial, walls)),
+        lids=tuple(_lids(partial, walls.outlines.vertices_m[walls.outlines.segments], walls.material, walls.top_m)),
         floor_m=_rectangles(floor_cells(partial, settings.floor_extent)).astype(float) * partial.resolution_m,
         cell_m=partial.resolution_m,
         height_m=partial.wall_height_m,
@@ -183,58 +178,6 @@ def _walls(partial: PartialMap, settings: SceneSettings) -> _Walls:
     return _Walls(
         Outlines(vertices_m, segments), material[order], np.concatenate([each.top_m for each in parts])[order]
     )
-
-
-def export_scene(
-    partial: PartialMap,
-    folder: str | os.PathLike[str],
-    scene_settings: SceneSettings | None = None,
-    *,
-    frequency_hz: float = CARRIER_FREQUENCY_HZ,
-) -> Path:
-    """Write a map as a scene folder that stock Sionna RT loads.
-
-    The folder holds `scene.xml`; the non-empty meshes `meshes/walls.ply`, `walls1.ply` and so on (for
-    `wall_materials`), `floor.ply` and `ceiling.ply`, or `part0.ply` and so on for the materials of a mesh; and the map
-    as `map.yaml` and `map.pgm`, which `load_map` reads. Scene coordinates are world coordinates minus `scene_offset`
-    in `map.yaml`: zero for maps within 1 km of the origin, else the lower-left corner of the map, or whole metres on
-    the far axes of a mesh.
-
-    Parameters
-    ----------
-    partial : PartialMap
-    folder : path-like
-        New or empty folder, or an exported scene, which is replaced.
-    scene_settings : SceneSettings, optional
-        Tolerances, floor extent and material.
-    frequency_hz : float
-        Frequency [Hz] for ITU materials that Sionna RT cannot load by name.
-
-    Raises
-    ------
-    SettingsError
-        For a frequency that the material does not cover.
-    OutputError
-        If writing fails. No partial scene remains.
-
-    Examples
-    --------
-    >>> import tempfile, sionna_partial as sp
-    >>> home = sp.make_home(3, "apartment")
-    >>> with tempfile.TemporaryDirectory() as folder:
-    ...     scene = sp.export_scene(home, f"{folder}/scene")
-    ...     sorted(path.name for path in scene.iterdir()), sp.load_map(scene) == home
-    (['map.pgm', 'map.yaml', 'meshes', 'scene.xml'], True)
-    """
-    require_map("partial", partial)
-    settings, environment = scene_settings_of(partial, scene_settings), partial.environment
-    offset_m = environment.scene_offset_m(partial.bounds_m)
-    for material in environment.known_materials(settings.traced_material):
-        material.require_frequency(frequency_hz)
-    with atomic_folder(folder) as target:
-        write_map(partial, target, settings, offset_m=offset_m, frequency_hz=frequency_hz)
-        write_ros_map(partial, target / "map.yaml", {"scene_offset": offset_m})
-    return Path(folder)
 
 
 def write_map(
@@ -397,28 +340,6 @@ def _meshes(geometry: SceneGeometry) -> dict[str, tuple[Floats, NDArray[np.int64
     return meshes
 
 
-def _lids(partial: PartialMap, walls: _Walls) -> Iterator[Lid]:
-    """Cover areas inside outlines of obstacles of one height, except mostly free ones."""
-    free = partial.state == CellState.FREE
-    row, column = np.indices(partial.shape)
-    centres_m = (np.stack([column, row], axis=-1) + 0.5) * partial.resolution_m
-    for top_m in np.unique(walls.top_m[walls.top_m < partial.wall_height_m]).tolist():
-        sides = np.flatnonzero(walls.top_m == top_m)
-        lines = shapely.linestrings(walls.outlines.vertices_m[walls.outlines.segments[sides]])
-        for area in shapely.get_parts(shapely.polygonize(lines)):
-            first, last = (np.floor(np.reshape(area.bounds, (2, 2)) / partial.resolution_m)).astype(int)
-            window = slice(max(first[1], 0), last[1] + 1), slice(max(first[0], 0), last[0] + 1)
-            inside = shapely.contains_xy(area, *np.moveaxis(centres_m[window], -1, 0))
-            if 2 * (inside & free[window]).sum() > inside.sum():
-                continue
-            beside = sides[shapely.covers(shapely.buffer(shapely.boundary(area), 1e-6), lines)]
-            material = int(np.bincount(walls.material[beside], minlength=1).argmax())
-            parts = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
-            rings = shapely.get_coordinates(shapely.orient_polygons(parts)).reshape(-1, 4, 2)[:, :3]
-            corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
-            yield Lid(corners, index.reshape(-1, 3).astype(np.int64), top_m, material)
-
-
 def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
     """Return the vertices (V,) where a single wall ends and the next cell is not free."""
     ends, tails = outlines.segments.ravel(), outlines.segments[:, ::-1].ravel()
@@ -430,16 +351,41 @@ def _open_ends(partial: PartialMap, outlines: Outlines) -> Bools:
     return is_open & (np.bincount(ends, minlength=len(is_open)) == 1)
 
 
+def _lids(partial: PartialMap, walls_m: Floats, material: Indices, top_m: Floats) -> Iterator[Lid]:
+    """Cover areas inside outlines of obstacles of one height, except mostly free ones."""
+    free = partial.state == CellState.FREE
+    row, column = np.indices(partial.shape)
+    centres_m = (np.stack([column, row], axis=-1) + 0.5) * partial.resolution_m
+    for level_m in np.unique(top_m[top_m < partial.wall_height_m]).tolist():
+        sides = np.flatnonzero(top_m == level_m)
+        lines = shapely.linestrings(walls_m[sides])
+        for area in shapely.get_parts(shapely.polygonize(lines)):
+            first, last = (np.floor(np.reshape(area.bounds, (2, 2)) / partial.resolution_m)).astype(int)
+            window = slice(max(first[1], 0), last[1] + 1), slice(max(first[0], 0), last[0] + 1)
+            inside = shapely.contains_xy(area, *np.moveaxis(centres_m[window], -1, 0))
+            if 2 * (inside & free[window]).sum() > inside.sum():
+                continue
+            beside = sides[shapely.covers(shapely.buffer(shapely.boundary(area), 1e-6), lines)]
+            most = int(np.bincount(material[beside], minlength=1).argmax())
+            parts = shapely.get_parts(shapely.constrained_delaunay_triangles(area))
+            yield Lid(*_joined(parts), level_m, most)
+
+
 def _triangles(rectangles_m: Floats, cell_m: float) -> tuple[Floats, NDArray[np.int64]]:
     """Return corners (V, 2) and counterclockwise triangles (F, 3) of an area.
 
     Triangles share whole edges: an inner edge must not look like the rim of a screen, which diffracts.
     """
     area = shapely.simplify(shapely.union_all(shapely.box(*np.rint(rectangles_m / cell_m).T)), 0.0)
-    rings = shapely.get_coordinates(shapely.orient_polygons(_pieces(area))).reshape(-1, 4, 2)[:, :3]
+    corners, triangles = _joined(_pieces(area))
+    return corners * cell_m, triangles[np.lexsort(triangles.T)]
+
+
+def _joined(parts: NDArray[np.object_]) -> tuple[Floats, NDArray[np.int64]]:
+    """Return common corners (V, 2) and counterclockwise corner numbers (F, 3) of triangles."""
+    rings = shapely.get_coordinates(shapely.orient_polygons(parts)).reshape(-1, 4, 2)[:, :3]
     corners, index = np.unique(rings.reshape(-1, 2), axis=0, return_inverse=True)
-    triangles = index.reshape(-1, 3)
-    return corners * cell_m, triangles[np.lexsort(triangles.T)].astype(np.int64)
+    return corners, index.reshape(-1, 3).astype(np.int64)
 
 
 def _pieces(area: shapely.Geometry) -> NDArray[np.object_]:

@@ -13,21 +13,16 @@ from copy import copy
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
-from sionna_partial.errors import BackendError
-from sionna_partial.llvm import load_llvm
-from sionna_partial.process import signals_held
+from sionna_partial.llvm import load_sionna
 from sionna_partial.scene.scene import PowerLaw, power_laws
 from sionna_partial.settings import Material, TraceSettings
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
-
-MITSUBA_VARIANT = "llvm_ad_mono_polarized"
 
 TESTED_VERSION = "2.2"
 """Release of Sionna RT whose internals are used."""
@@ -35,30 +30,10 @@ TESTED_VERSION = "2.2"
 REMEDY = f"""run pip install "sionna-rt=={TESTED_VERSION}.*" to have the fast engine back."""
 
 _BUFFER_COLUMNS = "_vertices_x", "_vertices_y", "_vertices_z", "_shapes", "_primitives", "_interaction_types"
-
 _BUFFER_FIELDS = {*_BUFFER_COLUMNS, "_valid", "_src_indices", "_tgt_indices", "_paths_counter", "_diffracting_wedges"}
 """Private fields of `PathsBuffer` that are filled here."""
 
 _log = logging.getLogger(__name__)
-
-
-def load_sionna() -> ModuleType:
-    """Import Sionna RT with a working LLVM, or raise a BackendError with the remedy."""
-    load_llvm()
-    with signals_held():
-        import mitsuba as mi
-
-        if mi.variant() is None:
-            mi.set_variant(MITSUBA_VARIANT)
-    if mi.variant() != MITSUBA_VARIANT:
-        raise BackendError(
-            f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
-            "before the first trace, or import sionna_partial in a process of its own."
-        )
-    with signals_held():
-        import sionna.rt
-
-    return sionna.rt
 
 
 @functools.cache
@@ -79,17 +54,16 @@ def engine_fault() -> str:
 
 def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> Any:
     """Load a scene into Sionna RT with separate shapes and isotropic antennas: vertical, or V and H for 2."""
-    rt = load_sionna()
-    scene = rt.load_scene(str(scene_xml), merge_shapes=False)
+    scene = load_sionna().load_scene(str(scene_xml), merge_shapes=False)
     scene.frequency = frequency_hz
     set_antennas(scene, polarisations)
     return scene
 
 
 def set_antennas(scene: Any, polarisations: int) -> None:
-    array = load_sionna().PlanarArray
     polarization = "V" if polarisations == 1 else "VH"
-    scene.tx_array = scene.rx_array = array(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+    array = load_sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+    scene.tx_array = scene.rx_array = array
 
 
 def _follow_frequency(scene: Any, materials: Mapping[str, Material], frequency_hz: float) -> None:
@@ -212,10 +186,9 @@ _ALIGNMENT_BYTES = 64
 
 def to_device(kind: Any, values: NDArray[Any]) -> Any:
     """Copy an array to Dr.Jit, aligned as its own arrays: for other mixtures it compiles kernels anew."""
-    count = values.size * values.itemsize
-    room = np.empty(count + _ALIGNMENT_BYTES, np.uint8)
+    room = np.empty(values.nbytes + _ALIGNMENT_BYTES, np.uint8)
     skip = -room.ctypes.data % _ALIGNMENT_BYTES
-    aligned = room[skip : skip + count].view(values.dtype).reshape(values.shape)
+    aligned = room[skip : skip + values.nbytes].view(values.dtype).reshape(values.shape)
     aligned[...] = values
     return kind(aligned)
 
@@ -265,6 +238,7 @@ class SceneSolver:
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
 
         self._scene = open_scene(scene_xml, settings.frequency_hz)
+        self.mi_scene = self._scene.mi_scene
         _follow_frequency(self._scene, materials or {}, settings.frequency_hz)
         self._field = settings.samples_per_tx, self._scene.tx_array.antenna_pattern.patterns
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
@@ -276,8 +250,7 @@ class SceneSolver:
         )
         shape = np.repeat(np.array([shape.object_id for shape in objects], np.uint32), faces)
         self._shape_of_face = np.append(shape, np.uint32(INVALID_SHAPE))  # the last is for no face, -1
-        primitive = np.concatenate([np.arange(0, dtype=np.uint32), *map(np.arange, faces)]).astype(np.uint32)
-        self._primitive_of_face = np.append(primitive, np.uint32(INVALID_PRIMITIVE))
+        self._primitive_of_face = np.concatenate([*map(np.arange, faces), [INVALID_PRIMITIVE]]).astype(np.uint32)
         self._symbolic, self._evaluated = _Verification("symbolic"), _Verification("evaluated")
 
     def polarised(self, polarisations: int) -> "SceneSolver":
@@ -289,15 +262,10 @@ class SceneSolver:
     @property
     def materials(self) -> dict[str, Floats]:
         """Relative permittivity, conductivity [S/m] and thickness [m] (3,) of each material, by name."""
-        constants = ("relative_permittivity", "conductivity", "thickness")
         return {
-            name: np.ravel([getattr(material, constant) for constant in constants]).astype(np.float64)
-            for name, material in self._scene.radio_materials.items()
+            name: np.ravel([each.relative_permittivity, each.conductivity, each.thickness]).astype(np.float64)
+            for name, each in self._scene.radio_materials.items()
         }
-
-    @property
-    def mi_scene(self) -> Any:
-        return self._scene.mi_scene
 
     def verify(self, candidates: Candidates, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, Indices]:
         """Return the verified paths and the candidate (P,) of each path.
@@ -406,8 +374,8 @@ class SceneSolver:
         finally:
             self._scene.frequency = frequency
             for material, permittivity, conductivity, thickness in kept:
-                material.relative_permittivity = permittivity
-                material.conductivity, material.thickness = conductivity, thickness
+                material.relative_permittivity, material.conductivity = permittivity, conductivity
+                material.thickness = thickness
 
     def _buffer(self, candidates: Candidates) -> Any:
         import mitsuba as mi
@@ -455,15 +423,6 @@ class SceneSolver:
         )
 
 
-def forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
-    import drjit as dr
-
-    for leaf in leaves:
-        dr.clear_grad(results)
-        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
-        yield dr.grad(results)
-
-
 def _points(positions_m: Floats) -> Any:
     import drjit as dr
     import mitsuba as mi
@@ -478,14 +437,13 @@ def _read_buffer(buffer: Any, tx_m: Floats, rx_m: Floats) -> tuple[SolvedPaths, 
     a = buffer.a[0][0]
     valid = np.flatnonzero(buffer.valid.numpy() & ((a.real.numpy() != 0.0) | (a.imag.numpy() != 0.0)))
     transfer = np.array([[a.real.numpy()[valid] + 1j * a.imag.numpy()[valid] for a in row] for row in buffer.a])
+    vertices_m = [getattr(buffer, f"vertices_{axis}").numpy()[valid] for axis in "xyz"]
     paths = SolvedPaths.of_vertices(
         path_rx=buffer.target_indices.numpy()[valid].astype(np.int32),
         transfer=np.moveaxis(transfer, 2, 0).astype(np.complex128),
         delay_s=buffer.tau.numpy()[valid].astype(np.float64),
         interactions=buffer.interaction_types.numpy()[valid].astype(np.uint8),
-        vertices_m=np.stack(
-            [axis.numpy()[valid] for axis in (buffer.vertices_x, buffer.vertices_y, buffer.vertices_z)], axis=2
-        ),
+        vertices_m=np.stack(vertices_m, axis=2),
         tx_m=tx_m,
         rx_m=rx_m,
     )

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import Progress
 from sionna_partial.constants import CellState
-from sionna_partial.maps.environment import SceneMesh
 from sionna_partial.maps.mesh.cells import narrow_areas
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings

@@ -16,8 +16,9 @@ from sionna_partial.display import Shown, reporting
 from sionna_partial.errors import PositionError
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.settings import SceneSettings, TraceSettings, takes_settings
-from sionna_partial.tracing.links import LinkSums
-from sionna_partial.tracing.simulation import Simulation, checked_positions, simulation_of
+from sionna_partial.tracing.paths import LinkSums
+from sionna_partial.tracing.positions import checked_positions
+from sionna_partial.tracing.simulation import Simulation, simulation_of
 
 
 def one_transmitter(tx: ArrayLike) -> ArrayLike:

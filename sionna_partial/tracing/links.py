@@ -9,18 +9,18 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
+from sionna_partial.arrays import Bools, Floats, States, read_only
 from sionna_partial.checks import require_choice
-from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER, LinkState
+from sionna_partial.constants import GAIN_FLOOR_DB, MEMORY_GB, NO_RECEIVER
 from sionna_partial.display import Shown
 from sionna_partial.settings import SceneSettings, TraceSettings
-from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
-from sionna_partial.tracing.paths import SolvedPaths, path_gain_db
+from sionna_partial.tracing.interactions import REFRACTION
+from sionna_partial.tracing.paths import SolvedPaths
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from sionna_partial.tracing.responses import ArrayPaths
+    from sionna_partial.tracing.array_paths import ArrayPaths
 
 
 @read_only
@@ -103,7 +103,7 @@ class TracedLinks(Shown):
 
     def array_paths(self, **arrays: Any) -> ArrayPaths:
         """Return the paths between antenna arrays, given by the arguments of `cir`."""
-        from sionna_partial.tracing.responses import ArrayPaths
+        from sionna_partial.tracing.array_paths import ArrayPaths
 
         return ArrayPaths.of(self.solved, self.tx.reshape(-1, 3), self.rx, self.trace_settings, **arrays)
 
@@ -333,18 +333,13 @@ class TracedLinks(Shown):
         names = [*(field.name for field in fields(self) if not field.name.endswith("settings")), "a"]
         along = ["theta", "phi"]
         axes = {"axis": ["x", "y", "z"], "angle": ["zenith", "azimuth"], "at_rx": along, "at_tx": along}
-        table = xr.Dataset(
-            {
-                f"{name}_m" if name in ("tx", "rx") else name: (
-                    shapes.get(name, ("path",)),
-                    getattr(self, name),
-                    _VARIABLES[name],
-                )
-                for name in names
-            },
-            coords=axes,
-            attrs={"frequency_hz": self.trace_settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB},
-        )
+        variables = {}
+        for name in names:
+            about = dict(zip(("long_name", "units"), _VARIABLES[name], strict=True))
+            own_name = f"{name}_m" if name in ("tx", "rx") else name
+            variables[own_name] = shapes.get(name, ("path",)), getattr(self, name), about
+        attributes = {"frequency_hz": self.trace_settings.frequency_hz, "gain_floor_db": GAIN_FLOOR_DB}
+        table = xr.Dataset(variables, axes, attributes)
         for name in ("trace_settings", "scene_settings"):
             table.attrs[name] = json.dumps(asdict(getattr(self, name)), sort_keys=True)
         return table
@@ -405,11 +400,8 @@ class TracedLinks(Shown):
 
         require_choice("of", of, ("links", "paths"))
         columns = self._link_columns() if of == "links" else self._path_columns()
-        return (
-            xr.Dataset({name: ("row", values) for name, values in columns.items()})
-            .to_dataframe()
-            .reset_index(drop=True)
-        )
+        table = xr.Dataset({name: ("row", values) for name, values in columns.items()})
+        return table.to_dataframe().reset_index(drop=True)
 
     def _link_columns(self) -> dict[str, NDArray[Any]]:
         tx_m, count = self.tx.reshape(-1, 3), len(self.rx)
@@ -439,62 +431,19 @@ class TracedLinks(Shown):
         }
 
 
-def _variable(long_name: str, units: str = "1") -> dict[str, str]:
-    return {"long_name": long_name, "units": units}
-
-
 _VARIABLES = {
-    "tx": _variable("transmitter position", "m"),
-    "rx": _variable("receiver position", "m"),
-    "link_state": _variable("link state: 0 outage, 1 LOS, 2 NLOS, 255 not traced"),
-    "gain_db": _variable("omnidirectional path gain", "dB"),
-    "path_tx": _variable("transmitter of the path"),
-    "path_rx": _variable("receiver of the path"),
-    "transfer": _variable("transfer matrix of the path between isotropic antennas"),
-    "a": _variable("complex path gain between isotropic, vertically polarised antennas"),
-    "delay_s": _variable("propagation delay", "s"),
-    "departure_rad": _variable("angles of departure", "rad"),
-    "arrival_rad": _variable("angles of arrival", "rad"),
-    "interactions": _variable("Sionna RT's InteractionType in order from the transmitter, 0 for none"),
-    "vertices_m": _variable("points of interaction", "m"),
+    "tx": ("transmitter position", "m"),
+    "rx": ("receiver position", "m"),
+    "link_state": ("link state: 0 outage, 1 LOS, 2 NLOS, 255 not traced", "1"),
+    "gain_db": ("omnidirectional path gain", "dB"),
+    "path_tx": ("transmitter of the path", "1"),
+    "path_rx": ("receiver of the path", "1"),
+    "transfer": ("transfer matrix of the path between isotropic antennas", "1"),
+    "a": ("complex path gain between isotropic, vertically polarised antennas", "1"),
+    "delay_s": ("propagation delay", "s"),
+    "departure_rad": ("angles of departure", "rad"),
+    "arrival_rad": ("angles of arrival", "rad"),
+    "interactions": ("Sionna RT's InteractionType in order from the transmitter, 0 for none", "1"),
+    "vertices_m": ("points of interaction", "m"),
 }
-
-
-class LinkSums:
-    """Power of links (T, N) and line of sight, added up over blocks of paths.
-
-    `path_power` (T N, ...) is by walls crossed, of one class or two, and reflections, up to the numbers `most`; the
-    last entries include larger numbers.
-    """
-
-    def __init__(self, transmitters: int, receivers: int, *most: int) -> None:
-        self._shape = transmitters, receivers
-        self.path_power = np.zeros((transmitters * receivers, *(count + 1 for count in most)))
-        self._is_direct = np.zeros(transmitters * receivers, dtype=bool)
-
-    @property
-    def power(self) -> Floats:
-        """Power of each link (T N,)."""
-        power: Floats = self.path_power.sum(axis=tuple(range(1, self.path_power.ndim)))
-        return power
-
-    def add(self, paths: SolvedPaths, classes: NDArray[np.uint8] | None = None) -> None:
-        """Add paths; `classes` (P, D) are from `PartialMap.wall_classes`."""
-        link, sizes = paths.link(self._shape[1]), self.path_power.shape[1:]
-        counted = () if classes is None else unnamed_counts(paths.interactions, classes, len(sizes) - 1)
-        counts = (np.minimum(count, size - 1) for count, size in zip(counted, sizes, strict=True))
-        np.add.at(self.path_power, (link, *counts), paths.power)
-        self._is_direct[link[paths.is_direct]] = True
-
-    def states_and_gains(self) -> tuple[States, Floats]:
-        """Return link state and path gain [dB] (T, N)."""
-        gain_db = path_gain_db(self.power)
-        link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
-        link_state[self._is_direct] = LinkState.LOS
-        return link_state.reshape(self._shape), gain_db.reshape(self._shape)
-
-
-def unnamed_counts(interactions: NDArray[np.uint8], classes: NDArray[np.uint8], walls: int = 2) -> list[Indices]:
-    """Count the crossings of walls of each class and the reflections (P,) at walls of unnamed materials."""
-    at = [(interactions == REFRACTION) & (classes == number) for number in range(1, walls + 1)]
-    return [np.count_nonzero(mask, axis=1) for mask in (*at, (interactions == REFLECTION) & (classes > 0))]
+"""Descriptions and units of the variables of `to_xarray`."""

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.display import Shown
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, forward_passes, to_device
-from sionna_partial.tracing.links import LinkSums, TracedLinks
-from sionna_partial.tracing.paths import Candidates, SolvedPaths, join_paths
+from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, to_device
+from sionna_partial.tracing.links import TracedLinks
+from sionna_partial.tracing.paths import Candidates, LinkSums, SolvedPaths, join_paths
 
 PATHS_PER_BLOCK = 50_000
 """Number of paths evaluated together, to bound the memory."""
@@ -198,7 +198,7 @@ class PathSet:
                 vertices_m = dr.zeros(type(power))
             results = power, vertices_m + dr.opaque(type(power), 0.0)  # power is made of them: theirs would be cleared
             for name in names:
-                for entry, slopes in enumerate(forward_passes(results, leaves[name])):
+                for entry, slopes in enumerate(_forward_passes(results, leaves[name])):
                     yield rows, name, entry, slopes
 
     def _moves(self, parameters: PathParameters) -> bool:
@@ -258,3 +258,13 @@ def _merged(parts: list[Part]) -> list[Part]:
             whole = len(rows) == len(paths.a)
             merged.append((candidates, paths) if whole else (candidates.rows(rows), paths.take(rows)))
     return merged
+
+
+def _forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
+    """Yield the derivatives of results by each variable."""
+    import drjit as dr
+
+    for leaf in leaves:
+        dr.clear_grad(results)
+        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
+        yield dr.grad(results)

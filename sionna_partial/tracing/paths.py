@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.constants import GAIN_FLOOR_DB
+from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.constants import GAIN_FLOOR_DB, LinkState
+from sionna_partial.tracing.interactions import REFLECTION, REFRACTION
 
 SHORTEST_LEG_M = 0.0101
 """Sionna RT drops paths with legs of 1 cm or less [m]."""
@@ -274,3 +275,43 @@ def path_gain_db(power: Floats) -> Floats:
     """Return the omnidirectional path gain [dB], at least -150, for a sum of |a|^2 (paper, eq. 5)."""
     with np.errstate(divide="ignore"):
         return np.maximum(10.0 * np.log10(power), GAIN_FLOOR_DB)
+
+
+class LinkSums:
+    """Power of links (T, N) and line of sight, added up over blocks of paths.
+
+    `path_power` (T N, ...) is by walls crossed, of one class or two, and reflections, up to the numbers `most`; the
+    last entries include larger numbers.
+    """
+
+    def __init__(self, transmitters: int, receivers: int, *most: int) -> None:
+        self._shape = transmitters, receivers
+        self.path_power = np.zeros((transmitters * receivers, *(count + 1 for count in most)))
+        self._is_direct = np.zeros(transmitters * receivers, dtype=bool)
+
+    @property
+    def power(self) -> Floats:
+        """Power of each link (T N,)."""
+        power: Floats = self.path_power.sum(axis=tuple(range(1, self.path_power.ndim)))
+        return power
+
+    def add(self, paths: SolvedPaths, classes: NDArray[np.uint8] | None = None) -> None:
+        """Add paths; `classes` (P, D) are from `PartialMap.wall_classes`."""
+        link, sizes = paths.link(self._shape[1]), self.path_power.shape[1:]
+        counted = () if classes is None else unnamed_counts(paths.interactions, classes, len(sizes) - 1)
+        counts = (np.minimum(count, size - 1) for count, size in zip(counted, sizes, strict=True))
+        np.add.at(self.path_power, (link, *counts), paths.power)
+        self._is_direct[link[paths.is_direct]] = True
+
+    def states_and_gains(self) -> tuple[States, Floats]:
+        """Return link state and path gain [dB] (T, N)."""
+        gain_db = path_gain_db(self.power)
+        link_state = np.where(gain_db > GAIN_FLOOR_DB, LinkState.NLOS, LinkState.OUTAGE).astype(np.uint8)
+        link_state[self._is_direct] = LinkState.LOS
+        return link_state.reshape(self._shape), gain_db.reshape(self._shape)
+
+
+def unnamed_counts(interactions: NDArray[np.uint8], classes: NDArray[np.uint8], walls: int = 2) -> list[Indices]:
+    """Count the crossings of walls of each class and the reflections (P,) at walls of unnamed materials."""
+    at = [(interactions == REFRACTION) & (classes == number) for number in range(1, walls + 1)]
+    return [np.count_nonzero(mask, axis=1) for mask in (*at, (interactions == REFLECTION) & (classes > 0))]

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import itertools
 import logging
-import math
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -16,19 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sionna_partial.arrays import Bools, Floats, Indices
-from sionna_partial.checks import (
-    Progress,
-    no_progress,
-    position_array,
-    require,
-    require_choice,
-    require_memory,
-    settings_or_default,
-    transmitter_names,
-)
-from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, SPEED_OF_LIGHT_M_S, CellState
+from sionna_partial.checks import Progress, no_progress, require, require_choice, require_memory, settings_or_default
+from sionna_partial.constants import MEMORY_GB, NO_RECEIVER, CellState
 from sionna_partial.display import part_of, reporting
-from sionna_partial.errors import BackendError, MemoryLimitError, PositionError
+from sionna_partial.errors import BackendError, MemoryLimitError
 from sionna_partial.files import atomic_files, temporary_folder
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
@@ -38,9 +26,10 @@ from sionna_partial.tracing.antennas import Antenna
 from sionna_partial.tracing.engine import REMEDY, SceneSolver, engine_fault
 from sionna_partial.tracing.finder import Counted, ExactFinder, Found, Purpose, RayFinder, write_scene_of
 from sionna_partial.tracing.interactions import Interaction, only_by_rays, with_defaults
-from sionna_partial.tracing.links import LinkSums, TracedLinks
+from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.path_set import PathParameters, PathSet
-from sionna_partial.tracing.paths import SEEN_M, LocatedPaths, PathColumns, PathFiles, SolvedPaths, path_bytes
+from sionna_partial.tracing.paths import SEEN_M, LinkSums, LocatedPaths, PathColumns, PathFiles, SolvedPaths, path_bytes
+from sionna_partial.tracing.positions import checked_positions, valid_links
 
 Unobserved = Callable[[Floats, NDArray[np.uint8], Floats, Floats], Floats]
 """Function that returns the lengths (P,) of paths in unobserved space: from points (P, 3) by interactions (P, D) at
@@ -50,8 +39,6 @@ InvalidLinks = Literal["raise", "nan"]
 
 _log = logging.getLogger(__name__)
 
-SHORTEST_M = 0.011
-"""Shortest distance of a link [m], above `SHORTEST_LEG_M`."""
 
 LARGE_JOB = 8_000
 """Number of links from which the memory of their paths is estimated."""
@@ -448,79 +435,6 @@ def simulation_of(
     return simulation
 
 
-@takes_settings
-def trace_links(
-    scene: PartialMap | str | Path | Simulation | Simulated,
-    tx: ArrayLike,
-    rx: ArrayLike,
-    *,
-    trace_settings: TraceSettings | None = None,
-    scene_settings: SceneSettings | None = None,
-    folder: str | Path | None = None,
-    memory_gb: float = MEMORY_GB,
-    invalid: InvalidLinks = "raise",
-    progress: Progress | bool | None = None,
-) -> TracedLinks:
-    """Trace every path from one or more transmitters to N receivers with Sionna RT.
-
-    On a floor plan, line of sight, specular reflections and paths with one diffraction at a vertical edge and at most
-    two reflections are complete, except legs of 1 cm or less, which Sionna RT drops: exact beams give candidates, which
-    Sionna RT's image method verifies. On a mesh, rays find the sequences of planes; line of sight and nearly all
-    reflections are found. Both include paths through walls. With diffuse reflection, diffraction on a mesh, or a
-    release of Sionna RT other than 2.2, its public path solver shoots rays for one receiver at a time: slow, and not
-    all paths are found. The result of a receiver does not depend on other receivers.
-
-    Parameters
-    ----------
-    scene : PartialMap, path, Simulation or LinkModel
-        Map of the building; unknown space is free (paper, Section III-B).
-    tx : (3,) or (T, 3) array-like
-        Transmitter positions [m].
-    rx : (N, 3) array-like
-        Receiver positions [m]; N may be 0.
-    trace_settings : TraceSettings, optional
-    scene_settings : SceneSettings, optional
-    folder : path, optional
-        Folder for the paths, an `.npy` file for each array, which the result reads on demand, without the limit
-        `memory_gb`.
-    memory_gb : float
-        Largest memory of the paths [GB], estimated from some receivers.
-    invalid : {"raise", "nan"}
-        Receivers that are not finite, outside the map, in a wall, not between floor and ceiling, or at the transmitter:
-        an error, or a link without paths, with link state 255 and gain NaN.
-    progress : bool or callable, optional
-        As in `predict_map`.
-
-    Raises
-    ------
-    MemoryLimitError
-        If the paths would take more than `memory_gb`.
-    PositionError
-        For an invalid transmitter or (with "raise") receiver, such as one within 1.1 cm of a transmitter (more at low
-        frequencies, where Friis' formula is above 0 dB).
-    SettingsError
-        For a frequency that a material does not cover, settings of another kind, or another value of `invalid`.
-    BackendError
-        If LLVM or Sionna RT cannot be used.
-    OutputError
-        If no temporary file can be written.
-
-    Examples
-    --------
-    In free space, the gain at a distance of 2 m is 20 log10(wavelength / (4 pi 2 m)), at 28 GHz:
-
-    >>> import numpy as np
-    >>> import sionna_partial as sp
-    >>> field = sp.PartialMap(np.zeros((20, 60), dtype=np.uint8), resolution_m=0.1)
-    >>> open_air = sp.SceneSettings(floor_extent="none")
-    >>> links = sp.trace_links(field, (1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)], scene_settings=open_air)
-    >>> links.gain_db.round(2).tolist()
-    [-67.41]
-    """
-    simulation = simulation_of(scene, trace_settings, scene_settings)
-    return simulation.links(tx, rx, folder=folder, memory_gb=memory_gb, invalid=invalid, progress=progress)
-
-
 def resolved_settings(
     partial: PartialMap, trace_settings: TraceSettings, scene_settings: SceneSettings
 ) -> ResolvedSettings:
@@ -529,50 +443,3 @@ def resolved_settings(
     for material in partial.environment.known_materials(scene_settings.traced_material):
         material.require_frequency(trace_settings.frequency_hz)
     return ResolvedSettings(with_defaults(trace_settings, partial.environment.kind), scene_settings)
-
-
-def nearest_m(frequency_hz: float) -> float:
-    """Return the shortest distance of a link [m], for Sionna RT and where Friis' formula is below 0 dB."""
-    return max(SHORTEST_M, SPEED_OF_LIGHT_M_S / frequency_hz / (4.0 * math.pi))
-
-
-def clear_of_walls(partial: PartialMap, points_m: Floats) -> Bools:
-    """Return whether points (..., 3) [m] are in no wall, and not within 1.1 cm of one."""
-    clear, lower_m = ~partial.is_wall_at(points_m), 0.0 if partial.obstacle is None else -SHORTEST_M
-    for corner in itertools.product((-SHORTEST_M, SHORTEST_M), repeat=2):
-        clear &= ~partial.is_wall_at(points_m + np.array([*corner, lower_m]))
-    return clear
-
-
-def checked_positions(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats]:
-    """Check the positions; return transmitters (T, 3) and receivers (N, 3)."""
-    tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
-    partial.require_positions("rx", rx_m, least=0)
-    limit_m = nearest_m(frequency_hz)
-    for source_m in tx_m:
-        distance_m = np.linalg.norm(rx_m - source_m, axis=1)
-        if distance_m.min(initial=math.inf) < limit_m:
-            index = int(distance_m.argmin())
-            raise PositionError(
-                f"rx[{index}] = {tuple(rx_m[index].tolist())} is {distance_m[index]:.3g} m from the transmitter, where "
-                f"the path gain has no meaning: leave out receivers nearer than {limit_m:.3g} m."
-            )
-    return tx_m, rx_m
-
-
-def valid_links(partial: PartialMap, tx: ArrayLike, rx: ArrayLike, frequency_hz: float) -> tuple[Floats, Floats, Bools]:
-    """Return transmitters (T, 3), receivers (N, 3) [m], and which links (T, N) `checked_positions` accepts."""
-    tx_m, rx_m = _transmitters(partial, tx), _receivers(rx)
-    far = np.linalg.norm(rx_m - tx_m[:, None], axis=-1) >= nearest_m(frequency_hz)
-    return tx_m, rx_m, far & partial.radios_can_stand(rx_m)
-
-
-def _transmitters(partial: PartialMap, tx: ArrayLike) -> Floats:
-    points_m = position_array("tx", tx)
-    return partial.require_positions("tx", points_m, names=transmitter_names(len(points_m))).reshape(-1, 3)
-
-
-def _receivers(rx: ArrayLike) -> Floats:
-    with suppress(ValueError):  # nested lists of unequal lengths have no size
-        rx = np.zeros((0, 3)) if np.size(rx) == 0 else rx
-    return position_array("rx", rx, least=0).reshape(-1, 3)

@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, grid_edges, largest_part
 from sionna_partial.constants import CellState
-from sionna_partial.maps.wall_cells import frontier_cells
+from sionna_partial.maps.environment import frontier_cells
 from sionna_partial.settings import SensorSettings
 from sionna_partial.worlds.camera import Camera
 

@@ -17,13 +17,13 @@ from sionna_partial.constants import GAIN_FLOOR_DB, CellState
 from sionna_partial.coverage.dataset import OFFSET
 from sionna_partial.coverage.link_budget import LinkBudget
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import Outline, Scale, plot_layer
+from sionna_partial.plots.coverage_plot import plot_layer
 from sionna_partial.plots.coverage_viewer import STATES, level_codes, radio_layers, server_codes, step_codes
+from sionna_partial.plots.layers import Scale
+from sionna_partial.plots.panel import Outline
+from sionna_partial.plots.report import LIKELY
 from sionna_partial.plots.style import STATE_COLOURS, figure_png
-from sionna_partial.prediction.predictor import LinkPrediction
-
-LIKELY = 0.9
-"""Probability at which an area counts as covered."""
+from sionna_partial.prediction.rule import LinkPrediction
 
 OUTLINES = {"p_above": f"where P = {LIKELY:g}", "power_mean_dbm": "where the mean is", "": "none"}
 """Layers with a line at the threshold."""

@@ -15,7 +15,7 @@ from sionna_partial.checks import require, require_choice, require_number
 from sionna_partial.constants import DRAWING_SUFFIXES, IFC_SUFFIXES, PICTURE_SUFFIXES, WALL_THICKNESS_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding
-from sionna_partial.maps.importers.drawings import read_picture, wall_shades
+from sionna_partial.maps.importers.pictures import read_picture, wall_shades
 from sionna_partial.maps.map_files import load_map
 from sionna_partial.maps.partial_map import PartialMap
 

@@ -33,8 +33,8 @@ from sionna_partial.maps.map_files import load_map, save_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.maps.ros_map import read_ros_map
 from sionna_partial.measurements.measurements import Measurements
-from sionna_partial.plots.coverage_plot import report_pdf
 from sionna_partial.plots.logo import read_logo
+from sionna_partial.plots.report import report_pdf
 from sionna_partial.tracing.antennas import Antenna
 
 MOST_BYTES = 200_000_000

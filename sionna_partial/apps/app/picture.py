@@ -16,8 +16,8 @@ from sionna_partial.apps.app.radio import MOST_TRANSMITTERS
 from sionna_partial.constants import CellState
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.plots.coverage_plot import Outline, extent_m, outside, to_the_edge
 from sionna_partial.plots.coverage_viewer import STATES, add_layer
+from sionna_partial.plots.panel import Outline, extent_m, outside, to_the_edge
 from sionna_partial.plots.style import FAILS, INK, material_colour
 
 _UNSELECT = "points.selection_manager.clear()"

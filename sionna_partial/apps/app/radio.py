@@ -93,10 +93,13 @@ class Transmitter(Checked):
         return self.x_m, self.y_m, self.z_m
 
 
+def is_name(name: str) -> bool:
+    return bool(re.fullmatch(r"[A-Za-z][\w-]{0,30}", name, re.ASCII))
+
+
 def require_name(name: str) -> None:
     """Raise a SettingsError for an invalid name of a transmitter."""
-    good = re.fullmatch(r"[A-Za-z][\w-]{0,30}", name, re.ASCII)
-    require(bool(good), "name", name, "give a letter, then letters, digits, _ or -, up to 31 in all.")
+    require(is_name(name), "name", name, "give a letter, then letters, digits, _ or -, up to 31 in all.")
 
 
 @dataclass(frozen=True)

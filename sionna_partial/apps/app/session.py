@@ -1,7 +1,7 @@
 """One window of the app without its page: its state, its jobs, and the parts that change them."""
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import PurePath
 from typing import Any
@@ -13,15 +13,13 @@ from sionna_partial.apps.app.files import FILES, coverage_file, file_name, proje
 from sionna_partial.apps.app.maps import Maps
 from sionna_partial.apps.app.planning import Radios, Searches
 from sionna_partial.apps.app.predicting import PredictionJobs
-from sionna_partial.apps.app.state import WindowState
+from sionna_partial.apps.app.radio import Transmitter
+from sionna_partial.apps.app.state import NO_TRANSMITTER, WindowState
 from sionna_partial.apps.app.survey import Survey
 from sionna_partial.checks import Progress, require_choice
-from sionna_partial.errors import MeasurementError, SettingsError
-from sionna_partial.measurements.measurements import (
-    SAME_TX_M,
-    Measurements,
-    measurements_of_each,
-)
+from sionna_partial.errors import PositionError, SettingsError
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import measurements_of_each
 from sionna_partial.plots.logo import read_logo
 
 
@@ -32,22 +30,25 @@ class Surveys:
         self._state, self._jobs = state, jobs
 
     def learn(self, content: bytes, name: str = "measured.csv") -> None:
-        """Take a survey; powers without transmitter are of the chosen one."""
-        all_m, plan = self._state.require_positions_m(), self._state.plan
+        """Take a survey, and add the transmitters whose positions it has; powers without one are of the chosen one."""
+        all_m, plan = self._state.positions_m, self._state.plan
         self._learn_from(lambda: Survey.read(name, content, plan, all_m))
 
     def assign(self, access_point: str) -> None:
         """Give the chosen transmitter an access point of the survey, or none of them for ""."""
-        survey, tx_m = self._state.survey, self._state.require_positions_m()[self._state.chosen]
+        survey, tx_m = self._state.survey, self._state.positions_m[self._state.chosen]
         assert survey is not None
         self._learn_from(lambda: survey.with_access_point(access_point, tx_m))
 
     def _learn_from(self, read: Callable[[], Survey]) -> None:
-        state, partial, all_m = self._state, self._state.require_map(), self._state.require_positions_m()
-        tx_m, frequency_hz = all_m[state.chosen], state.settings.frequency_hz
+        state, partial, frequency_hz = self._state, self._state.require_map(), self._state.settings.frequency_hz
+        all_m = state.positions_m
+        tx_m = all_m.get(state.chosen)
 
-        def take(survey: Survey, measured: Measurements | None, *warnings: str) -> None:
-            state.survey, state.measured, state.action_warnings = survey, measured, [*warnings]
+        def take(survey: Survey, measured: Measurements | None, added: Mapping[str, Transmitter], *told: str) -> None:
+            state.take_transmitters({**state.transmitters, **added})
+            state.survey, state.measured = survey, measured
+            state.action_warnings += told
             self._jobs.predict()
 
         def work(report: Progress) -> Iterator[Callable[[], None]]:
@@ -56,17 +57,15 @@ class Surveys:
             if survey.has_several and not survey.positions_m:
                 count = len(survey.access_points)
                 what = f'{survey.name} has {count} access points: choose them in "Access point of the survey".'
-                yield functools.partial(take, survey, None, what)
+                yield functools.partial(take, survey, None, {}, what)
                 return
             measured = survey.measurements(tx_m)
-            if not state.are_ours(measured).any():
-                position = ", ".join(f"{each:g}" for each in measured.tx[0])
-                raise MeasurementError(
-                    f"the measurements are of no transmitter within {SAME_TX_M:g} m: move one to ({position}), "
-                    "the first position in the file."
-                )
-            measurements_of_each(partial, [np.array([each_m]) for each_m in all_m.values()], measured, frequency_hz)
-            yield functools.partial(take, survey, measured)
+            added, told = state.transmitters_at(survey.sources(measured))
+            every_m = [*all_m.values(), *(each.position_m for each in added.values())]
+            if not every_m:
+                raise PositionError(told[0] if told else NO_TRANSMITTER)
+            measurements_of_each(partial, [np.array([each_m]) for each_m in every_m], measured, frequency_hz)
+            yield functools.partial(take, survey, measured, added, *told)
 
         self._jobs.begin(work)
 

@@ -1,7 +1,8 @@
 """State of one window of the app: map, transmitters, settings, measurements, and the view of them."""
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+import math
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -10,16 +11,26 @@ from sionna_partial.apps.app.answer import LAYERS, NETWORK_LAYERS, RATE, View
 from sionna_partial.apps.app.drawing import Plan, Source, Stroke, drawn
 from sionna_partial.apps.app.files import Project, script
 from sionna_partial.apps.app.marks import Marks, aims_m
-from sionna_partial.apps.app.radio import RadioSettings, Transmitter, fitted, placed, usual_height_m
-from sionna_partial.apps.app.survey import Survey
+from sionna_partial.apps.app.radio import (
+    MOST_TRANSMITTERS,
+    RadioSettings,
+    Transmitter,
+    fitted,
+    is_name,
+    placed,
+    usual_height_m,
+)
+from sionna_partial.apps.app.survey import Position, Survey
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import MapError, PositionError
 from sionna_partial.exploration.next_views import NextViews
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements, can_be_used, nearest_transmitters
+from sionna_partial.measurements.measurements import Measurements
+from sionna_partial.measurements.selection import SAME_TX_M, can_be_used, nearest_transmitters
 
 MEASURE = 'Drag along a length that you know, such as a wall; then type it in "Known length [m]" and press Enter.'
+NO_TRANSMITTER = "there is no transmitter yet: click on the map where one shall be."
 SAVED_MAP = 'partial = sp.load_map("map.npz")  # in the file of "Save the project", with everything drawn on it'
 
 
@@ -73,10 +84,14 @@ class WindowState:
             raise MapError(MEASURE if self.source else "there is no map yet: open one, or an example.")
         return self.partial
 
-    def require_positions_m(self) -> dict[str, tuple[float, float, float]]:
-        if not self.transmitters:
-            raise PositionError("there is no transmitter yet: click on the map where one shall be.")
+    @property
+    def positions_m(self) -> dict[str, Position]:
         return {name: each.position_m for name, each in self.transmitters.items()}
+
+    def require_positions_m(self) -> dict[str, Position]:
+        if not self.transmitters:
+            raise PositionError(NO_TRANSMITTER)
+        return self.positions_m
 
     def forget_map(self) -> None:
         """Remove the map and everything on it."""
@@ -109,6 +124,22 @@ class WindowState:
 
     def new_transmitter(self) -> Transmitter:
         return Transmitter(0.0, 0.0, usual_height_m(self.require_map()), self.settings.eirp_dbm)
+
+    def transmitters_at(self, sources: Iterable[tuple[str, Position]]) -> tuple[dict[str, Transmitter], list[str]]:
+        """Return new transmitters at the named positions of a survey where there is none, and what to tell of them."""
+        added, left, partial = dict[str, Transmitter](), list[str](), self.require_map()
+        for name, (x_m, y_m, z_m) in sources:
+            if any(math.dist((x_m, y_m, z_m), at_m) <= SAME_TX_M for at_m in self.positions_m.values()):
+                continue
+            taken = {*self.transmitters, *added}
+            new = placed(partial, replace(self.new_transmitter(), x_m=x_m, y_m=y_m, z_m=z_m))
+            if len(taken) == MOST_TRANSMITTERS or math.dist((x_m, y_m), new.position_m[:2]) > SAME_TX_M:
+                left.append(f"({x_m:g}, {y_m:g})")
+                continue
+            added[name if is_name(name) and name not in taken else unused_name(taken)] = new
+        told = [f"Transmitters of the survey are added: {', '.join(added)}."] if added else []
+        least = f"they are not in the map's free space, or the page has {MOST_TRANSMITTERS}"
+        return added, [*told, *([f"Its transmitters at {', '.join(left)} are not added: {least}."] if left else [])]
 
     def threshold_db(self, transmitters: Sequence[Transmitter]) -> float:
         """Return the path gain at the threshold of the weakest transmitter [dB]."""

@@ -1,5 +1,6 @@
 """Uploaded surveys: measured powers of one or several access points, also at pixels of the page's floor plan."""
 
+import itertools
 import math
 import tempfile
 from collections import Counter
@@ -13,8 +14,9 @@ from sionna_partial.apps.app.drawing import Plan
 from sionna_partial.apps.app.files import file_name
 from sionna_partial.constants import BAG_SUFFIXES
 from sionna_partial.errors import MeasurementError
-from sionna_partial.measurements.measurements import SAME_TX_M, Measurements
+from sionna_partial.measurements.measurements import Measurements
 from sionna_partial.measurements.recordings import load_survey
+from sionna_partial.measurements.selection import SAME_TX_M
 from sionna_partial.measurements.surveys import is_plan_survey, read_survey
 
 SURVEY_SUFFIXES = (".csv", ".json", ".vwm", *BAG_SUFFIXES)
@@ -31,13 +33,17 @@ def is_survey(name: str, content: bytes) -> bool:
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """A survey, the floor plan of its pixels, the names of its access points (identity first), and where some are."""
+    """A survey, the floor plan of its pixels, the names of its access points (identity first), and where some are.
+
+    `given_m` has the positions (x, y) that the file gives, with the name of the access point there, or "" [m].
+    """
 
     name: str
     content: bytes
     plan: Plan | None = None
     access_points: tuple[tuple[str, ...], ...] = ()
     positions_m: Mapping[str, Position] = field(default_factory=dict)
+    given_m: Mapping[tuple[float, float], str] = field(default_factory=dict)
 
     @classmethod
     def read(cls, name: str, content: bytes, plan: Plan | None, transmitters: Mapping[str, Position]) -> "Survey":
@@ -48,7 +54,9 @@ class Survey:
                 return bare
             survey = read_survey(path, None, 0.0, options.get("pixel_m"))
         if {"tx_x", "tx_y"} <= {*survey.table}:
-            return bare
+            given_m = zip(survey.table["tx_x"].tolist(), survey.table["tx_y"].tolist(), strict=True)
+            names = [each[-1] for each in survey.transmitters] or itertools.repeat("")
+            return replace(bare, given_m=dict(zip(given_m, names, strict=False)))
         found = {names[0]: names for names, _ in Counter(survey.transmitters).most_common()}
         named: dict[str, Position] = {}
         for name, at_m in transmitters.items():
@@ -76,13 +84,21 @@ class Survey:
         others = {name: at_m for name, at_m in self.positions_m.items() if name not in old}
         return replace(self, positions_m=others | ({access_point: tx_m} if access_point else {}))
 
-    def measurements(self, tx_m: Position) -> Measurements:
+    def sources(self, measured: Measurements) -> list[tuple[str, Position]]:
+        """Return the positions of the transmitters in the file, most measured first, with their names, or ""."""
+        found: list[tuple[str, Position]] = []
+        for at_m, _ in Counter(map(tuple, measured.tx[measured.tx_known].tolist())).most_common():
+            if not any(math.dist(at_m, other_m) <= SAME_TX_M for _, other_m in found):
+                found.append((self.given_m.get(at_m[:2], ""), at_m))
+        return found
+
+    def measurements(self, tx_m: Position | None) -> Measurements:
         """Return the measured powers; those without any position are of the transmitter at `tx_m`."""
         with self._file() as (path, options):
             if self.has_several:
                 return load_survey(path, tx=dict(self.positions_m), **options)
             measured = load_survey(path, **options)
-            return measured if measured.tx_known.any() else load_survey(path, tx=tx_m, **options)
+            return measured if tx_m is None or measured.tx_known.any() else load_survey(path, tx=tx_m, **options)
 
     @contextmanager
     def _file(self) -> Iterator[tuple[Path, dict[str, Any]]]:

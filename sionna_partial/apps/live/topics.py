@@ -1,16 +1,11 @@
-"""Topics of a robot to a LiveCoverage and back: recordings, DDS (ROS 2) or rosbridge (ROS 1), without ROS."""
+"""Topics of a robot to a LiveCoverage and back: their names, types and messages, and recordings of them."""
 
-import json
-import logging
 import os
 import re
 import time
 from collections import ChainMap
 from collections.abc import Container, Mapping, MutableMapping
-from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
-from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,10 +14,9 @@ from scipy.spatial.transform import Rotation
 
 from sionna_partial.apps.live.answers import LiveAnswer, LiveTransmitter, LiveViews
 from sionna_partial.apps.live.coverage import LiveCoverage
-from sionna_partial.checks import Checked, require, require_whole, shown
-from sionna_partial.errors import MapError, SettingsError
-from sionna_partial.maps.importers.bags import GRID, MAX_MESSAGE_BYTES, open_recording
-from sionna_partial.resources import optional_packages
+from sionna_partial.checks import Checked, require
+from sionna_partial.errors import MapError
+from sionna_partial.maps.importers.bags import GRID, open_recording
 
 MOST_FRAMES = 1000
 """Number of frames outside the robot's chain that are kept of each topic."""
@@ -47,27 +41,6 @@ KEEPOUT = 0
 """Type of nav2's keepout filter."""
 
 TF_TYPE = "tf2_msgs/msg/TFMessage"
-
-HIGHEST_DOMAIN = 232
-
-MOST_AT_ONCE = 100
-"""Messages of a topic that are taken before the next topic's."""
-
-POLL_S = 0.02
-"""Time between two polls [s]."""
-
-_LIMITS = (
-    "<CycloneDDS><Domain><Internal>"
-    f"<MaxSampleSize>{MAX_MESSAGE_BYTES} B</MaxSampleSize></Internal></Domain></CycloneDDS>"
-)
-
-MAX_BYTES = 100_000_000
-"""Size of the largest accepted message [bytes]."""
-
-RETRY_S = 1.0
-"""Time between two attempts to connect [s]."""
-
-_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -245,266 +218,3 @@ def replay(listener: Listener, path: str | os.PathLike[str], rate: float = 0.0) 
             listener.take(message.topic, message.content, message.time_s)
             while not rate and listener.live.step():
                 pass
-
-
-class Dds:
-    """The topics of one DDS domain.
-
-    `CYCLONEDDS_URI` chooses interfaces and peers, as for ROS 2 with Cyclone DDS.
-
-    Parameters
-    ----------
-    topics : Topics
-    names : mapping
-        Transmitters by name.
-    domain : int or None
-        None is `ROS_DOMAIN_ID`, or 0.
-
-    Raises
-    ------
-    SettingsError
-        For an invalid domain, or one that cannot be joined.
-    """
-
-    def __init__(self, topics: Topics, names: Mapping[str, object], domain: int | None = None) -> None:
-        number = _domain(domain)
-        with optional_packages(SettingsError):
-            from cyclonedds.core import DDSException
-            from cyclonedds.domain import Domain, DomainParticipant
-        try:
-            config = ",".join(filter(None, [os.environ.get("CYCLONEDDS_URI"), _LIMITS]))
-            self._domain: Any = Domain(number, config)
-            self._participant: Any = DomainParticipant(number)
-        except DDSException as error:
-            remedy = "check CYCLONEDDS_URI and the network interfaces."
-            raise SettingsError(f"DDS domain {number} cannot be joined ({error.msg}): {remedy}") from error
-        self.topics, self.source, self._sent = topics, f"DDS domain {number}", set[str]()
-        self._readers = [
-            (topic, self._reader(topic, kind, latched))
-            for topic, kind in topics.types().items()
-            for latched in ((True, False) if topic in (topics.map, "/tf_static") else (False,))
-        ]
-        self._writers = {topic: self._writer(topic, kind) for topic, kind in topics.published(names).items()}
-
-    def publish(self, answer: LiveAnswer) -> None:
-        """Publish an answer reliably; late subscribers get the last one."""
-        for topic, (kind, message) in self.topics.messages(answer, self._sent).items():
-            if topic not in self._writers:
-                self._writers[topic] = self._writer(topic, kind)
-            self._writers[topic].write(filled(kind, message))
-            self._sent.add(topic)
-
-    def listen(self, live: LiveCoverage) -> None:
-        """Pass messages to a `LiveCoverage` without end."""
-        listener = Listener(live, self.topics)
-        while True:
-            self.poll(listener)
-            time.sleep(POLL_S)
-
-    def poll(self, listener: Listener) -> None:
-        """Pass the messages that have arrived."""
-        for topic, reader in self._readers:
-            for _ in range(MOST_AT_ONCE):
-                try:
-                    samples = reader.take(1)
-                except Exception as error:  # bytes that are no message of its type
-                    listener.live.report(f"a message of {topic} cannot be decoded ({type(error).__name__}: {error}).")
-                    continue
-                if not samples:
-                    break
-                if samples[0].sample_info.valid_data:
-                    listener.take(topic, samples[0])
-
-    def close(self) -> None:
-        """Leave the domain."""
-        self._readers, self._writers, self._participant, self._domain = [], {}, None, None
-
-    def _reader(self, topic: str, kind: str, latched: bool) -> Any:
-        from cyclonedds.sub import DataReader
-
-        qos = _qos(latched=latched, reliable=latched, depth=1 if topic == self.topics.map else 100)
-        return DataReader(self._participant, self._topic(topic, kind), qos=qos)
-
-    def _writer(self, topic: str, kind: str) -> Any:
-        from cyclonedds.pub import DataWriter
-
-        qos = _qos(latched=True, reliable=True, depth=1)
-        return DataWriter(self._participant, self._topic(topic, kind), qos=qos)
-
-    def _topic(self, topic: str, kind: str) -> Any:
-        from cyclonedds.topic import Topic
-
-        return Topic(self._participant, f"rt{topic}", struct(kind))
-
-
-def _domain(given: int | None) -> int:
-    text = os.environ.get("ROS_DOMAIN_ID", "").strip() or "0"
-    if given is None and not text.isdecimal():
-        raise SettingsError(f"ROS_DOMAIN_ID = {text!r} is no number: give 0 to {HIGHEST_DOMAIN}.")
-    number = int(text) if given is None else given
-    require_whole("domain", number, 0, HIGHEST_DOMAIN)
-    return number
-
-
-def _qos(*, latched: bool, reliable: bool, depth: int) -> Any:
-    """Return the quality of service of nav2's maps if latched, else one for any publisher."""
-    from cyclonedds.core import Policy, Qos
-    from cyclonedds.util import duration
-
-    return Qos(
-        Policy.Durability.TransientLocal if latched else Policy.Durability.Volatile,
-        Policy.Reliability.Reliable(duration(milliseconds=100)) if reliable else Policy.Reliability.BestEffort,
-        Policy.History.KeepLast(depth),
-        Policy.DataRepresentation(use_cdrv0_representation=True),
-    )
-
-
-@cache
-def _store() -> Any:
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-
-    store = get_typestore(Stores.LATEST)
-    for kind, text in DEFINITIONS.items():
-        store.register(get_types_from_msg(text, kind))
-    return store
-
-
-@cache
-def struct(kind: str) -> Any:
-    """Return the DDS type of a message type, named as in ROS 2."""
-    from cyclonedds.idl import make_idl_struct
-
-    package, _, name = kind.split("/")
-    fields = {each: _field_type(*description) for each, description in _store().fielddefs[kind][1]}
-    return make_idl_struct(f"{name}_", f"{package}.msg.dds_.{name}_", fields)
-
-
-def _field_type(node: Any, description: Any) -> Any:
-    from cyclonedds.idl import types
-
-    if node.name == "NAME":
-        return struct(description)
-    if node.name == "BASE":
-        return {"string": str, "bool": bool}.get(description[0]) or getattr(types, description[0])
-    inner, count = description
-    if node.name == "SEQUENCE":
-        return types.sequence[_field_type(*inner)]  # type: ignore[misc]
-    return types.array[_field_type(*inner), count]  # type: ignore[misc]
-
-
-def filled(kind: str, values: Mapping[str, Any]) -> Any:
-    """Return a message from nested mappings."""
-    given = {}
-    for name, (node, description) in _store().fielddefs[kind][1]:
-        value = values[name]
-        if node.name == "NAME":
-            value = filled(description, value)
-        elif isinstance(value, list) and description[0][0].name == "NAME":
-            value = [filled(description[0][1], each) for each in value]
-        given[name] = value
-    return struct(kind)(**given)
-
-
-class Rosbridge:
-    """The topics of a rosbridge server; lost connections are opened again.
-
-    Parameters
-    ----------
-    url : str
-        For example "ws://robot:9090".
-    topics : Topics
-    names : mapping
-        Transmitters by name.
-
-    Raises
-    ------
-    SettingsError
-        For any other address.
-    """
-
-    def __init__(self, url: str, topics: Topics, names: Mapping[str, object]) -> None:
-        with optional_packages(SettingsError):
-            from websockets.uri import parse_uri
-        try:
-            good = bool(re.fullmatch(r"wss?://[^/\s]+(/[!-~]*)?", url) and parse_uri(url).host)
-        except ValueError:  # a port that is none
-            good = False
-        if not good:
-            raise SettingsError(f"rosbridge = {shown(url)} is not allowed: give for example ws://robot:9090.")
-        self.url = self.source = url
-        self.topics, self._published = topics, topics.published(names)
-        self._socket: Any = None
-        self._last: dict[str, str] = {}
-
-    def publish(self, answer: LiveAnswer) -> None:
-        """Publish an answer; a restarted server gets the last ones."""
-        for topic, (kind, message) in self.topics.messages(answer, self._last).items():
-            if topic not in self._published:
-                self._published[topic] = kind
-                self._advertise(topic)
-            self._last[topic] = json.dumps({"op": "publish", "topic": topic, "msg": message})
-            self._send(self._last[topic])
-
-    def listen(self, live: LiveCoverage) -> None:
-        """Pass messages to a `LiveCoverage` without end."""
-        listener = Listener(live, self.topics)
-        while True:
-            self.connect(listener)
-            time.sleep(RETRY_S)
-
-    def connect(self, listener: Listener) -> None:
-        """Pass messages until the connection ends, and log why it did."""
-        from websockets.exceptions import WebSocketException
-        from websockets.sync.client import connect
-
-        try:
-            with connect(self.url, max_size=MAX_BYTES, open_timeout=5.0) as self._socket:
-                _log.info("connected to %s", self.url)
-                self._greet()
-                for text in self._socket:
-                    self._take(listener, text)
-                reason = "it ended the connection"
-        except (OSError, WebSocketException) as error:
-            reason = str(error)
-        finally:
-            self._socket = None
-        listener.live.report(f"{self.url}: {reason}; it is tried again every {RETRY_S:g} s.")
-
-    def _greet(self) -> None:
-        for topic in [*self._published]:
-            self._advertise(topic)
-        for topic, kind in self.topics.types().items():
-            depth = 1 if topic == self.topics.map else 0
-            request = {"op": "subscribe", "topic": topic, "type": _old(kind), "queue_length": depth}
-            self._send(json.dumps(request))
-        for text in [*self._last.values()]:
-            self._send(text)
-
-    def _advertise(self, topic: str) -> None:
-        kind = _old(self._published[topic])
-        self._send(json.dumps({"op": "advertise", "topic": topic, "type": kind, "latch": True}))
-
-    def _send(self, text: str) -> None:
-        from websockets.exceptions import WebSocketException
-
-        socket = self._socket
-        if socket is not None:
-            with suppress(OSError, WebSocketException):  # the listening side logs it
-                socket.send(text)
-
-    def _take(self, listener: Listener, text: str | bytes) -> None:
-        try:
-            message = json.loads(text, object_hook=lambda fields: SimpleNamespace(**fields))
-            operation, topic = getattr(message, "op", None), getattr(message, "topic", None)
-            if operation == "publish" and topic in self.topics.types():
-                listener.take(topic, message.msg)
-            elif operation == "status":
-                listener.live.report(f"{self.url}: {shown(message.msg)}")
-        except (ValueError, TypeError, AttributeError, RecursionError) as error:
-            listener.live.report(f"{self.url}: a message is dropped ({type(error).__name__}: {error}).")
-
-
-def _old(kind: str) -> str:
-    """Return a type without "msg", as rosbridge of ROS 1 and 2 accepts it."""
-    package, _, name = kind.split("/")
-    return f"{package}/{name}"

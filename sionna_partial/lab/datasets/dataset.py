@@ -20,21 +20,19 @@ from sionna_partial.checks import CountProgress, require, require_number, requir
 from sionna_partial.display import Shown, counting
 from sionna_partial.errors import BackendError, OutputError, SettingsError
 from sionna_partial.files import LOCK_FILE, atomic_write, locked_folder, output_path, read_bytes, temporary_folder
-from sionna_partial.lab.datasets.home_links import (
-    Home,
+from sionna_partial.lab.datasets.home_links import Home, HomeSource, home_sources
+from sionna_partial.lab.datasets.home_processes import (
     HomeResult,
-    HomeSource,
     HomeTask,
     allow_homes,
-    home_sources,
     installed_versions,
     run_home,
     settings_record,
     stop_homes,
 )
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import FAILED_FOLDER, INDEX_FILE, SHARDS_FOLDER, file_stem
 from sionna_partial.process import NEW_FOLDER, cleaned_up, core_count
-from sionna_partial.settings import DatasetSettings
 
 POLL_S = 1.0
 

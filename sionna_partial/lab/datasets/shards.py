@@ -1,16 +1,13 @@
-"""Links of many homes, and their folders: one Parquet shard per home, read as one LinkTable."""
+"""Folders of data sets: one Parquet shard per home, read as one LinkTable."""
 
 import base64
 import hashlib
 import io
 import json
-import math
 import os
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
-from os import PathLike
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -19,16 +16,16 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Floats
 from sionna_partial.checks import is_whole, shown
-from sionna_partial.display import Shown
-from sionna_partial.errors import MapError, PredictorError, SettingsError
+from sionna_partial.errors import MapError, PredictorError
 from sionna_partial.files import atomic_write, input_path, open_regular, read_bytes
+from sionna_partial.lab.datasets.table import CIR, COLUMNS, LinkTable
 from sionna_partial.maps.environment import layers_of
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import LinkContext, LinkFeatures, link_numbers, link_states
+from sionna_partial.prediction.features import LinkContext, LinkFeatures
 from sionna_partial.prediction.map_networks import FEATURES, columns_of, features_of_columns
-from sionna_partial.settings import Material, NetworkKind, PredictorSettings, TraceSettings
+from sionna_partial.settings import Material
 
 INDEX_FILE, SHARDS_FOLDER, FAILED_FOLDER = "dataset.json", "shards", "failed"
 
@@ -48,14 +45,6 @@ _TYPES = {
     **dict.fromkeys(("inside", "anywhere"), pa.bool_()),
 }
 
-COLUMNS = ("home", "stage", "link_state", "gain_db", "inside", "anywhere", "observed_fraction")
-
-CIR = ("path_gain_re", "path_gain_im", "path_delay_s")
-"""Impulse response between isotropic antennas on the complete map, the strongest path first.
-
-Complex baseband gain [1], 0 without path, and absolute delay [s], NaN without path.
-"""
-
 _NAMES = (
     *COLUMNS[:2],
     *(f"{end}_{axis}_m" for end in ("tx", "rx") for axis in "xyz"),
@@ -69,106 +58,6 @@ def _fields(cir_paths: int) -> list[pa.Field]:
     lists = dict.fromkeys(CIR, pa.list_(pa.float32(), cir_paths)) if cir_paths else {}
     types = {name: _TYPES.get(name, pa.float64()) for name in _NAMES} | lists
     return [pa.field(name, kind, nullable=False) for name, kind in types.items()]
-
-
-@dataclass(frozen=True, eq=False)
-class LinkTable(Shown):
-    """N links, each at one stage of exploration of a home.
-
-    Parameters
-    ----------
-    home : (N,) str array
-        Name of the home, such as "make_home(10003)".
-    stage : (N,) float64 array
-        Steps of exploration; below 1, the wanted observed fraction of the home's free area.
-    features : LinkFeatures
-        Features on the partial map.
-    maps : tuple of M PartialMap
-        The partial maps.
-    map_index : (N,) int64 array
-        Index of each link's map.
-    link_state, gain_db : (N,) arrays
-        LinkState and omnidirectional path gain [dB] on the complete map; outage for a receiver that is not inside.
-    inside, anywhere : (N,) bool arrays
-        True for a receiver in a free cell of the complete map, and for a receiver drawn from the whole map area.
-    observed_fraction : (N,) float64 array
-        Observed fraction of the home's free area.
-    complete_maps : mapping of str to PartialMap
-        The complete homes by name.
-    cir : mapping of str to (N, cir_paths) float32 array
-        `CIR`, if the data set has impulse responses.
-    """
-
-    home: NDArray[np.str_]
-    stage: Floats
-    features: LinkFeatures
-    maps: tuple[PartialMap, ...]
-    map_index: NDArray[np.int64]
-    link_state: States
-    gain_db: Floats
-    inside: Bools
-    anywhere: Bools
-    observed_fraction: Floats
-    complete_maps: Mapping[str, PartialMap]
-    cir: Mapping[str, Floats] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        if self.features.context is None:
-            raise PredictorError("features has no context: give the LinkFeatures of link_features.")
-        link_states("link_state", self.link_state, (len(self),))
-        link_numbers("gain_db", self.gain_db, (len(self),))
-
-    def __len__(self) -> int:
-        return len(self.home)
-
-    @property
-    def context(self) -> LinkContext:
-        """Context of the links' features."""
-        assert self.features.context is not None
-        return self.features.context
-
-    @property
-    def phi(self) -> LinkFeatures:
-        """The features."""
-        return self.features
-
-    def take(self, index: NDArray[np.generic] | slice) -> "LinkTable":
-        """Select links."""
-        features = self.features.take(index)
-        columns = {name: getattr(self, name)[index] for name in (*COLUMNS, "map_index")}
-        cir = {name: values[index] for name, values in self.cir.items()}
-        return LinkTable(features=features, maps=self.maps, complete_maps=self.complete_maps, cir=cir, **columns)
-
-    @classmethod
-    def concatenate(cls, parts: Iterable["LinkTable"]) -> "LinkTable":
-        """Join links, with impulse responses if all have as many paths."""
-        tables = list(parts)
-        if not tables:
-            raise PredictorError("parts is empty: give at least one LinkTable.")
-        features = LinkFeatures.concatenate([table.features for table in tables])
-        columns: dict[str, Any] = {name: np.concatenate([getattr(table, name) for table in tables]) for name in COLUMNS}
-        complete_maps = {name: home for table in tables for name, home in table.complete_maps.items()}
-        maps = {id(each): each for table in tables for each in table.maps}
-        number = {key: index for index, key in enumerate(maps)}
-        numbers = [np.array([number[id(each)] for each in table.maps], dtype=np.int64) for table in tables]
-        index = np.concatenate([each[table.map_index] for each, table in zip(numbers, tables, strict=True)])
-        is_same = len({tuple(values.shape[1:] for values in table.cir.values()) for table in tables}) == 1
-        cir = {name: np.concatenate([table.cir[name] for table in tables]) for name in tables[0].cir if is_same}
-        shared: dict[str, Any] = {
-            "maps": tuple(maps.values()),
-            "map_index": index,
-            "complete_maps": complete_maps,
-            "cir": cir,
-        }
-        return cls(features=features, **shared, **columns)
-
-
-Dataset = LinkTable | str | PathLike[str] | Sequence[str | PathLike[str]]
-"""Links, or one or more folders of data sets."""
-
-
-def stage_name(stage: float) -> str:
-    return f"{stage:g} steps" if stage >= 1 or stage == 0 else f"{100 * stage:g} % observed"
 
 
 def _columns(table: LinkTable) -> dict[str, Any]:
@@ -375,97 +264,3 @@ def _damaged(path: str | os.PathLike[str], error: Exception) -> PredictorError:
 def _few(names: list[str]) -> str:
     listed = ", ".join(map(repr, names[:5])) or "nothing, no home has been built"
     return listed + (f" and {len(names) - 5} more" if len(names) > 5 else "")
-
-
-@dataclass(frozen=True)
-class LinkTraces:
-    """Settings of the traces: carrier frequency [Hz], diffraction on plans, paths through walls."""
-
-    frequency_hz: float
-    diffraction: bool
-    through_walls: bool = False
-
-    @classmethod
-    def of_settings(cls, settings: PredictorSettings) -> "LinkTraces":
-        """Return the traces of a predictor's training links."""
-        return cls(settings.frequency_hz, settings.diffraction, settings.through_walls)
-
-    def __str__(self) -> str:
-        where = f"at {self.frequency_hz / 1e9:g} GHz{' through walls' if self.through_walls else ''}"
-        return f"{where} {'with' if self.diffraction else 'without'} diffraction"
-
-    def is_like(self, other: "LinkTraces") -> bool:
-        """Return whether frequency (within 1e-6), diffraction and paths through walls are equal."""
-        same_frequency = math.isclose(self.frequency_hz, other.frequency_hz, rel_tol=1e-6)
-        return same_frequency and replace(self, frequency_hz=other.frequency_hz) == other
-
-
-def open_links(dataset: Dataset) -> tuple[LinkTable, LinkTraces | None]:
-    """Return the links of data sets and their traces, None for a table; a home may be in several folders."""
-    if isinstance(dataset, LinkTable):
-        links, traces = dataset, None
-    else:
-        folders = _folders(dataset)
-        tables = [read_dataset(folder) for folder in folders]
-        traces = _read_traces(folders[0])
-        homes: dict[str, PartialMap] = {}
-        for folder, table in zip(folders, tables, strict=True):
-            remedy = "give data sets that were traced with the same settings."
-            require_like(_read_traces(folder), traces, f"'{folders[0]}'", remedy, dataset=f"'{folder}'")
-            for name, home in table.complete_maps.items():
-                if homes.setdefault(name, home) != home:
-                    raise PredictorError(
-                        f"'{folder}' has another home {name!r} than those before: give one of the two."
-                    )
-        links = LinkTable.concatenate(tables)
-    if links.anywhere.all():
-        raise PredictorError("dataset has no links with receivers drawn indoors: build one that has homes and links.")
-    return links, traces
-
-
-def _folders(dataset: str | PathLike[str] | Sequence[str | PathLike[str]]) -> list[Path]:
-    folders = [dataset] if isinstance(dataset, (str, PathLike)) else dataset
-    named = isinstance(folders, Sequence) and all(isinstance(each, (str, PathLike)) for each in folders)
-    if not named or not folders:
-        raise PredictorError(
-            f"dataset = {dataset!r} is not allowed: give a LinkTable, or one or more folders that "
-            "`sionna-partial dataset` wrote."
-        )
-    paths = [Path(each) for each in folders]
-    twice = [
-        path for path, count in Counter(path.resolve() for path in paths if os.path.exists(path)).items() if count > 1
-    ]
-    if twice:
-        raise PredictorError(f"dataset has '{twice[0]}' twice, whose links would count twice: give it once.")
-    return paths
-
-
-def settings_for(
-    traces: LinkTraces | None,
-    *,
-    networks: NetworkKind = "map",
-    passes: int = PredictorSettings.passes,
-    seed: int = PredictorSettings.seed,
-) -> PredictorSettings:
-    known = traces or LinkTraces.of_settings(PredictorSettings())
-    return PredictorSettings(
-        networks, known.frequency_hz, known.diffraction, passes, seed=seed, through_walls=known.through_walls
-    )
-
-
-def require_like(
-    found: LinkTraces | None, wanted: LinkTraces, whose: str, remedy: str, *, dataset: str = "dataset"
-) -> None:
-    """Raise a PredictorError unless the links were traced like `whose` links; None passes."""
-    if found is not None and not found.is_like(wanted):
-        raise PredictorError(f"{dataset} was traced {found}, {whose} {wanted}: {remedy}")
-
-
-def _read_traces(folder: Path) -> LinkTraces:
-    index = read_index(folder)
-    try:
-        trace = TraceSettings(**index["settings"]["trace"])
-        return LinkTraces(trace.frequency_hz, trace.diffraction is not False, trace.through_walls)
-    except (ValueError, KeyError, TypeError, AttributeError, SettingsError) as error:
-        path = folder / INDEX_FILE
-        raise PredictorError(f"'{path}' is damaged ({error!r}): build the data set again in a new folder.") from error

@@ -13,13 +13,13 @@ from sionna_partial.arrays import Bools, Floats, Indices
 from sionna_partial.constants import DEFAULT_HEIGHT_M, SPEED_OF_LIGHT_M_S, CellState, LinkState
 from sionna_partial.exploration.explore import explore
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.features import traced_unobserved_m
 from sionna_partial.prediction.paper_networks import import_keras
 from sionna_partial.prediction.path_model import STATES, LinkGeometry, PathModel, survival_inputs, wrapped
+from sionna_partial.prediction.unobserved import traced_unobserved_m
 from sionna_partial.tracing.antennas import directions
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import path_gain_db
-from sionna_partial.tracing.simulation import trace_links
+from sionna_partial.tracing.trace import trace_links
 from sionna_partial.worlds.homes import make_home
 
 ANALOGUES_OF_STATE = 3_000

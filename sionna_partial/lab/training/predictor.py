@@ -12,8 +12,9 @@ from sionna_partial.checks import Progress, require_number, settings_or_default
 from sionna_partial.display import Shown, part_of, reporting
 from sionna_partial.errors import PredictorError, PredictorWarning
 from sionna_partial.files import atomic_files, atomic_write
-from sionna_partial.lab.datasets.shards import Dataset, LinkTraces, open_links, require_like, settings_for
-from sionna_partial.lab.evaluation import Baselines, Evaluation, evaluate
+from sionna_partial.lab.baselines import Baselines
+from sionna_partial.lab.datasets.traces import Dataset, LinkTraces, open_links, require_like, settings_for
+from sionna_partial.lab.evaluation import Evaluation, evaluate
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 

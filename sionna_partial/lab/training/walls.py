@@ -15,14 +15,16 @@ from sionna_partial.arrays import Floats
 from sionna_partial.constants import DEFAULT_HEIGHT_M, CellState
 from sionna_partial.exploration.explore import explore
 from sionna_partial.lab.datasets.home_links import home_sensor, map_area, points_in
+from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.prediction.map_networks import adam_w
+from sionna_partial.prediction.map_training import adam_w
 from sionna_partial.prediction.paper_networks import import_keras, tf
 from sionna_partial.prediction.unobserved import unobserved_lengths_m
 from sionna_partial.prediction.unseen_walls import CELL_M, UnseenWalls, corrected, map_image, walls_met, walls_per_m
 from sionna_partial.process import core_count
-from sionna_partial.settings import DatasetSettings, HomeKind, Material, SceneSettings, TraceSettings
-from sionna_partial.tracing.simulation import Simulation, nearest_m
+from sionna_partial.settings import HomeKind, Material, SceneSettings, TraceSettings
+from sionna_partial.tracing.positions import nearest_m
+from sionna_partial.tracing.simulation import Simulation
 from sionna_partial.worlds.homes import make_home
 
 CAMERA, ROBOTS, LARGE = (500_000, 350), (530_000, 200), (520_000, 60)

@@ -18,10 +18,9 @@ from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import BAG_SUFFIXES, DEFAULT_WALL_HEIGHT_M
 from sionna_partial.errors import MapError, SionnaPartialError
 from sionna_partial.files import decoding, input_path, open_regular
-from sionna_partial.maps.environment import MAX_CELLS, grid_array
-from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.environment import MAX_CELLS, ImportNotes, grid_array, turn_grid
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent, turn_grid
+from sionna_partial.maps.ros_map import fitted_threshold, states_from_percent
 from sionna_partial.resources import optional_packages
 
 MAX_BAG_BYTES = 10**12

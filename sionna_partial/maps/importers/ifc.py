@@ -15,13 +15,14 @@ from sionna_partial.checks import shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
 from sionna_partial.files import decoding, read_bytes
-from sionna_partial.maps.environment import MAX_TRIANGLES
+from sionna_partial.maps.environment import ImportNotes
 from sionna_partial.maps.grid import cell_centres_m
-from sionna_partial.maps.import_report import SHOWN_ROWS, ImportNotes
+from sionna_partial.maps.import_report import SHOWN_ROWS
 from sionna_partial.maps.importers.drawing_lines import Segments
 from sionna_partial.maps.importers.drawings import material_given, with_materials
 from sionna_partial.maps.importers.ifc_layers import Layer, described, slab
 from sionna_partial.maps.mesh.cells import DEFAULT_RESOLUTION_M, fitted_grid, states_of_lines
+from sionna_partial.maps.mesh.scene_mesh import MAX_TRIANGLES
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.process import core_count
 from sionna_partial.resources import optional_packages

@@ -1,18 +1,13 @@
-"""Point clouds (PCD, PLY, LAS, LAZ, XYZ, arrays) -> PartialMap, read in parts and kept as occupied voxels."""
+"""Point clouds -> PartialMap, read in parts and kept as occupied voxels."""
 
 from __future__ import annotations
 
-import io
-import itertools
 import math
 import os
-import re
-import struct
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,11 +15,10 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.checks import float_array, real_array
-from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, POINT_SUFFIXES, CellState
+from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError
-from sionna_partial.files import decoding, open_regular
-from sionna_partial.maps.environment import MAX_COORDINATE_M, height_pair
-from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.environment import ImportNotes
+from sionna_partial.maps.importers.cloud_files import PART, Parts, opened_cloud
 from sionna_partial.maps.mesh.cells import (
     DEFAULT_BAND_M,
     DEFAULT_RESOLUTION_M,
@@ -35,6 +29,7 @@ from sionna_partial.maps.mesh.cells import (
     require_metres,
     warn_of_feet,
 )
+from sionna_partial.maps.mesh.scene_mesh import MAX_COORDINATE_M, height_pair
 from sionna_partial.maps.mesh.upright import (
     END_M,
     FURNITURE_M,
@@ -49,18 +44,8 @@ from sionna_partial.maps.mesh.upright import (
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.process import njit
 
-MAX_CLOUD_BYTES = 20_000_000_000
-"""Largest point cloud [bytes]; `MAX_WHOLE_BYTES` for PCD and PLY, which are read as a whole."""
-
-MAX_WHOLE_BYTES = 2_000_000_000
-
-PART, PART_BYTES = 1_000_000, 32_000_000
-"""Points, and bytes of text, that are read at a time."""
-
-MAX_FIELDS, MAX_SENSOR_M = 1000, 200.0
-"""Most values of a point of a PCD, and largest distance of a sensor from the map [m]."""
-
-MAX_HEADER_LINES = 100
+MAX_SENSOR_M = 200.0
+"""Largest distance of a sensor from the map [m]."""
 
 LAYER_M = 0.05
 """Height of a voxel [m]."""
@@ -111,6 +96,24 @@ class _Axes(NamedTuple):
         return points_m @ self.turn.T + self.shift_m
 
 
+class _Voxels(NamedTuple):
+    """Occupied voxels of a cloud, in the world's axes.
+
+    `cells` (V, 3) are their x, y and z, `counts` (V,) their numbers of points, `heights_m` the number of points and the
+    sum of their heights [m] in each layer, and `sample` (S, 3) some of the points [m].
+    """
+
+    cells: NDArray[np.int64]
+    counts: NDArray[np.int64]
+    heights_m: dict[int, tuple[int, float]]
+    sample: Floats
+
+    @property
+    def bounds(self) -> NDArray[np.int64]:
+        """Lowest corner, and corner above the highest (2, 3) [voxels]."""
+        return np.stack([self.cells.min(axis=0), self.cells.max(axis=0) + 1])
+
+
 def map_from_points(
     points: ArrayLike | str | os.PathLike[str],
     *,
@@ -158,161 +161,28 @@ def map_from_points(
     """
     reading = MeshReading(height_band_m, observed, resolution_m, up, unit_m)
     if isinstance(points, str | os.PathLike):
-        partial = _read(Path(points), reading, sensor_positions_m)
+        path = Path(points)
+        with opened_cloud(path) as parts:
+            partial = _cloud_map(f"path = '{path}'", parts, reading, sensor_positions_m, reading.notes(path))
     else:
         cloud = real_array("points", points, MapError, "give x, y, z in metres, (N, 3), or the path of a file.")
         if cloud.ndim != 2 or cloud.shape[1] != 3:
             raise MapError(f"points has shape {cloud.shape}: give x, y, z in metres, (N, 3), or the path of a file.")
 
-        def parts() -> Iterator[NDArray[Any]]:
-            return (cloud[start : start + PART] for start in range(0, len(cloud), PART))
-
-        partial = _cloud_map("points", parts, reading, sensor_positions_m, reading.notes("points"))
+        starts = range(0, len(cloud), PART)
+        partial = _cloud_map(
+            "points",
+            lambda: (cloud[start : start + PART] for start in starts),
+            reading,
+            sensor_positions_m,
+            reading.notes("points"),
+        )
     return partial if wall_height_m is None else replace(partial, wall_height_m=wall_height_m)
-
-
-def _read(path: Path, reading: MeshReading, sensor_positions_m: ArrayLike | None) -> PartialMap:
-    kind = path.suffix.lower().removeprefix(".")
-    reader = {"las": _las, "laz": _las, "pcd": _pcd, "ply": _ply}.get(kind, _text)
-    most = MAX_WHOLE_BYTES if kind in ("pcd", "ply") else MAX_CLOUD_BYTES
-    if f".{kind}" not in (*POINT_SUFFIXES, ".ply"):
-        raise MapError(f"path = '{path}' is no point cloud: give one of {', '.join(POINT_SUFFIXES)}, .ply.")
-    with (
-        open_regular(path, "path", MapError, most, "thin it out, or save it as LAZ.") as stream,
-        decoding(path, f"no {kind.upper()}", MapError),
-    ):
-
-        def parts() -> Iterator[Floats]:
-            stream.seek(0)
-            return reader(stream)
-
-        return _cloud_map(f"path = '{path}'", parts, reading, sensor_positions_m, reading.notes(path))
-
-
-def is_cloud(path: Path) -> bool:
-    with open_regular(path, "path", MapError, MAX_CLOUD_BYTES) as stream:
-        header, end, _ = stream.read(100_000).partition(b"end_header")
-    if end and re.search(rb"^element\s+tristrips\s+[1-9]", header, re.MULTILINE):
-        remedy = "save it with faces, such as by MeshLab or Blender."
-        raise MapError(f"path = '{path}' holds triangle strips, which are not read: {remedy}")
-    return bool(end) and re.search(rb"^element\s+face\s+[1-9]", header, re.MULTILINE) is None
-
-
-def _las(stream: IO[bytes]) -> Iterator[Floats]:
-    import laspy  # type: ignore[import-untyped]
-
-    _require_records(stream)
-    with laspy.open(stream, closefd=False, laz_backend=laspy.LazBackend.Lazrs) as reader:
-        count, header = 0, reader.header
-        if header.are_points_compressed:
-            _require_chunks(stream, header.offset_to_point_data, header.point_count)
-        for part in reader.chunk_iterator(PART):
-            count += len(part)
-            yield np.column_stack([part.x, part.y, part.z])
-        _require_count(count, header.point_count)
-
-
-def _require_records(stream: IO[bytes]) -> None:
-    """Raise a ValueError for a LAS that announces more variable length records than fit."""
-    header, size = stream.read(247).ljust(247, b"\0"), os.fstat(stream.fileno()).st_size
-    points_at, records = struct.unpack_from("<II", header, 96)
-    extended = struct.unpack_from("<I", header, 243)[0] if header[25] >= 4 else 0
-    if records * 54 > points_at or extended * 60 > size:
-        raise ValueError(f"it announces {records} and {extended} variable length records, more than it holds")
-    stream.seek(0)
-
-
-def _require_chunks(stream: IO[bytes], start: int, points: int) -> None:
-    """Raise a ValueError for a LAZ with a wrong chunk table: lazrs would exhaust the memory and abort."""
-    here, size = stream.tell(), os.fstat(stream.fileno()).st_size
-    stream.seek(start)
-    (table,) = struct.unpack("<q", stream.read(8))
-    if table == -1:  # written at the end, by those who cannot seek
-        stream.seek(size - 8)
-        (table,) = struct.unpack("<q", stream.read(8))
-    stream.seek(table)
-    _, chunks = struct.unpack("<II", stream.read(8))
-    if chunks > min(points, size - table):
-        raise ValueError(f"its table has {chunks} chunks for {points} points")
-    stream.seek(here)
-
-
-def _pcd(stream: IO[bytes]) -> Iterator[Floats]:
-    from pypcd4.pypcd4 import MetaData, PointCloud
-
-    lines = [""]
-    while len(lines) < MAX_HEADER_LINES and not lines[-1].startswith("DATA"):
-        lines.append(stream.readline(1000).decode("ascii").strip())
-    header = MetaData.parse_header([line for line in lines if line and not line.startswith("#")])
-    if sum(header.count) > MAX_FIELDS:
-        raise ValueError(f"it announces {sum(header.count)} values for each point")
-    size = header.points * header.build_dtype().itemsize
-    inside = os.fstat(stream.fileno()).st_size
-    if header.data.value.startswith("binary_") or header.data.value == "binaryscompressed":
-        size, inside = int(np.frombuffer(stream.read(8), "<u4")[1]), size
-    if size > (inside if header.data.value != "ascii" else MAX_WHOLE_BYTES) or size > MAX_WHOLE_BYTES:
-        raise ValueError(f"it announces {header.points} points, more than it holds")
-    stream.seek(0)
-    cloud = PointCloud.from_fileobj(stream)  # type: ignore[arg-type]
-    data = np.atleast_1d(cloud.pc_data)
-    _require_count(len(data), header.points)
-    for start in range(0, len(data), PART):
-        yield np.column_stack([data[axis][start : start + PART] for axis in "xyz"]).astype(np.float64)
-
-
-def _ply(stream: IO[bytes]) -> Iterator[Floats]:
-    import trimesh
-
-    header, _, _ = stream.read(100_000).partition(b"end_header")
-    found = re.search(rb"^element\s+vertex\s+(\d+)", header, re.MULTILINE)
-    count = int(found[1]) if found else 0
-    if count > os.fstat(stream.fileno()).st_size:
-        raise ValueError(f"it announces {count} points, more than it holds")
-    stream.seek(0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # damage ends in an error
-        vertices = np.asarray(trimesh.load(stream, file_type="ply", process=False).vertices)
-    _require_count(len(vertices), count)
-    for start in range(0, len(vertices), PART):
-        yield vertices[start : start + PART]
-
-
-def _text(stream: IO[bytes]) -> Iterator[Floats]:
-    """Yield the first three columns, after a header or a number of points."""
-    separator, first, announced, count = None, True, None, 0
-    while block := stream.read(PART_BYTES):
-        block += stream.readline(10_000)
-        if block[-1:] not in b"\r\n":
-            raise ValueError("it ends without a line end and may be cut: copy it again, or add a line end")
-        if first:
-            lines = block.splitlines(keepends=True)
-            start = next((n for n, line in enumerate(lines[:50]) if _columns(line) >= 3), None)
-            if start is None:
-                raise ValueError("no line has three numbers")
-            announced = next((int(line) for line in lines[:start] if line.strip().isdigit()), None)
-            separator = next((mark for mark in ",;" if mark.encode() in lines[start]), None)
-            block, first = b"".join(lines[start:]), False
-        if block.strip():
-            points = np.loadtxt(io.BytesIO(block), delimiter=separator, usecols=(0, 1, 2), ndmin=2)
-            count += len(points)
-            yield points
-    if announced is not None:
-        _require_count(count, announced)
-
-
-def _columns(line: bytes) -> int:
-    words = re.split(rb"[\s,;]+", line.strip())
-    return sum(1 for _ in itertools.takewhile(lambda word: re.fullmatch(rb"[-+]?[\d.]+([eE][-+]?\d+)?", word), words))
-
-
-def _require_count(count: int, announced: int) -> None:
-    if count != announced:
-        raise ValueError(f"it announces {announced} points, and has {count}")
 
 
 def _cloud_map(
     what: str,
-    parts: Callable[[], Iterable[NDArray[Any]]],
+    parts: Parts,
     reading: MeshReading,
     sensor_positions_m: ArrayLike | None,
     notes: ImportNotes,
@@ -320,17 +190,17 @@ def _cloud_map(
     cell = DEFAULT_RESOLUTION_M if reading.resolution_m is None else reading.resolution_m
     cell = PartialMap(np.full((1, 1), CellState.UNKNOWN), cell).resolution_m
     axes = _Axes(TURNS[reading.up or "z"], np.zeros(3))
-    voxels, count, heights_m, sample = _occupied_voxels(what, parts(), cell, axes, reading, notes)
+    voxels = _occupied_voxels(what, parts(), cell, axes, reading, notes)
     size = np.array([cell, cell, LAYER_M])
-    bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
+    bounds = voxels.bounds * size
     require_metres(what, bounds - [[0.0], [1.0]] * size, reading.height_band_m)
-    found = "z" if reading.up is not None else _axis_up(voxels, bounds, cell)
+    found = "z" if reading.up is not None else _axis_up(voxels.cells, bounds, cell)
     warn_of_axis(what, found, "z")
-    turn = levelling(what, surfaces_of_points(sample), notes) if found.endswith("z") else np.eye(3)
+    turn = levelling(what, surfaces_of_points(voxels.sample), notes) if found.endswith("z") else np.eye(3)
     if turn[2, 2] < 1.0:
         axes = _Axes(turn @ axes.turn, bounds.mean(axis=0) - turn @ bounds.mean(axis=0))
-        voxels, count, heights_m, _ = _occupied_voxels(what, parts(), cell, axes, reading, ImportNotes(what))
-        bounds = np.stack([voxels.min(axis=0), voxels.max(axis=0) + 1]) * size
+        voxels = _occupied_voxels(what, parts(), cell, axes, reading, ImportNotes(what))
+        bounds = voxels.bounds * size
     sensors = _sensors(sensor_positions_m, reading.up, axes)
     empty = fitted_grid(bounds, cell)
     if sensors is not None:
@@ -339,15 +209,15 @@ def _cloud_map(
         if far.any():
             at = sensors[far.any(axis=1)][0].tolist()
             raise MapError(f"sensor_positions_m has {at}, more than {MAX_SENSOR_M:g} m from the points: give metres.")
-    column, row = (voxels[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
-    z = (voxels[:, 2] + 0.5) * LAYER_M
-    floor_m, ceiling_m = _floor_and_ceiling(voxels[:, 2], heights_m, reading.height_band_m)
+    column, row = (voxels.cells[:, :2] - np.rint(np.array(empty.origin_m) / cell).astype(np.int64)).T
+    z = (voxels.cells[:, 2] + 0.5) * LAYER_M
+    floor_m, ceiling_m = _floor_and_ceiling(voxels, reading.height_band_m)
     notes.notes.append(f"floor at z = {floor_m:g} m" + ("" if ceiling_m is None else f", ceiling at {ceiling_m:g} m"))
     if ceiling_m is not None:
         warn_of_feet(what, bounds, ceiling_m - floor_m, reading)
     low, high = reading.height_band_m or (floor_m + DEFAULT_BAND_M[0], floor_m + DEFAULT_BAND_M[1])
     band = (z > low) & (z < high)
-    wall = _walls(np.ravel_multi_index((row[band], column[band]), empty.shape), count[band], empty.shape)
+    wall = _walls(np.ravel_multi_index((row[band], column[band]), empty.shape), voxels.counts[band], empty.shape)
     seen = np.zeros(empty.shape, dtype=np.bool_)
     storey = (z > floor_m - BELOW_FLOOR_M) & (z < (math.inf if ceiling_m is None else ceiling_m + ABOVE_CEILING_M))
     seen[row[storey], column[storey]] = True
@@ -385,11 +255,7 @@ def _occupied_voxels(
     axes: _Axes,
     reading: MeshReading,
     notes: ImportNotes,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], dict[int, tuple[int, float]], Floats]:
-    """Return voxels x, y, z (V, 3), their numbers of points, count and sum of heights [m] of each layer, and a sample.
-
-    Points are in the world's axes.
-    """
+) -> _Voxels:
     heights_m: dict[int, tuple[int, float]] = {}
     sample: list[Floats] = []
     base, pending = None, [(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64))]
@@ -423,7 +289,7 @@ def _occupied_voxels(
     keys, counts = _merged(pending)
     mask = (1 << _BITS) - 1
     voxels = np.stack([keys >> 2 * _BITS, (keys >> _BITS) & mask, keys & mask], axis=1) - _HALF + base
-    return voxels, counts, heights_m, np.concatenate(sample)
+    return _Voxels(voxels, counts, heights_m, np.concatenate(sample))
 
 
 def _merged(pending: list[tuple[NDArray[np.int64], NDArray[np.int64]]]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -444,13 +310,12 @@ def _walls(cell: NDArray[np.int64], count: NDArray[np.int64], shape: tuple[int, 
     return np.asarray((layers >= max(1, math.ceil(WALL_FRACTION * fuller))) & ~is_noise)
 
 
-def _floor_and_ceiling(
-    layer: NDArray[np.int64], heights_m: Mapping[int, tuple[int, float]], band_m: tuple[float, float] | None
-) -> tuple[float, float | None]:
+def _floor_and_ceiling(voxels: _Voxels, band_m: tuple[float, float] | None) -> tuple[float, float | None]:
     """Return the heights of the floor below a band, by default the lowest, and of the ceiling, if any [m].
 
     Both are the mean height of points in their two fullest layers.
     """
+    layer, heights_m = voxels.cells[:, 2], voxels.heights_m
     first = int(layer.min())
     pairs = np.convolve(np.bincount(layer - first), (1, 1))[1:]  # pairs[k] counts the layers k and k + 1
     full = np.nonzero(pairs >= FLOOR_FRACTION * pairs.max())[0]

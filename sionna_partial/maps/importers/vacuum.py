@@ -20,8 +20,7 @@ from sionna_partial.checks import number_of, real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError, SionnaPartialError, one_line
 from sionna_partial.files import read_bytes
-from sionna_partial.maps.environment import MAX_CELLS, MAX_WALL_MATERIALS
-from sionna_partial.maps.import_report import ImportNotes
+from sionna_partial.maps.environment import MAX_CELLS, MAX_WALL_MATERIALS, ImportNotes
 from sionna_partial.maps.partial_map import PartialMap
 
 MAX_BYTES = 200_000_000

@@ -11,16 +11,16 @@ import shapely
 from numpy.typing import ArrayLike
 from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States, largest_by_area, span_in_strip
+from sionna_partial.arrays import Bools, Floats, States, largest_by_area, row_runs, span_in_strip
 from sionna_partial.checks import number_of, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
-from sionna_partial.maps.environment import MAX_CELLS, SceneMesh, height_pair
+from sionna_partial.maps.environment import MAX_CELLS, ImportNotes, MapWarning
 from sionna_partial.maps.grid import area_polygon
-from sionna_partial.maps.import_report import ENCLOSED_FRACTION, ImportNotes, MapWarning
+from sionna_partial.maps.import_report import ENCLOSED_FRACTION
 from sionna_partial.maps.mesh.cut import BORDER_M, clip_slab
+from sionna_partial.maps.mesh.scene_mesh import SceneMesh, height_pair
 from sionna_partial.maps.partial_map import PartialMap
-from sionna_partial.maps.wall_cells import row_runs
 from sionna_partial.process import njit
 
 DEFAULT_BAND_M = (1.0, 1.8)

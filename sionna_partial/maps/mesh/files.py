@@ -25,8 +25,8 @@ from trimesh.transformations import rotation_matrix, translation_matrix
 from sionna_partial.arrays import Floats
 from sionna_partial.errors import MapError, SettingsError
 from sionna_partial.files import decoding, lies_in, read_bytes
-from sionna_partial.maps.environment import MAX_COORDINATE_M, MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
-from sionna_partial.maps.import_report import ImportNotes, MapWarning
+from sionna_partial.maps.environment import ImportNotes, MapWarning
+from sionna_partial.maps.mesh.scene_mesh import MAX_COORDINATE_M, MAX_MESH_BYTES, MAX_TRIANGLES, SceneMesh, merged_mesh
 from sionna_partial.maps.mesh.upright import TURNS, levelling, looks_y_up, mesh_ends, surfaces_of, warn_of_axis
 from sionna_partial.settings import Material
 

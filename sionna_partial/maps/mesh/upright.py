@@ -10,7 +10,7 @@ from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats
 from sionna_partial.errors import MapError
-from sionna_partial.maps.import_report import ImportNotes, MapWarning
+from sionna_partial.maps.environment import ImportNotes, MapWarning
 from sionna_partial.maps.mesh.cells import LOWEST_CEILING_M, fitted_grid, mark_cells
 
 TURNS = {
