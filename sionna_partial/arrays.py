@@ -6,8 +6,8 @@ from functools import wraps
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sionna_partial.process import njit
 
@@ -55,9 +55,16 @@ def cross(first: Floats, second: Floats) -> Floats:
     return np.asarray(first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0])
 
 
+def with_neighbours(mask: Bools) -> Bools:
+    """Return a mask (ny, nx) with the eight neighbours of its cells; scipy.ndimage takes longer to import than maps."""
+    wide = np.pad(mask, 1)
+    rows = wide[:-2] | wide[1:-1] | wide[2:]
+    return rows[:, :-2] | rows[:, 1:-1] | rows[:, 2:]
+
+
 def largest_part(mask: Bools) -> Bools:
     """Return the largest part of a mask (ny, nx) whose cells touch by edges."""
-    labels, _ = ndimage.label(mask)
+    labels, _ = scipy.ndimage.label(mask)
     return mask & (labels == np.argmax(np.bincount(labels[mask], minlength=1)))
 
 
@@ -111,7 +118,7 @@ def counted_near(cells: NDArray[np.generic], deviation: float) -> Floats:
     half = round((math.sqrt(4.0 * deviation**2 + 1.0) - 1.0) / 2.0)
     counts = np.pad(cells.astype(np.float64), half)  # so that unknown cells around a map change nothing
     for _ in range(3):
-        counts = ndimage.uniform_filter(counts, 2 * half + 1, mode="constant")
+        counts = scipy.ndimage.uniform_filter(counts, 2 * half + 1, mode="constant")
     return 2.0 * math.pi * deviation**2 * counts[half : half + cells.shape[0], half : half + cells.shape[1]]
 
 

@@ -20,10 +20,11 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # a shell has started the
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
 SLOWEST_FIRST = (
-    *("readme", "wheel", "app", "llvm", "differentiable", "dataset", "against_stock", "homes", "path_set"),
-    *("docstrings", "train", "evaluate", "predictor_files", "unseen_walls", "calibration", "localisation", "antennas"),
-    *("assimilation", "channels", "export", "link_model", "hostile", "paper_networks", "map_networks", "notebook"),
-    *("crossings", "predictor", "cli", "shipped_predictor", "learning_commands", "coverage", "trace", "home_links"),
+    *("readme", "wheel", "app", "differentiable", "path_set", "calibration", "docstrings", "llvm", "against_stock"),
+    *("hostile", "dataset", "app_surveys", "map_networks", "localisation", "train", "channels", "homes", "crossings"),
+    *("predictor_files", "predictor", "assimilation", "unseen_walls", "link_model", "trace", "antennas", "cli"),
+    *("shipped_predictor", "home_links", "paper_networks", "channel_samples", "export", "evaluate", "finder"),
+    *("coincident", "learning_commands", "notebook", "engine"),
 )
 
 

@@ -91,7 +91,7 @@ def furnished() -> sp.PartialMap:
 INSIDE, OVER = np.array([1.03, 2.93, 1.4]), np.array([1.83, -0.08, 1.1])
 PLACES, HALF = (_grid(partial, 0.3) + np.array([0.021, 0.013, 0.3]) for partial in (_room(), _half_seen_room()))
 ABOUT = np.array([(2.0, 0.2, 0.35), (3.3, 0.8, 0.9), (4.6, 1.4, 1.5), (5.9, 2.0, 0.35), (3.8, 0.5, 0.9)])
-AMONG = np.random.default_rng(0).uniform((0.4, 0.3, 0.2), (7.6, 5.7, 2.8), (10, 3))
+AMONG = np.random.default_rng(0).uniform((0.4, 0.3, 0.2), (7.6, 5.7, 2.8), (5, 3))
 OPAQUE = replace(SPECULAR, samples_per_tx=100_000)
 BENT = all_paths(max_depth=3, open_ends=True, samples_per_tx=100_000)
 LOW = replace(OPAQUE, max_depth=2, wall_depth_m=0.0)
@@ -99,10 +99,10 @@ LEAKY = replace(EVERY, samples_per_tx=300_000)
 THROUGH: dict[str, Any] = {"weakest": 1e-3, "material": BRICK}
 
 CASES = {
-    "plan": Case(_room, OPAQUE, INSIDE, PLACES[5::58], 150, found=0.999),
-    "partial plan": Case(_half_seen_room, OPAQUE, INSIDE, HALF[5::58], 150, found=0.999),
-    "partial plan, edges": Case(_half_seen_room, BENT, INSIDE, HALF[5::47], 50, found=0.999, compared=at_edges),
-    "mesh": Case(furnished, replace(OPAQUE, max_depth=3), np.array([4.3, 2.8, 1.6]), AMONG, 300, found=0.99),
+    "plan": Case(_room, OPAQUE, INSIDE, PLACES[5::116], 75),
+    "partial plan": Case(_half_seen_room, OPAQUE, INSIDE, HALF[5::116], 75),
+    "partial plan, edges": Case(_half_seen_room, BENT, INSIDE, HALF[5::94], 25, compared=at_edges),
+    "mesh": Case(furnished, replace(OPAQUE, max_depth=3), np.array([4.3, 2.8, 1.6]), AMONG, 150, found=0.99),
     "materials through walls": Case(of_several_materials, LEAKY, TX, RX, 30, power=2e-3, **THROUGH),
     "edges through walls": Case(
         *(rooms, replace(EVERY, diffraction=True, max_depth=3), TX, RX, 3, 1e-4),

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import xarray as xr
 from matplotlib.figure import Figure
 from PIL import Image
 from test_app import PARTIAL, Window, open_plan
@@ -156,10 +157,10 @@ class TestLogo:
         assert session.file("pdf") == bare
         other.session.jobs.close()
 
-    def test_it_is_beside_the_title(self, window: Window, tmp_path: Path) -> None:
+    def test_it_is_beside_the_title(self, several: xr.Dataset, tmp_path: Path) -> None:
         (tmp_path / "acme.png").write_bytes(png(300, 100))
         levels: dict[str, Any] = {"eirp_dbm": 23.0, "threshold_dbm": -67.0}
-        figure = plot_report(window.answer.coverage, **levels, heading=("a" * 80,), logo=tmp_path / "acme.png")
+        figure = plot_report(several, **levels, heading=("a" * 80,), logo=tmp_path / "acme.png")
         figure.draw_without_rendering()
         logo = next(axis for axis in figure.axes if axis.images and axis.images[0].get_array().shape == (100, 300, 4))
         box, title = logo.get_window_extent(), figure._suptitle.get_window_extent()  # type: ignore[attr-defined]
@@ -175,16 +176,15 @@ class TestLogo:
             ("none.png", r"logo = 'none.png' cannot be read \(No such file or directory\)"),
         ],
     )
-    def test_refused(self, window: Window, content: bytes | str, message: str) -> None:
+    def test_refused(self, several: xr.Dataset, content: bytes | str, message: str) -> None:
         with pytest.raises(SettingsError, match=message):
-            plot_report(window.answer.coverage, eirp_dbm=23.0, threshold_dbm=-67.0, logo=content)
+            plot_report(several, eirp_dbm=23.0, threshold_dbm=-67.0, logo=content)
 
-    def test_one_unnamed_transmitter_and_wrong_powers(self, window: Window) -> None:
-        coverage = sp.predict_map(PARTIAL, (1.0, 1.0, 1.5), spacing_m=0.5)
+    def test_one_unnamed_transmitter_and_wrong_powers(self, coverage: xr.Dataset, several: xr.Dataset) -> None:
         figure = plot_report(coverage, eirp_dbm=23.0, threshold_dbm=-67.0)
-        assert "tx at (1.00, 1.00, 1.50) m, 23 dBm" in figure.axes[-1].texts[0].get_text()
+        assert "tx at (0.60, 3.60, 1.50) m, 23 dBm" in figure.axes[-1].texts[0].get_text()
         with pytest.raises(SettingsError, match=r"eirp_dbm = \[1, 2, 3\] is not allowed: give one power, or 2\."):
-            plot_report(window.answer.coverage, eirp_dbm=[1, 2, 3], threshold_dbm=-67.0)
+            plot_report(several, eirp_dbm=[1, 2, 3], threshold_dbm=-67.0)
 
 
 def test_one_inside_and_one_outside_of_a_complete_map() -> None:

@@ -188,7 +188,7 @@ class TestAt:
         """Dr.Jit replays recorded kernels for other materials, also while another scene is open."""
         there = replace(paths.base, relative_permittivity=np.array([4.0]), conductivity_s_m=np.array([0.3]))
         first = paths.at(there)[0]
-        other = sp.Simulation(FIELD, scene_settings=FLOOR).paths((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
+        other = sp.Simulation(FIELD, SETTINGS, FLOOR).paths((1.0, 1.0, 1.5), [(3.0, 1.0, 1.5)])
         other.at(changed(other, conductivity_s_m=0.1))
         paths.at(changed(paths, relative_permittivity=5.0))
         assert paths.at(there)[0].tobytes() == first.tobytes()

@@ -136,8 +136,11 @@ def test_integers_of_compiled_callers_share_one_compilation() -> None:
     assert (outer(np.int32(3)), len(inner.signatures)) == (5, 1)
 
 
-def test_cached_code_of_another_version_of_the_package_is_not_used(tmp_path: Path) -> None:
+def test_cached_code_of_another_version_of_the_package_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Its index may name types that have moved, and its code what other modules have been."""
+    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
     script = tmp_path / "half.py"
     script.write_text(
         "from sionna_partial.process import njit\n\n\n"

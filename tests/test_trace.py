@@ -214,10 +214,11 @@ class TestSimulation:
         assert len(opened) == 1
 
     def test_it_stands_for_a_map(self) -> None:
-        simulation = Simulation(_half_seen_room(), all_paths(max_depth=1))
+        settings = TraceSettings(max_depth=1)
+        simulation = Simulation(_half_seen_room(), settings)
         ends = (1.0, 1.5, 1.5), [(2.0, 3.0, 1.4)]
         here = gain_gradients(simulation, *ends).gain_db
-        assert here == gain_gradients(_half_seen_room(), *ends, trace_settings=all_paths(max_depth=1)).gain_db
+        assert here == gain_gradients(_half_seen_room(), *ends, trace_settings=settings).gain_db
         with pytest.raises(SettingsError, match=r"^trace_settings = .*: the Simulation that was given has its own"):
             trace_links(simulation, *ends, trace_settings=simulation.trace_settings)
         with pytest.raises(SettingsError, match="polarisations = 3 is not allowed: give 1 or 2"):

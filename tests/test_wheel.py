@@ -61,10 +61,10 @@ def test_source_archive_has_what_its_pages_name(archive: Path) -> None:
     assert not [name for name in names if name.startswith(("build/", ".venv/")) or "__pycache__" in name]
 
 
-def published_in(folder: Path, packages: list[str | Path]) -> tuple[Path, dict[str, str]]:
+def published_in(folder: Path, *install: str | Path) -> tuple[Path, dict[str, str]]:
     venv.create(folder, with_pip=True)
     python = folder / "bin" / "python"
-    subprocess.run([python, *INSTALL, *packages], check=True, timeout=1800)
+    subprocess.run([python, *install], check=True, timeout=1800)
     hidden = ("PYTHON", "DRJIT", "VIRTUAL")
     return python, {name: value for name, value in os.environ.items() if not name.startswith(hidden)}
 
@@ -76,8 +76,7 @@ LOCK = ROOT / "requirements.lock"
 @pytest.mark.slow
 def test_demo_runs_from_what_is_published_alone(wheel: Path, archive: Path, tmp_path: Path) -> None:
     """Install the lock, then wheel and source archive, in a new environment; run the demo in an empty folder."""
-    lock: list[str | Path] = ["--no-deps", "--only-binary", ":all:", "--require-hashes", "-r", LOCK]
-    python, environment = published_in(tmp_path / "venv", lock)
+    python, environment = published_in(tmp_path / "venv", ROOT / "install_locked.py")
     (tmp_path / "empty").mkdir()
     for published in (archive, wheel):
         again = [*INSTALL, "--no-deps", "--no-build-isolation", "--force-reinstall", published]
@@ -98,7 +97,7 @@ def test_base_predicts_without_any_extra(wheel: Path, tmp_path: Path) -> None:
     """Install the wheel without extras, in locked versions; predict, and write all formats that need no extra."""
     versions = re.findall(r"^[\w.-]+==[^\s\\]+", LOCK.read_text(encoding="utf-8"), flags=re.MULTILINE)
     (tmp_path / "versions.txt").write_text("\n".join(versions), encoding="utf-8")
-    python, environment = published_in(tmp_path / "venv", ["-c", tmp_path / "versions.txt", wheel])
+    python, environment = published_in(tmp_path / "venv", *INSTALL, "-c", tmp_path / "versions.txt", wheel)
     code = """
 import sionna_partial as sp
 from importlib.util import find_spec

@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import Any, TypeAlias
 
 import numpy as np
+import pandas as pd
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import maximum_filter
@@ -173,9 +174,9 @@ def coverage_map(
         layers[name] = np.full(receivers.valid.shape, np.float32(np.nan))
         layers[name][receivers.valid] = values
     axes = {
-        name: (
+        name: xr.IndexVariable(
             name,
-            values,
+            pd.Index(values),
             {"standard_name": f"projection_{name}_coordinate", "long_name": name, "units": "m", "axis": name.upper()},
             {"_FillValue": None},
         )
@@ -191,7 +192,11 @@ def coverage_map(
         variables[ROOM] = ("y", "x"), partial.room[row, column], {"long_name": "room of the map", **flags(names)}
     for name in (*DISTRIBUTION, "link_state"):
         variables[name][2]["long_name"] += f", {_WHOSE[attributes['receivers']]}"
-    return xr.Dataset(variables, coords=axes, attrs=dict(attributes))
+    # fastpath: xarray would first import Dask, which takes a second, to see that these are no arrays of Dask
+    arrays = {
+        name: xr.Variable(axes_of, values, about, fastpath=True) for name, (axes_of, values, about) in variables.items()
+    }
+    return xr.Dataset(arrays, coords=axes, attrs=dict(attributes))
 
 
 def _wall_parts(partial: PartialMap, receivers: Receivers, spacing_m: float) -> NDArray[np.int64]:

@@ -13,10 +13,10 @@ from dataclasses import dataclass, field, fields, replace
 from typing import Any, ClassVar, Literal, TypeVar
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States
+from sionna_partial.arrays import Bools, Floats, States, with_neighbours
 from sionna_partial.checks import number_of, real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -160,7 +160,7 @@ def uniform_cells(state: States) -> NDArray[np.int32]:
     for kind in CellState:
         cells = state == kind
         if cells.any() and not cells.all():
-            uniform[cells] = ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
+            uniform[cells] = scipy.ndimage.distance_transform_cdt(cells, "chessboard")[cells] - 1
     return uniform
 
 
@@ -192,10 +192,12 @@ def turn_grid(state: States, resolution_m: float, origin: tuple[float, float, fl
 
     def turned(grid: States) -> States:
         shape, unknown = (rows, columns), CellState.UNKNOWN
-        return ndimage.affine_transform(grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown)
+        return scipy.ndimage.affine_transform(
+            grid, turn.T / 2, first, shape, order=0, mode="grid-constant", cval=unknown
+        )
 
     result = turned(state)
-    frontier = ndimage.binary_dilation(frontier_cells(state), np.ones((3, 3)))
+    frontier = with_neighbours(frontier_cells(state))
     result[frontier_cells(result) & (turned(frontier.astype(np.uint8)) == 0)] = CellState.WALL
     return result, cell_m, (x + float(low[1]), y + float(low[0]))
 

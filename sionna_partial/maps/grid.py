@@ -5,11 +5,11 @@ from collections.abc import Callable, Sequence
 from typing import Protocol
 
 import numpy as np
+import scipy
 import shapely
 from numpy.typing import ArrayLike, NDArray
-from scipy import ndimage
 
-from sionna_partial.arrays import Bools, Floats, States, largest_by_area
+from sionna_partial.arrays import Bools, Floats, States, largest_by_area, with_neighbours
 from sionna_partial.checks import float_array, real_array, shown
 from sionna_partial.constants import CellState
 from sionna_partial.errors import MapError
@@ -77,9 +77,9 @@ def unknown_pockets(state: States, resolution_m: float) -> Bools:
     """Return unknown cells of enclosed regions without a square of `POCKET_M`, as in furniture and pillars."""
     unknown = np.pad(state == CellState.UNKNOWN, 1, constant_values=True)
     size = max(1, math.ceil(POCKET_M / resolution_m - 1e-6))
-    regions, count = ndimage.label(unknown, np.ones((3, 3), dtype=bool))
+    regions, count = scipy.ndimage.label(unknown, np.ones((3, 3), dtype=bool))
     wide = np.zeros(count + 1, dtype=bool)
-    wide[regions[ndimage.binary_opening(unknown, np.ones((size, size), dtype=bool))]] = True
+    wide[regions[scipy.ndimage.binary_opening(unknown, np.ones((size, size), dtype=bool))]] = True
     wide[regions[0, 0]] = True
     return (unknown & ~wide[regions])[1:-1, 1:-1]
 
@@ -90,13 +90,13 @@ def has_unknown_room(state: States, resolution_m: float) -> bool:
     unknown, opened = state == CellState.UNKNOWN, state != CellState.WALL
     if opened.all():
         return True
-    clear = ndimage.distance_transform_edt(opened) * resolution_m > BODY_M
-    parts, count = ndimage.label(clear, np.ones((3, 3), dtype=bool))
+    clear = scipy.ndimage.distance_transform_edt(opened) * resolution_m > BODY_M
+    parts, count = scipy.ndimage.label(clear, np.ones((3, 3), dtype=bool))
     from_free = np.zeros(count + 1, dtype=bool)
     from_free[parts[clear & (state == CellState.FREE)]] = True
-    regions, count = ndimage.label(unknown)
+    regions, count = scipy.ndimage.label(unknown)
     entered = np.unique(regions[unknown & from_free[parts]])
-    radii_m = largest_by_area(ndimage.distance_transform_edt(unknown), regions, count)[entered] * resolution_m
+    radii_m = largest_by_area(scipy.ndimage.distance_transform_edt(unknown), regions, count)[entered] * resolution_m
     return bool(((entered == regions[0, 0]) | (radii_m >= ROOM_M)).any())
 
 
@@ -106,17 +106,17 @@ def free_standing(state: States, resolution_m: float) -> Bools:
     Unknown cells that only walls touch belong to them.
     """
     state, square = np.pad(state, 1, constant_values=CellState.UNKNOWN), np.ones((3, 3), dtype=bool)
-    unknown, _ = ndimage.label(state == CellState.UNKNOWN)
+    unknown, _ = scipy.ndimage.label(state == CellState.UNKNOWN)
     is_open = np.zeros(unknown.max() + 1, dtype=bool)
-    is_open[unknown[ndimage.binary_dilation(state == CellState.FREE)]] = True
+    is_open[unknown[scipy.ndimage.binary_dilation(state == CellState.FREE)]] = True
     is_open[unknown[0, 0]] = True
     beyond = is_open[unknown] & (unknown > 0)
     solid = (state != CellState.FREE) & ~beyond
-    pieces, _ = ndimage.label(solid, square)
+    pieces, _ = scipy.ndimage.label(solid, square)
     most = FREE_STANDING_M / resolution_m + 1e-6
-    small = [max(part.stop - part.start for part in extent) <= most for extent in ndimage.find_objects(pieces)]
+    small = [max(part.stop - part.start for part in extent) <= most for extent in scipy.ndimage.find_objects(pieces)]
     stands = np.array([False, *small])
-    stands[pieces[ndimage.binary_dilation(beyond, square)]] = False
+    stands[pieces[with_neighbours(beyond)]] = False
     return np.asarray((stands[pieces] & (state == CellState.WALL))[1:-1, 1:-1])
 
 
@@ -153,7 +153,7 @@ def states_by_height(state: States, obstacle: States, heights_m: Sequence[float]
 
     States of full walls have free cells instead of obstacles and the areas that they enclose.
     """
-    within = ndimage.binary_fill_holes(obstacle > 0) & (state == CellState.UNKNOWN)
+    within = scipy.ndimage.binary_fill_holes(obstacle > 0) & (state == CellState.UNKNOWN)
     found = [(math.inf, np.where((obstacle > 0) | within, CellState.FREE, state))]
     for number in np.unique(obstacle[obstacle > 0]).tolist():
         other = np.where(state == CellState.UNKNOWN, CellState.UNKNOWN, CellState.FREE)

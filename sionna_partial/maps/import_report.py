@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import ndimage
+import scipy
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import CellState
@@ -51,7 +51,7 @@ def rooms_of(free: Bools, resolution_m: float) -> Rooms:
     if factor > 1:
         for axis, size in enumerate(free.shape):  # a block is free if all of its cells are
             free = np.logical_and.reduceat(free, np.arange(0, size, factor), axis=axis)
-    clearance = ndimage.distance_transform_edt(np.pad(free, 1)).astype(np.float32)
+    clearance = scipy.ndimage.distance_transform_edt(np.pad(free, 1)).astype(np.float32)
     inside = np.flatnonzero(clearance)
     order = inside[np.argsort(-clearance.ravel()[inside], kind="stable")]
     openings, areas = _join(clearance.ravel(), order, clearance.shape[1], OPENING_RATIO, SMALLEST_RADIUS_CELLS)
@@ -155,7 +155,7 @@ class ImportReport(ImportSource, Shown):
 def report_of(source: ImportSource, state: States, resolution_m: float) -> ImportReport:
     free = state == CellState.FREE
     rooms = rooms_of(free, resolution_m)
-    (y, x) = next(iter(ndimage.find_objects((state != CellState.UNKNOWN).astype(np.uint8))), (slice(0, 0),) * 2)
+    (y, x) = next(iter(scipy.ndimage.find_objects((state != CellState.UNKNOWN).astype(np.uint8))), (slice(0, 0),) * 2)
     extent_m = (x.stop - x.start) * resolution_m, (y.stop - y.start) * resolution_m
     area_m2, doors_m = float(free.sum()) * resolution_m**2, tuple(rooms.openings_m.tolist())
     return ImportReport(

@@ -8,8 +8,8 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sionna_partial.arrays import Bools, Floats, Indices, States, read_only
 from sionna_partial.checks import float_array, is_whole, number_of, position_array, require, require_number, shown
@@ -307,7 +307,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
         """
         cells = (np.asarray(points_m, dtype=float)[..., :2] - self.origin_m) / self.resolution_m - 0.5
         row_column = np.moveaxis(cells[..., ::-1], -1, 0)
-        return np.asarray(ndimage.map_coordinates(self._noise_field, row_column, order=1, mode="nearest"))
+        return np.asarray(scipy.ndimage.map_coordinates(self._noise_field, row_column, order=1, mode="nearest"))
 
     @cached_property
     def wall_fractions(self) -> dict[Material | None, float]:
@@ -339,7 +339,7 @@ class PartialMap(Pictured, plot="plots.style:plot_map"):
     @cached_property
     def _nearest_classes(self) -> NDArray[np.uint8]:
         """Result of `wall_classes` for the nearest wall of each cell; named walls are at most `OUTLINE_M` away."""
-        away, (row, column) = ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
+        away, (row, column) = scipy.ndimage.distance_transform_edt(self.state != CellState.WALL, return_indices=True)
         classes = (1 + self.thick_walls[row, column]).astype(np.uint8)
         if self.wall_material is not None:
             classes[(self.wall_material[row, column] > 0) & (away * self.resolution_m <= OUTLINE_M)] = 0

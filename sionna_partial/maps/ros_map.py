@@ -12,9 +12,8 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 from PIL import Image
-from scipy.ndimage import binary_dilation
 
-from sionna_partial.arrays import Bools, Floats, Indices, States
+from sionna_partial.arrays import Bools, Floats, Indices, States, with_neighbours
 from sionna_partial.checks import is_whole, number_of, shown
 from sionna_partial.constants import DEFAULT_WALL_HEIGHT_M, CellState
 from sionna_partial.errors import MapError, SettingsError
@@ -441,9 +440,9 @@ def _fitted_state(pixels: _Pixels, sheet: _Sheet, notes: ImportNotes, *, strict:
 
 def _warn_of_inflation(state: States, sheet: _Sheet) -> bool:
     """Warn if hardly any free cell touches a wall, as around inflated obstacles."""
-    wall, free, square = state == CellState.WALL, state == CellState.FREE, np.ones((3, 3), dtype=bool)
-    faces = wall & binary_dilation(~wall, square)
-    apart = 1.0 - (faces & binary_dilation(free, square)).sum() / max(1, faces.sum())
+    wall, free = state == CellState.WALL, state == CellState.FREE
+    faces = wall & with_neighbours(~wall)
+    apart = 1.0 - (faces & with_neighbours(free)).sum() / max(1, faces.sum())
     inflated = bool(faces.sum() > FEW_CELLS and free.any() and apart >= 1.0 - TOUCHED_WALLS)
     if inflated:
         what = f"grey (unknown) lies between {apart:.0%} of the walls and the free cells, as in an inflated costmap"

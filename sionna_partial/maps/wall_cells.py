@@ -3,8 +3,8 @@
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from sionna_partial.arrays import (
     Bools,
@@ -16,6 +16,7 @@ from sionna_partial.arrays import (
     run_lengths,
     turned_back,
     turned_grid,
+    with_neighbours,
 )
 from sionna_partial.constants import CellState
 
@@ -94,8 +95,8 @@ def wall_cells(state: States, resolution_m: float, bridge_gap_m: float = 0.5) ->
     wall, filled = wall | more, filled | more
     rows, columns = (_short_gaps(*turned, resolution_m, bridge_gap_m) for turned in ((wall, free), (wall.T, free.T)))
     wall |= rows | columns.T
-    seen = wall & ndimage.binary_dilation(free, structure=_SQUARE) & ~_hidden_corners(wall, free)[1]
-    label, count = ndimage.label(wall, structure=_SQUARE)
+    seen = wall & with_neighbours(free) & ~_hidden_corners(wall, free)[1]
+    label, count = scipy.ndimage.label(wall, structure=_SQUARE)
     unseen = np.ones(count + 1, dtype=bool)  # pieces that no free cell is beside
     unseen[label[seen]] = False
     thinned, peeled = _thin(seen | (wall & (unseen[label] | filled)), free)
@@ -138,7 +139,7 @@ def noise_field(state: States, resolution_m: float, windows_m: tuple[float, floa
     cells stick out behind the faces of walls. `windows_m` are the standard deviations of the windows for the depth, and
     for these signs [m].
     """
-    wall, near_free = state == CellState.WALL, ndimage.binary_dilation(state == CellState.FREE, structure=_SQUARE)
+    wall, near_free = state == CellState.WALL, with_neighbours(state == CellState.FREE)
     ragged, faces = _ragged_behind(wall, state != CellState.UNKNOWN) & ~near_free, wall & near_free
     hidden, around = (counted_near(cells, windows_m[0] / resolution_m) for cells in (wall & ~near_free, faces))
     signs, farther = (counted_near(cells, windows_m[1] / resolution_m) for cells in (ragged, faces))
@@ -149,7 +150,7 @@ def noise_field(state: States, resolution_m: float, windows_m: tuple[float, floa
 
 def _ragged_behind(wall: Bools, known: Bools) -> Bools:
     """Return wall cells with at most one neighbour by a side, or that stick out of a diagonal into unknown space."""
-    sides = ndimage.convolve(wall.astype(np.uint8), [[0, 1, 0], [1, 0, 1], [0, 1, 0]], mode="constant")
+    sides = scipy.ndimage.convolve(wall.astype(np.uint8), [[0, 1, 0], [1, 0, 1], [0, 1, 0]], mode="constant")
     ragged = wall & (sides <= 1)
     for turns in _TURNS:
         walls, knowns = (np.pad(np.rot90(mask, turns), 3) for mask in (wall, known))
@@ -163,7 +164,7 @@ def _ragged_behind(wall: Bools, known: Bools) -> Bools:
 
 
 def _levelled(wall: Bools, free: Bools, resolution_m: float) -> tuple[Bools, Bools, Floats]:
-    facing = wall & ndimage.binary_dilation(free, structure=_SQUARE)
+    facing = wall & with_neighbours(free)
     hidden, was_free = wall & ~facing, free
     for level in (_bumps, _notches) * 2:
         opened, filled = np.zeros((2, *wall.shape), dtype=bool)
@@ -186,15 +187,15 @@ def _unknown_gaps(wall: Bools, free: Bools, longest: int) -> Bools:
     A gap is a row of at most `longest` such cells beside FREE ones. The shortest line between the pieces closes it,
     or the row itself where rays passed that line.
     """
-    gap = ndimage.binary_dilation(free) & ~free & ~wall
-    label, _ = ndimage.label(gap, structure=_SQUARE)
-    pieces, _ = ndimage.label(wall & ndimage.binary_dilation(gap, structure=_SQUARE), structure=_SQUARE)
+    gap = scipy.ndimage.binary_dilation(free) & ~free & ~wall
+    label, _ = scipy.ndimage.label(gap, structure=_SQUARE)
+    pieces, _ = scipy.ndimage.label(wall & with_neighbours(gap), structure=_SQUARE)
     filled = np.zeros_like(wall)
-    for index, box in enumerate(ndimage.find_objects(label), start=1):
+    for index, box in enumerate(scipy.ndimage.find_objects(label), start=1):
         if max(side.stop - side.start for side in box) <= longest:
             around = tuple(slice(max(side.start - 1, 0), side.stop + 1) for side in box)
             row = label[around] == index
-            ends = np.where(ndimage.binary_dilation(row, structure=_SQUARE), pieces[around], 0)
+            ends = np.where(with_neighbours(row), pieces[around], 0)
             if len(np.unique(ends)) > 2:
                 line = _shortest_line(ends, row + 2 * free[around])
                 filled[around] |= row if (free[around] & line).any() else line
@@ -215,7 +216,7 @@ def _shortest_line(ends: NDArray[np.int32], others: NDArray[np.integer]) -> Bool
 
 
 def _fill_pinholes(wall: Bools) -> Bools:
-    label, count = ndimage.label(np.pad(~wall, 1, constant_values=True))
+    label, count = scipy.ndimage.label(np.pad(~wall, 1, constant_values=True))
     size = np.bincount(label.ravel(), minlength=count + 1)
     size[[0, label[0, 0]]] = PINHOLE_CELLS + 1
     return wall | (size <= PINHOLE_CELLS)[label[1:-1, 1:-1]]
@@ -255,8 +256,8 @@ def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: flo
     filled = np.zeros_like(wall)
     for k in index:
         filled[row[k], end[k] : start[k + 1]] = True
-    label, _ = ndimage.label(filled)
-    thickness = [0] + [rows.stop - rows.start for rows, _ in ndimage.find_objects(label)]
+    label, _ = scipy.ndimage.label(filled)
+    thickness = [0] + [rows.stop - rows.start for rows, _ in scipy.ndimage.find_objects(label)]
     for k in index:
         filled[row[k], end[k] : start[k + 1]] = beside[k] >= thickness[label[row[k], end[k]]]
     return filled
@@ -264,14 +265,15 @@ def _short_gaps(wall: Bools, free: Bools, resolution_m: float, bridge_gap_m: flo
 
 def _thin(wall: Bools, free: Bools) -> tuple[Bools, Bools]:
     """Thin walls of two cells to one; the only layer that faces FREE cells is kept."""
-    label, _ = ndimage.label(wall, structure=_SQUARE)
-    small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in ndimage.find_objects(label)]
-    kept = ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
-    facing = ndimage.binary_dilation(free, structure=_SQUARE)
-    kept |= ~ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
-    padded, facing_there, width, height = (np.pad(cells, 1) for cells in (wall, facing, *run_lengths(wall)))
-    thinned, (label, _) = padded.copy(), ndimage.label(np.pad(wall & ~kept, 1), structure=_SQUARE)
-    for index, box in enumerate(ndimage.find_objects(label), start=1):
+    label, _ = scipy.ndimage.label(wall, structure=_SQUARE)
+    small = [False] + [max(s.stop - s.start for s in box) <= _POST_CELLS for box in scipy.ndimage.find_objects(label)]
+    kept = scipy.ndimage.binary_opening(wall, structure=_SQUARE) | np.array(small, dtype=bool)[label]
+    facing = with_neighbours(free)
+    kept |= ~scipy.ndimage.binary_opening(wall, structure=np.ones((2, 2), dtype=bool))
+    padded, facing_there = np.pad(wall, 1), np.pad(facing, 1)
+    width, height = (np.pad(lengths, 1) for lengths in run_lengths(wall))
+    thinned, (label, _) = padded.copy(), scipy.ndimage.label(np.pad(wall & ~kept, 1), structure=_SQUARE)
+    for index, box in enumerate(scipy.ndimage.find_objects(label), start=1):
         around = tuple(slice(side.start - 1, side.stop + 1) for side in box)
         cells = padded[around], label[around] == index, facing_there[around]
         _, swap, flips = canonical((cells[0] + 2 * cells[1] + 4 * cells[2]).astype(np.uint8))

@@ -14,9 +14,8 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.optimize import minimize
-from scipy.special import log_softmax
 
 from sionna_partial.arrays import Bools, Floats, States
 from sionna_partial.constants import GAIN_FLOOR_DB, SPEED_OF_LIGHT_M_S, LinkState
@@ -359,11 +358,13 @@ def _fit_logistic(network: "keras.Model", phi: LinkFeatures, truth: States) -> N
 
     def loss(flat: Floats) -> tuple[float, Floats]:
         weights = flat.reshape(-1, classes)
-        log_p = log_softmax(rows @ weights, axis=1)
+        log_p = scipy.special.log_softmax(rows @ weights, axis=1)
         slope = rows.T @ (np.exp(log_p) - picked) + _WEIGHT_PENALTY * weights
         return -log_p[picked].sum() + 0.5 * _WEIGHT_PENALTY * (flat**2).sum(), slope.ravel()
 
-    found = minimize(loss, np.zeros(rows.shape[1] * classes), jac=True, method="L-BFGS-B", options={"maxiter": 1000})
+    found = scipy.optimize.minimize(
+        loss, np.zeros(rows.shape[1] * classes), jac=True, method="L-BFGS-B", options={"maxiter": 1000}
+    )
     weights = found.x.reshape(-1, classes)
     if network.output.shape[1] == 1:
         weights = weights[:, 1:] - weights[:, :1]

@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from sionna_partial.arrays import Bools, Floats, read_only
 from sionna_partial.display import Shown
 from sionna_partial.settings import TraceSettings
-from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables
+from sionna_partial.tracing.engine import HeldPaths, SceneSolver, Variables, to_device
 from sionna_partial.tracing.links import TracedLinks
 from sionna_partial.tracing.paths import Candidates, LinkSums, SolvedPaths, join_paths
 
@@ -233,7 +233,7 @@ class PathSet:
         if together:
             values = {name: [value + leaves[name][0] for value in own] for name, own in values.items()}
         shift_m = (parameters.tx_m - self.base.tx_m).reshape(-1, 3).T.astype(np.float32)
-        shift = tuple(mi.Float(column) + leaf for column, leaf in zip(shift_m, leaves["tx_m"], strict=True))
+        shift = tuple(to_device(mi.Float, column) + leaf for column, leaf in zip(shift_m, leaves["tx_m"], strict=True))
         materials = {name: tuple(own) for name, own in values.items()}
         return leaves, Variables(shift_m=shift, frequency_hz=frequency_hz[0], **materials)
 
