@@ -104,7 +104,7 @@ class _Verification:
         self._image_method.loop_mode = self._field_calculator.loop_mode = loop_mode
 
     def verify(self, scene: Any, buffer: Any, source: Any, targets: Any, diffraction: bool) -> Any:
-        buffer = self._image_method(
+        return self._image_method(
             scene=_IncoherentScene(scene.mi_scene),
             paths=buffer,
             src_positions=source,
@@ -112,9 +112,6 @@ class _Verification:
             diffraction=diffraction,
             diffraction_lit_region=True,
         )
-        if diffraction:
-            _end_at_targets(buffer, targets)
-        return buffer
 
     def evaluate(
         self, scene: Any, buffer: Any, source: Any, targets: Any, field: tuple[int, Any], diffraction: bool
@@ -153,6 +150,14 @@ def _end_at_targets(buffer: Any, targets: Any) -> None:
     for name, position in zip(("_vertices_x", "_vertices_y", "_vertices_z"), target, strict=True):
         beyond = dr.select(kind.array == InteractionType.NONE, position, getattr(buffer, name).array)
         setattr(buffer, name, type(getattr(buffer, name))(beyond, kind.shape))
+
+
+def _shortened(buffer: Any, candidates: Candidates, targets: Any) -> Any:
+    """Return verified candidates without refractions at further faces of a wall, ended at the receivers."""
+    buffer = _without_same_walls(buffer, candidates)
+    if candidates.wedges is not None:
+        _end_at_targets(buffer, targets)
+    return buffer
 
 
 def _without_same_walls(buffer: Any, candidates: Candidates) -> Any:
@@ -276,7 +281,7 @@ class SceneSolver:
             return join_paths([], candidates.face.shape[1]), np.zeros(0, np.intp)
         ends, diffraction = (_points(tx_m[None]), _points(rx_m)), candidates.wedges is not None
         buffer = self._symbolic.verify(self._scene, self._buffer(candidates), *ends, diffraction)
-        buffer = _without_same_walls(buffer, candidates)
+        buffer = _shortened(buffer, candidates, ends[1])
         buffer = self._symbolic.evaluate(self._scene, buffer, *ends, self._field, diffraction)
         return _read_buffer(buffer, tx_m, rx_m)
 
@@ -346,7 +351,7 @@ class SceneSolver:
         buffer = self._buffer(candidates)
         buffer._src_indices = to_device(mi.UInt, tx_index.astype(np.uint32))
         buffer = verification.verify(self._scene, buffer, *ends, candidates.wedges is not None)
-        return _without_same_walls(buffer, candidates)
+        return _shortened(buffer, candidates, ends[1])
 
     def _power(self, verification: _Verification, buffer: Any, ends: tuple[Any, Any], diffraction: bool) -> Any:
         import drjit as dr

@@ -232,8 +232,10 @@ def _verified(
         full = sum(len(stored.candidates.rx) for stored in waiting) >= CANDIDATES_AT_ONCE
         if waiting and (block is None or full or not block.candidates.is_like(waiting[0].candidates)):
             together = Candidates.concatenate([stored.candidates for stored in waiting])
-            for start in range(0, len(together.rx), CANDIDATES_AT_ONCE):
-                part = together.rows(np.arange(start, min(start + CANDIDATES_AT_ONCE, len(together.rx))))
+            # Dr.Jit follows neighbours together, until the longest of them ends
+            order = np.argsort((together.kind > 0).sum(axis=1), kind="stable")
+            for start in range(0, len(order), CANDIDATES_AT_ONCE):
+                part = together.rows(order[start : start + CANDIDATES_AT_ONCE])
                 paths, rows = solver.verify(part, tx_m, rx_m)
                 report(waiting[-1].done, waiting[-1].message)
                 yield part.rows(rows), paths

@@ -211,16 +211,15 @@ class CrossedEdgeCandidates(_EdgeCandidates):
         edges, building, needed = self._edges, self._building, self._building.limits.min_power(found)
         pairs = np.stack([np.zeros(count, np.int32), np.arange(count, dtype=np.int32)], axis=1)
         arrivals = self._arrivals(_straight_lines(building.room.tx_m[None, :2].copy()), pairs, 0)
-
-        shortest_m = shortest_leg_m(building)
+        shortest_m, bounds = shortest_leg_m(building), Bounds.empty(len(arrivals.edge))
+        bound_arrivals(edges, arrivals, building.materials, 0.0, bounds, np.empty((4, 3)))
 
         def of_edges(first: int) -> tuple[NDArray[np.int32], Floats]:
             some = np.arange(first, min(first + _EDGES_AT_ONCE, count))
             output = np.empty((1024, 4), np.int32), np.empty(1024)
             trail, terms = trail_of(building.plan), np.empty((4, 3))
-            chosen, power, used = _list_crossed(
-                some, edges, arrivals, needed, shortest_m, building, trail, terms, *output
-            )
+            inputs = edges, arrivals, bounds.power, needed, shortest_m, building
+            chosen, power, used = _list_crossed(some, *inputs, trail, terms, *output)
             return chosen[:used].copy(), power[:used].copy()
 
         chosen, power = zip(*in_order(of_edges, range(0, count, _EDGES_AT_ONCE)), strict=True)
@@ -243,60 +242,59 @@ def _straight_lines(sources_m: Floats) -> BeamTree:
 
 
 @njit(cache=True, nogil=True)
-def _list_crossed(group, edges, arrivals, needed, shortest_m, building, trail, terms, chosen, power):
+def _list_crossed(group, edges, arrivals, rough, needed, shortest_m, building, trail, terms, chosen, power):
     """List the strong paths through walls over some edges: edge, receiver, arrival and variant (C, 4), and powers.
 
-    The two arrays are enlarged as necessary; return them, and the number of paths. `terms` is scratch.
+    The two arrays are enlarged as necessary; return them, and the number of paths. `rough` is `Bounds.power`, `terms`
+    is scratch.
     """
-    used, receivers, start = 0, len(needed), arrivals.start
+    used, receivers, start, rx_m = 0, len(needed), arrivals.start, building.room.rx_m
     for e in group:
         for j in range(start[e], start[e + 1]):
             most = used + receivers * _VARIANTS
             if most > len(power):
                 chosen, power = grow(chosen, most), grow(power, most)
-            used = _cross_arrival(j, edges, arrivals, needed, shortest_m, building, trail, terms, (chosen, power), used)
+            origin, before, left = edges.position_m[e], arrivals.length_m[j], arrivals.left[j]
+            for rx in range(receivers):
+                x, y = rx_m[rx, 0] - origin[0], rx_m[rx, 1] - origin[1]
+                onward = np.sqrt(x * x + y * y)
+                if onward < shortest_m or not outside(edges.normals, e, x, y)[1]:
+                    continue
+                azimuth_rad, least = np.arctan2(y, x), needed[rx] * onward * (before + onward)
+                if rough[j, int(np.degrees(azimuth_rad) + 360.5) % 360] * left < least:
+                    continue
+                line = rx, onward, azimuth_rad
+                used = _cross_edge(j, line, edges, arrivals, needed[rx], building, trail, terms, (chosen, power), used)
     return chosen, power, used
 
 
 @njit(cache=True, borrows=True)
-def _cross_arrival(j, edges, arrivals, needed, shortest_m, building, trail, terms, output, used):
-    """List an arrival at an edge with straight lines to all receivers that may need it; return the number of paths."""
-    wavelength, e, before = building.materials.wavelength_m, arrivals.edge[j], arrivals.length_m[j]
-    origin, rx_m, gain = edges.position_m[e], building.room.rx_m, arrivals.gain[j]
-    for rx in range(len(needed)):
-        x, y = rx_m[rx, 0] - origin[0], rx_m[rx, 1] - origin[1]
-        onward = np.hypot(x, y)
-        too_weak = arrivals.left[j] * gain * (wavelength / (4.0 * np.pi * (before + onward))) ** 2 < needed[rx]
-        if not (too_weak or onward < shortest_m) and outside(edges.normals, e, x, y)[1]:
-            used = _cross_edge(j, rx, edges, arrivals, needed[rx], building, trail, terms, output, used)
-    return used
-
-
-@njit(cache=True, borrows=True)
-def _cross_edge(j, rx, edges, arrivals, least, building, trail, terms, output, used):
+def _cross_edge(j, line, edges, arrivals, least, building, trail, terms, output, used):
     """List the variants of a path, by an arrival at an edge and a straight line to a receiver; return their number.
 
-    They have at least the power `least`, and cross at least one wall.
+    They have at least the power `least`, and cross at least one wall. The line is (receiver, length, azimuth).
     """
-    room, materials, (chosen, power), e = building.room, building.materials, output, arrivals.edge[j]
-    target, origin, through, gain = room.rx_m[rx], edges.position_m[e], arrivals.left[j], arrivals.gain[j]
-    x, y, before = target[0] - origin[0], target[1] - origin[1], arrivals.length_m[j]
-    onward = np.hypot(x, y)
-    total = before + onward
-    azimuth_rad, exterior = angle_rad(edges.face_rad[e], edges.exterior_rad[e], np.arctan2(y, x)), edges.exterior_rad[e]
-    write_terms(edges.utd, e, arrivals.angle, j, wedge_angle(azimuth_rad, exterior), terms)
+    (rx, onward, azimuth_rad), room, materials, e = line, building.room, building.materials, arrivals.edge[j]
+    (chosen, power), target, origin, before = output, room.rx_m[rx], edges.position_m[e], arrivals.length_m[j]
+    total, exterior = before + onward, edges.exterior_rad[e]
+    turned = wedge_angle(angle_rad(edges.face_rad[e], exterior, azimuth_rad), exterior)
+    write_terms(edges.utd, e, arrivals.angle, j, turned, terms)
     spread, reach = spread_of(materials.wavelength_m, before, onward)
     straight = Reflected(arrivals.material[j], arrivals.cosine[j], np.int64(0))
     face = edges.material[e, 0 if arrivals.lit[j] else 1], arrivals.faces[j, 0], arrivals.faces[j, 1]
     flat = Shape(np.sqrt(reach), 1.0, 0.0, np.int64(0))
     level = strength_of(materials, straight, face, straight, flat, terms, room.flat_material)
-    if level**2 * spread * through / total * gain < least:
+    spread *= arrivals.left[j]
+    level *= level * arrivals.gain[j] / total
+    if level * spread < least:
         return used
     count, crossed = from_edge(building, origin, target, onward, total, 0, trail)
     walls = crossed + arrivals.crossed[j]
     if count < 0 or walls == 0 or walls > building.limits.walls:
         return used
-    spread *= through * leg_power(trail, count, building)
+    spread *= leg_power(trail, count, building)
+    if level * spread < least:
+        return used
     for variant in range(_VARIANTS):
         rise = rise_of(variant, room, target)
         if not has_variant(variant, room) or rise.bounces > building.limits.depth - 1:
