@@ -478,7 +478,6 @@ class TestFiles:
         assert "taken for an offset" in offset
         before = session.measured, session.answer
         for csv, message in (
-            (b"tx_x,tx_y,x,y,rssi\n3,1,1.5,2.0,-60\n", "move one to (3, 1, 1.5)"),
             (b"x,y,rssi\n2.05,1.0,-60\n", "are in walls"),
             (b"x,y,rssi\n70,1,-60\n", "is outside the map"),
             (b"\xff\x00", "measured.csv"),
