@@ -164,23 +164,13 @@ class TransmitterSection:
         searches = session.searches
         self.chosen = widgets.select("Transmitter", (), self._choose)
         self.name = widgets.name("Name", lambda value: self._change(new_name=value))
-        self.fields = {
-            name: widgets.number(
-                title,
-                bind(lambda name, value: self._change(**{name: float(value)}), name),
-                name=name,
-                step=step,
-                low=low,
-                high=high,
-                format="0.[00]",
-            )
-            for name, title, step, low, high in (
-                ("x_m", "x [m]", 0.25, None, None),
-                ("y_m", "y [m]", 0.25, None, None),
-                ("z_m", "Height [m]", 0.1, 0, 100),
-                ("eirp_dbm", "Power [dBm]", 1, -100, 100),
-            )
-        }
+        places = (
+            ("x_m", "x [m]", 0.25, None, None),
+            ("y_m", "y [m]", 0.25, None, None),
+            ("z_m", "Height [m]", 0.1, 0, 100),
+            ("eirp_dbm", "Power [dBm]", 1, -100, 100),
+        )
+        self.fields = widgets.numbers(places, lambda name, value: self._change(**{name: float(value)}), format="0.[00]")
         models = [(name, name or "own power") for name in MODELS]
         self.model = widgets.select("Kind", models, lambda name: self._change(model=name), name="model")
         self.channel = widgets.select("Channel", (), lambda name: self._change(channel=name), name="channel", **NARROW)
@@ -190,22 +180,11 @@ class TransmitterSection:
         self.pattern = widgets.select(
             "Antenna", _ANTENNAS.items(), lambda value: self._change_antenna("pattern", value), name="pattern"
         )
-        self.aims = {
-            name: widgets.number(
-                title,
-                bind(self._change_antenna, name),
-                name=name,
-                step=5,
-                low=low,
-                high=high,
-                format="0.[0]",
-                max_width=80,
-            )
-            for name, title, low, high in (
-                ("azimuth_deg", "Azimuth [\u00b0]", -360, 360),
-                ("downtilt_deg", "Downtilt [\u00b0]", -90, 90),
-            )
-        }
+        aims = (
+            ("azimuth_deg", "Azimuth [\u00b0]", 5, -360, 360),
+            ("downtilt_deg", "Downtilt [\u00b0]", 5, -90, 90),
+        )
+        self.aims = widgets.numbers(aims, self._change_antenna, format="0.[0]", max_width=80)
         self.root = self._laid_out()
         picture.points.on_change("data", self._on_points)
         picture.points.selected.on_change("indices", self._on_selected)
@@ -300,24 +279,18 @@ class RadioSection:
         self.region = widgets.select(
             "Power limits of", _REGIONS.items(), lambda name: radios.set(region=name), name="region"
         )
-        self.fields = {
-            name: widgets.number(
-                title,
-                bind(lambda name, value: radios.set(**{name: float(value) * _UNITS.get(name, 1.0)}), name),
-                name=name,
-                step=step,
-                low=low,
-                high=high,
-                format="0.[000]",
-            )
-            for name, title, step, low, high in (
-                ("frequency_hz", "Frequency [GHz]", 0.1, 0.1, 300),
-                ("bandwidth_hz", "Bandwidth [MHz]", 10, 0.01, 10_000),
-                ("rx_height_m", "Receiver height [m]", 0.1, 0, 100),
-                ("spacing_m", "Between receivers [m]", 0.05, 0.05, 10),
-                ("client_dbm", "Client's power [dBm]", 1, -100, 100),
-            )
-        }
+        settings = (
+            ("frequency_hz", "Frequency [GHz]", 0.1, 0.1, 300),
+            ("bandwidth_hz", "Bandwidth [MHz]", 10, 0.01, 10_000),
+            ("rx_height_m", "Receiver height [m]", 0.1, 0, 100),
+            ("spacing_m", "Between receivers [m]", 0.05, 0.05, 10),
+            ("client_dbm", "Client's power [dBm]", 1, -100, 100),
+        )
+        self.fields = widgets.numbers(
+            settings,
+            lambda name, value: radios.set(**{name: float(value) * _UNITS.get(name, 1.0)}),
+            format="0.[000]",
+        )
         frequency, bandwidth, height, spacing, client = self.fields.values()
         self.root = wide(
             pair(frequency, bandwidth),

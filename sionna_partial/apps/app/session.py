@@ -36,7 +36,7 @@ class Surveys:
 
     def assign(self, access_point: str) -> None:
         """Give the chosen transmitter an access point of the survey, or none of them for ""."""
-        survey, tx_m = self._state.survey, self._state.positions_m[self._state.chosen]
+        survey, tx_m = self._state.survey, self._state.require_positions_m()[self._state.chosen]
         assert survey is not None
         self._learn_from(lambda: survey.with_access_point(access_point, tx_m))
 

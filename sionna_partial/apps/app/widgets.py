@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 from sionna_partial.apps.app.session import Session
@@ -56,6 +57,15 @@ class Widgets:
         from bokeh.models.widgets.inputs import Spinner
 
         return self._on(Spinner(title=title, **look), take, attribute)
+
+    def numbers(
+        self, rows: Iterable[tuple[str, str, float, Any, Any]], take: Callable[[str, float], object], **look: Any
+    ) -> dict[str, Any]:
+        """Make numbers by name, of name, title, step, and lowest and highest value; `take` gets name and value."""
+        return {
+            name: self.number(title, partial(take, name), name=name, step=step, low=low, high=high, **look)
+            for name, title, step, low, high in rows
+        }
 
     def slider(self, title: str, take: Callable[[float], object], attribute: str = "value", **look: Any) -> Any:
         from bokeh.models.widgets.sliders import Slider
