@@ -89,6 +89,30 @@ class TestCompiling:
         assert len(kernels) >= 7
         assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
 
+    @pytest.mark.parametrize("derive", [sp.trace_links, sp.gain_gradients])
+    def test_numbers_of_a_scene_are_not_compiled(self, derive) -> None:
+        """Another frequency and materials of every kind: kernels of traces and derivatives are there."""
+        cells = np.ones((12, 16), np.uint8)
+        cells[1:-1, 1:-1] = CellState.FREE
+        room, rx = sp.map_from_array(cells, resolution_m=0.4), [(1.0, 1.0, 1.5), (4.1, 3.3, 1.1)]
+
+        def solve(itu: str | None, frequency_hz: float, exponent: float = 0.0) -> None:
+            own = sp.Material(relative_permittivity=5.0, conductivity_s_m=0.5, conductivity_exponent=exponent)
+            walls = sp.SceneSettings(material=own if itu is None else sp.Material(itu=itu))
+            of_trace = sp.TraceSettings(frequency_hz, max_depth=1, diffraction=False, refraction=False)
+            derive(room, (2.0, 2.2, 1.4), rx, trace_settings=of_trace, scene_settings=walls)
+
+        solve("brick", 28e9)
+        import drjit as dr  # after LLVM
+
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for itu, frequency_hz, exponent in (("brick", 27.3e9, 0.0), ("wood", 7.7e9, 0.0), (None, 28e9, 0.77)):
+                solve(itu, frequency_hz, exponent)
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        assert len(kernels) >= 30
+        assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
+
 
 def _elsewhere(candidates: Candidates, skip: int) -> Candidates:
     """Copy candidates to addresses that are off by `skip` of their numbers."""

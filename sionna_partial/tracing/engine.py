@@ -52,30 +52,53 @@ def engine_fault() -> str:
     return fault
 
 
-def open_scene(scene_xml: Path, frequency_hz: float, polarisations: int = 1) -> Any:
-    """Load a scene into Sionna RT with separate shapes and isotropic antennas: vertical, or V and H for 2."""
+def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Material] | None = None) -> Any:
+    """Load a scene into Sionna RT with separate shapes and vertical isotropic antennas.
+
+    `materials`, by their names in the scene, follow the frequency. No number of the scene is part of the code of a
+    kernel, which Dr.Jit would compile for each frequency.
+    """
     scene = load_sionna().load_scene(str(scene_xml), merge_shapes=False)
-    scene.frequency = frequency_hz
-    set_antennas(scene, polarisations)
+    import drjit as dr
+    import mitsuba as mi
+
+    set_antennas(scene, 1)
+    _set_frequency(scene, dr.opaque(mi.Float, frequency_hz))
+    _follow_frequency(scene, materials or {}, frequency_hz)
+    for own in scene.radio_materials.values():
+        dr.make_opaque(own.relative_permittivity, own.conductivity, own.thickness)
     return scene
 
 
+def _set_frequency(scene: Any, frequency_hz: Any) -> None:
+    """Set the carrier frequency, with all materials.
+
+    Frozen functions refer to materials of all scenes that there are, and find their variables in attributes only.
+    """
+    scene.frequency = frequency_hz
+    for material in scene.radio_materials.values():
+        material.frequency_of_scene = scene.frequency
+
+
 def set_antennas(scene: Any, polarisations: int) -> None:
+    """Give a scene isotropic antennas: vertical, or V and H for 2 polarisations."""
     polarization = "V" if polarisations == 1 else "VH"
     array = load_sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
     scene.tx_array = scene.rx_array = array
 
 
 def _follow_frequency(scene: Any, materials: Mapping[str, Material], frequency_hz: float) -> None:
-    """Give materials that Sionna RT does not load by an ITU name their dependence on frequency."""
+    """Give all materials their dependence on frequency in the same form, for which Dr.Jit compiles once."""
+    import drjit as dr
+    import mitsuba as mi
 
     def update(laws: Sequence[PowerLaw], at_hz: Any) -> tuple[Any, ...]:
-        return tuple(law.value * (at_hz / frequency_hz) ** law.exponent for law in laws)
+        return tuple(opaque(law.value) * (at_hz / opaque(frequency_hz)) ** opaque(law.exponent) for law in laws)
 
-    for name, material in scene.radio_materials.items():
-        laws = power_laws(materials[name], frequency_hz) if name in materials else ()
-        if material.frequency_update_callback is None and any(law.exponent for law in laws):
-            material.frequency_update_callback = functools.partial(update, laws)
+    opaque = functools.partial(dr.opaque, mi.Float)
+    for name in materials.keys() & scene.radio_materials.keys():
+        laws = power_laws(materials[name], frequency_hz)
+        scene.radio_materials[name].frequency_update_callback = functools.partial(update, laws)
 
 
 class _IncoherentScene:
@@ -242,9 +265,8 @@ class SceneSolver:
         load_sionna()
         from sionna.rt.constants import INVALID_PRIMITIVE, INVALID_SHAPE
 
-        self._scene = open_scene(scene_xml, settings.frequency_hz)
+        self._scene = open_scene(scene_xml, settings.frequency_hz, materials)
         self.mi_scene = self._scene.mi_scene
-        _follow_frequency(self._scene, materials or {}, settings.frequency_hz)
         self._field = settings.samples_per_tx, self._scene.tx_array.antenna_pattern.patterns
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
@@ -368,7 +390,7 @@ class SceneSolver:
         kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
         frequency = self._scene.frequency
         try:
-            self._scene.frequency = frequency + variables.frequency_hz  # materials follow
+            _set_frequency(self._scene, frequency + variables.frequency_hz)
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
             for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
                 material.relative_permittivity = new[0] * (material.relative_permittivity / permittivity)
@@ -377,7 +399,7 @@ class SceneSolver:
                 material.thickness = new[2]
             yield
         finally:
-            self._scene.frequency = frequency
+            _set_frequency(self._scene, frequency)
             for material, permittivity, conductivity, thickness in kept:
                 material.relative_permittivity, material.conductivity = permittivity, conductivity
                 material.thickness = thickness
