@@ -52,6 +52,44 @@ def engine_fault() -> str:
     return fault
 
 
+_PLACES = 256
+"""Least number up to which Dr.Jit counts shapes and materials in kernels."""
+
+_placeholders: dict[tuple[str, int], Any] = {}
+
+
+def _hold_places(shapes: Sequence[Any]) -> None:
+    """Let the largest numbers of shapes and of materials in this process be powers of two, from `_PLACES` on.
+
+    They are part of each kernel, which Dr.Jit would compile for each number of scenes, and for each mesh.
+    """
+    import mitsuba as mi
+
+    def hold(kind: str, make: Callable[[], Any], pointer: Any, objects: Sequence[Any]) -> None:
+        place = max(_PLACES, 1 << int(max(map(number_of, map(pointer, objects)), default=0)).bit_length())
+        while (kind, place) not in _placeholders:
+            waiting = [make()]
+            while number_of(pointer(waiting[-1])) < place:
+                waiting.append(make())
+            _placeholders[kind, place] = waiting[-1]
+
+    def number_of(pointer: Any) -> int:
+        return int(dr.reinterpret_array(mi.UInt, pointer)[0])
+
+    def material() -> Any:
+        return mi.load_dict({"type": "null"})
+
+    def shape() -> Any:
+        properties = mi.Properties()
+        properties["bsdf"] = _placeholders["material", _PLACES]
+        return mi.Mesh("placeholder", 3, 1, properties)
+
+    import drjit as dr
+
+    hold("material", material, mi.BSDFPtr, [each.bsdf() for each in shapes])
+    hold("shape", shape, mi.ShapePtr, shapes)
+
+
 def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Material] | None = None) -> Any:
     """Load a scene into Sionna RT with separate shapes and vertical isotropic antennas.
 
@@ -62,6 +100,7 @@ def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Mat
     import drjit as dr
     import mitsuba as mi
 
+    _hold_places(scene.mi_scene.shapes())
     set_antennas(scene, 1)
     _set_frequency(scene, dr.opaque(mi.Float, frequency_hz))
     _follow_frequency(scene, materials or {}, frequency_hz)
