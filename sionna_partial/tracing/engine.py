@@ -52,6 +52,9 @@ def engine_fault() -> str:
     return fault
 
 
+_RAYS = 1_000_000
+"""Number of rays of a transmitter, which only diffuse reflections depend on: candidates have none."""
+
 _PLACES = 256
 """Least number up to which Dr.Jit counts shapes and materials in kernels."""
 
@@ -306,7 +309,7 @@ class SceneSolver:
 
         self._scene = open_scene(scene_xml, settings.frequency_hz, materials)
         self.mi_scene = self._scene.mi_scene
-        self._field = settings.samples_per_tx, self._scene.tx_array.antenna_pattern.patterns
+        self._field = _RAYS, self._scene.tx_array.antenna_pattern.patterns
         objects = [self._scene.objects[name] for name in shapes if name in self._scene.objects]
         self.shapes = [shape.mi_mesh for shape in objects]
         faces = [mesh.face_count() for mesh in self.shapes]
