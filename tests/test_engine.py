@@ -90,17 +90,19 @@ class TestCompiling:
         assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
 
     @pytest.mark.parametrize("derive", [False, True])
-    def test_numbers_of_a_scene_are_not_compiled(self, derive: bool) -> None:
-        """Another frequency and materials of every kind: kernels of traces and derivatives are there."""
+    def test_other_scenes_are_not_compiled(self, derive: bool) -> None:
+        """At other frequencies, of all kinds of materials, beside others: kernels are there, also of derivatives."""
         cells = np.ones((12, 16), np.uint8)
         cells[1:-1, 1:-1] = CellState.FREE
         room, rx = sp.map_from_array(cells, resolution_m=0.4), [(1.0, 1.0, 1.5), (4.1, 3.3, 1.1)]
+        alive: list[sp.Simulation] = []
 
         def solve(itu: str | None, frequency_hz: float, exponent: float = 0.0) -> None:
             own = sp.Material(relative_permittivity=5.0, conductivity_s_m=0.5, conductivity_exponent=exponent)
             walls = sp.SceneSettings(material=own if itu is None else sp.Material(itu=itu))
             of_trace = sp.TraceSettings(frequency_hz, max_depth=1, diffraction=False, refraction=False)
-            paths = sp.Simulation(room, trace_settings=of_trace, scene_settings=walls).paths((2.0, 2.2, 1.4), rx)
+            alive.append(sp.Simulation(room, trace_settings=of_trace, scene_settings=walls))
+            paths = alive[-1].paths((2.0, 2.2, 1.4), rx)
             if derive:
                 paths.slopes(paths.base, ("thickness_m", "frequency_hz"))
 

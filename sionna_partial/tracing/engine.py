@@ -7,7 +7,7 @@ is avoided. Symbolic loops are fastest, but Dr.Jit differentiates evaluated loop
 import functools
 import gc
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.llvm import load_sionna
-from sionna_partial.scene.scene import PowerLaw, power_laws
 from sionna_partial.settings import Material, TraceSettings
+from sionna_partial.tracing.opened_scene import open_scene, set_antennas, set_frequency
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
 
 TESTED_VERSION = "2.2"
@@ -54,93 +54,6 @@ def engine_fault() -> str:
 
 _RAYS = 1_000_000
 """Number of rays of a transmitter, which only diffuse reflections depend on: candidates have none."""
-
-_PLACES = 256
-"""Least number up to which Dr.Jit counts shapes and materials in kernels."""
-
-_placeholders: dict[tuple[str, int], Any] = {}
-
-
-def _hold_places(shapes: Sequence[Any]) -> None:
-    """Let the largest numbers of shapes and of materials in this process be powers of two, from `_PLACES` on.
-
-    They are part of each kernel, which Dr.Jit would compile for each number of scenes, and for each mesh.
-    """
-    import mitsuba as mi
-
-    def hold(kind: str, make: Callable[[], Any], pointer: Any, objects: Sequence[Any]) -> None:
-        place = max(_PLACES, 1 << int(max(map(number_of, map(pointer, objects)), default=0)).bit_length())
-        while (kind, place) not in _placeholders:
-            waiting = [make()]
-            while number_of(pointer(waiting[-1])) < place:
-                waiting.append(make())
-            _placeholders[kind, place] = waiting[-1]
-
-    def number_of(pointer: Any) -> int:
-        return int(dr.reinterpret_array(mi.UInt, pointer)[0])
-
-    def material() -> Any:
-        return mi.load_dict({"type": "null"})
-
-    def shape() -> Any:
-        properties = mi.Properties()
-        properties["bsdf"] = _placeholders["material", _PLACES]
-        return mi.Mesh("placeholder", 3, 1, properties)
-
-    import drjit as dr
-
-    hold("material", material, mi.BSDFPtr, [each.bsdf() for each in shapes])
-    hold("shape", shape, mi.ShapePtr, shapes)
-
-
-def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Material] | None = None) -> Any:
-    """Load a scene into Sionna RT with separate shapes and vertical isotropic antennas.
-
-    `materials`, by their names in the scene, follow the frequency. No number of the scene is part of the code of a
-    kernel, which Dr.Jit would compile for each frequency.
-    """
-    scene = load_sionna().load_scene(str(scene_xml), merge_shapes=False)
-    import drjit as dr
-    import mitsuba as mi
-
-    _hold_places(scene.mi_scene.shapes())
-    set_antennas(scene, 1)
-    _set_frequency(scene, dr.opaque(mi.Float, frequency_hz))
-    _follow_frequency(scene, materials or {}, frequency_hz)
-    for own in scene.radio_materials.values():
-        dr.make_opaque(own.relative_permittivity, own.conductivity, own.thickness)
-    return scene
-
-
-def _set_frequency(scene: Any, frequency_hz: Any) -> None:
-    """Set the carrier frequency, with all materials.
-
-    Frozen functions refer to materials of all scenes that there are, and find their variables in attributes only.
-    """
-    scene.frequency = frequency_hz
-    for material in scene.radio_materials.values():
-        material.frequency_of_scene = scene.frequency
-
-
-def set_antennas(scene: Any, polarisations: int) -> None:
-    """Give a scene isotropic antennas: vertical, or V and H for 2 polarisations."""
-    polarization = "V" if polarisations == 1 else "VH"
-    array = load_sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
-    scene.tx_array = scene.rx_array = array
-
-
-def _follow_frequency(scene: Any, materials: Mapping[str, Material], frequency_hz: float) -> None:
-    """Give all materials their dependence on frequency in the same form, for which Dr.Jit compiles once."""
-    import drjit as dr
-    import mitsuba as mi
-
-    def update(laws: Sequence[PowerLaw], at_hz: Any) -> tuple[Any, ...]:
-        return tuple(opaque(law.value) * (at_hz / opaque(frequency_hz)) ** opaque(law.exponent) for law in laws)
-
-    opaque = functools.partial(dr.opaque, mi.Float)
-    for name in materials.keys() & scene.radio_materials.keys():
-        laws = power_laws(materials[name], frequency_hz)
-        scene.radio_materials[name].frequency_update_callback = functools.partial(update, laws)
 
 
 class _IncoherentScene:
@@ -432,7 +345,7 @@ class SceneSolver:
         kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
         frequency = self._scene.frequency
         try:
-            _set_frequency(self._scene, frequency + variables.frequency_hz)
+            set_frequency(self._scene, frequency + variables.frequency_hz)
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
             for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
                 material.relative_permittivity = new[0] * (material.relative_permittivity / permittivity)
@@ -441,7 +354,7 @@ class SceneSolver:
                 material.thickness = new[2]
             yield
         finally:
-            _set_frequency(self._scene, frequency)
+            set_frequency(self._scene, frequency)
             for material, permittivity, conductivity, thickness in kept:
                 material.relative_permittivity, material.conductivity = permittivity, conductivity
                 material.thickness = thickness
