@@ -68,18 +68,8 @@ ROOMS = {
     "worlds": ("buildings", "homes", "camera", "robot"),
     "scene": ("outlines", "scene", "export"),
     "tracing": (
-        *(
-            "interactions",
-            "power",
-            "paths",
-            "select",
-            "line",
-            "mesh.faces",
-            "walls",
-            "opened_scene",
-            "engine",
-            "antennas",
-        ),
+        *("interactions", "power", "paths", "select", "line", "mesh.faces", "walls"),
+        *("opened_scene", "engine", "antennas"),
         *("antenna_files", "array_paths", "responses", "links"),
         *(
             "plan.room",
