@@ -17,9 +17,9 @@ import sionna_partial as sp
 from sionna_partial.constants import CARRIER_FREQUENCY_HZ, SPEED_OF_LIGHT_M_S
 from sionna_partial.files import temporary_folder
 from sionna_partial.scene.scene import build_scene
+from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.finder import MeshScene, PlanScene, write_scene_of
 from sionna_partial.tracing.interactions import DIFFRACTION, REFLECTION, REFRACTION
-from sionna_partial.tracing.opened_scene import open_scene
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.simulation import resolved_settings
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from sionna_partial.maps.mesh.scene_mesh import SceneMesh
 from sionna_partial.scene.scene import write_mesh_scene
 from sionna_partial.settings import Material, TraceSettings
+from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.mesh.faces import (
     PLANE_TOLERANCE_M,
     MeshPlanes,
@@ -25,7 +26,6 @@ from sionna_partial.tracing.mesh.faces import (
 )
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import Rays, Sequences, collect_sequences, shoot_rays, view_sequences
-from sionna_partial.tracing.opened_scene import open_scene
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.power import materials_of
 from sionna_partial.tracing.walls import Cells, SolidMesh, closed_bodies

@@ -16,6 +16,7 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.export import export_scene
 from sionna_partial.scene.scene import build_scene, write_scene
 from sionna_partial.settings import ITU_BANDS_GHZ, SceneSettings, TraceSettings
+from sionna_partial.tracing.engine import open_scene
 from sionna_partial.tracing.interactions import (
     DIFFRACTION,
     DIFFUSE,
@@ -24,7 +25,6 @@ from sionna_partial.tracing.interactions import (
     only_by_rays,
     with_defaults,
 )
-from sionna_partial.tracing.opened_scene import open_scene
 from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.stock import listed_before, stock_paths
 

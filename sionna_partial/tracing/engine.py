@@ -7,7 +7,8 @@ is avoided. Symbolic loops are fastest, but Dr.Jit differentiates evaluated loop
 import functools
 import gc
 import logging
-from collections.abc import Callable, Iterator, Mapping
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import copy
 from dataclasses import dataclass
@@ -20,8 +21,8 @@ from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices
 from sionna_partial.llvm import load_sionna
+from sionna_partial.scene.scene import power_laws
 from sionna_partial.settings import Material, TraceSettings
-from sionna_partial.tracing.opened_scene import open_scene, set_antennas, set_frequency
 from sionna_partial.tracing.paths import Candidates, SolvedPaths, Wedges, join_paths
 
 TESTED_VERSION = "2.2"
@@ -54,6 +55,98 @@ def engine_fault() -> str:
 
 _RAYS = 1_000_000
 """Number of rays of a transmitter, which only diffuse reflections depend on: candidates have none."""
+
+
+_PLACES = 256
+"""Least number up to which kernels count shapes and materials."""
+
+_placeholders: dict[tuple[str, int], Any] = {}
+_holding = threading.Lock()
+
+
+def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Material] | None = None) -> Any:
+    """Load a scene with separate shapes and vertical isotropic antennas.
+
+    `materials`, by their names in the scene, follow the frequency.
+    """
+    scene = load_sionna().load_scene(str(scene_xml), merge_shapes=False)
+    import drjit as dr
+    import mitsuba as mi
+
+    with _holding:
+        _hold_places(scene.mi_scene.shapes())
+    set_antennas(scene, 1)
+    _set_frequency(scene, dr.opaque(mi.Float, frequency_hz))
+    _follow_frequency(scene, materials or {}, frequency_hz)
+    for own in scene.radio_materials.values():
+        dr.make_opaque(own.relative_permittivity, own.conductivity, own.thickness)
+    return scene
+
+
+def set_antennas(scene: Any, polarisations: int) -> None:
+    """Give a scene isotropic antennas: vertical, or V and H for 2 polarisations."""
+    polarization = "V" if polarisations == 1 else "VH"
+    array = load_sionna().PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization=polarization)
+    scene.tx_array = scene.rx_array = array
+
+
+def _set_frequency(scene: Any, frequency_hz: Any) -> None:
+    """Set the carrier frequency, a `mitsuba.Float` [Hz], with all materials.
+
+    Frozen functions refer to materials of all scenes that there are, and find their variables in attributes only.
+    """
+    scene.frequency = frequency_hz
+    for material in scene.radio_materials.values():
+        material.frequency_of_scene = scene.frequency
+
+
+def _follow_frequency(scene: Any, materials: Mapping[str, Material], at_load_hz: float) -> None:
+    """Give all materials their dependence on frequency in the same form, for which Dr.Jit compiles once."""
+    import drjit as dr
+    import mitsuba as mi
+
+    def update(laws: Sequence[tuple[Any, Any]], at_hz: Any) -> tuple[Any, ...]:
+        return tuple(value * (at_hz / frequency_hz) ** exponent for value, exponent in laws)
+
+    frequency_hz = scene.frequency
+    for name in materials.keys() & scene.radio_materials.keys():
+        laws = power_laws(materials[name], at_load_hz)
+        opaque = [(dr.opaque(mi.Float, law.value), dr.opaque(mi.Float, law.exponent)) for law in laws]
+        scene.radio_materials[name].frequency_update_callback = functools.partial(update, opaque)
+
+
+def _hold_places(shapes: Sequence[Any]) -> None:
+    """Let the largest numbers of shapes and of materials in this process, which Dr.Jit reuses, be powers of two.
+
+    Kernels have tables of as many places, so that each number of scenes and each mesh would compile them again.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    def placeholder(kind: str, make: Callable[[], Any], pointer: Any, objects: Sequence[Any]) -> Any:
+        place = max(_PLACES, 1 << max(number_of(pointer(each)) for each in objects).bit_length())
+        waiting = []
+        while (kind, place) not in _placeholders:
+            waiting.append(make())
+            if number_of(pointer(waiting[-1])) >= place:
+                _placeholders[kind, place] = waiting[-1]
+        return _placeholders[kind, place]
+
+    def number_of(pointer: Any) -> int:
+        numbers: Any = dr.reinterpret_array(mi.UInt, pointer)
+        return int(numbers[0])
+
+    def new_material() -> Any:
+        return mi.load_dict({"type": "null"})
+
+    def new_shape() -> Any:
+        properties: Any = mi.Properties()
+        properties["bsdf"] = material
+        return mi.Mesh("placeholder", 3, 1, properties)
+
+    if len(shapes):
+        material = placeholder("material", new_material, mi.BSDFPtr, [each.bsdf() for each in shapes])
+        placeholder("shape", new_shape, mi.ShapePtr, shapes)
 
 
 class _IncoherentScene:
@@ -181,15 +274,15 @@ class Variables:
     """Variables of the power of paths, as `mitsuba.Float`, to which derivatives lead back.
 
     `shift_m` is added to x, y, z of the transmitters, each with 1 or T entries [m], `frequency_hz` to the carrier
-    frequency. The others are values for each of `SceneSolver.materials`, not changes, which would drown in a metal's
-    conductivity; they are multiplied by the materials' change with the frequency.
+    frequency, None for an unchanged one. The others are values for each of `SceneSolver.materials`, not changes, which
+    would drown in a metal's conductivity; they are multiplied by the materials' change with the frequency.
     """
 
     shift_m: tuple[Any, ...]
     relative_permittivity: tuple[Any, ...]
     conductivity_s_m: tuple[Any, ...]
     thickness_m: tuple[Any, ...]
-    frequency_hz: Any
+    frequency_hz: Any | None
 
 
 @dataclass(frozen=True)
@@ -341,23 +434,22 @@ class SceneSolver:
     def _changed(self, variables: Variables) -> Iterator[None]:
         import drjit as dr
 
-        materials = self._scene.radio_materials.values()
-        kept = [(own, own.relative_permittivity, own.conductivity, own.thickness) for own in materials]
-        frequency = self._scene.frequency
+        materials = [*self._scene.radio_materials.values()]
+        kept = [(each, dict(vars(each))) for each in (self._scene, *materials)]
+        constants = [(own, own.relative_permittivity, own.conductivity) for own in materials]
         try:
-            set_frequency(self._scene, frequency + variables.frequency_hz)
+            if variables.frequency_hz is not None:
+                _set_frequency(self._scene, self._scene.frequency + variables.frequency_hz)
             values = variables.relative_permittivity, variables.conductivity_s_m, variables.thickness_m
-            for (material, permittivity, conductivity, _), *new in zip(kept, *values, strict=True):
+            for (material, permittivity, conductivity), *new in zip(constants, *values, strict=True):
                 material.relative_permittivity = new[0] * (material.relative_permittivity / permittivity)
                 grown = dr.select(conductivity > 0.0, material.conductivity / dr.maximum(conductivity, 1e-30), 1.0)
                 material.conductivity = new[1] * grown
                 material.thickness = new[2]
             yield
         finally:
-            set_frequency(self._scene, frequency)
-            for material, permittivity, conductivity, thickness in kept:
-                material.relative_permittivity, material.conductivity = permittivity, conductivity
-                material.thickness = thickness
+            for each, attributes in kept:  # their setters would launch kernels
+                vars(each).update(attributes)
 
     def _buffer(self, candidates: Candidates) -> Any:
         import mitsuba as mi

@@ -19,12 +19,11 @@ from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.scene.scene import SceneGeometry, floor_cells, write_map
 from sionna_partial.settings import SceneSettings, TraceSettings
 from sionna_partial.tracing.antennas import Antenna
-from sionna_partial.tracing.engine import SceneSolver
+from sionna_partial.tracing.engine import SceneSolver, open_scene, set_antennas
 from sionna_partial.tracing.interactions import REFRACTION
 from sionna_partial.tracing.mesh.faces import FaceTree, MeshPlanes, face_tree, group_planes
 from sionna_partial.tracing.mesh.reflections import MeshReflections
 from sionna_partial.tracing.mesh.sequences import SPLIT_RAYS, shoot_rays
-from sionna_partial.tracing.opened_scene import open_scene, set_antennas
 from sionna_partial.tracing.paths import Candidates, LocatedPaths, SolvedPaths, Wedges
 from sionna_partial.tracing.plan.edges import CrossedEdgeCandidates, DiffractionCandidates, find_wedges
 from sionna_partial.tracing.plan.reflections import CrossingCandidates, SpecularCandidates

@@ -235,7 +235,8 @@ class PathSet:
         shift_m = (parameters.tx_m - self.base.tx_m).reshape(-1, 3).T.astype(np.float32)
         shift = tuple(to_device(mi.Float, column) + leaf for column, leaf in zip(shift_m, leaves["tx_m"], strict=True))
         materials = {name: tuple(own) for name, own in values.items()}
-        return leaves, Variables(shift_m=shift, frequency_hz=frequency_hz[0], **materials)
+        same = parameters.frequency_hz == self.base.frequency_hz and "frequency_hz" not in names
+        return leaves, Variables(shift_m=shift, frequency_hz=None if same else frequency_hz[0], **materials)
 
 
 def _merged(parts: list[Part]) -> list[Part]:

@@ -15,8 +15,8 @@ from sionna_partial.constants import GAIN_FLOOR_DB
 from sionna_partial.errors import BackendError, SettingsError
 from sionna_partial.llvm import load_sionna
 from sionna_partial.settings import TraceSettings
+from sionna_partial.tracing.engine import set_antennas
 from sionna_partial.tracing.interactions import DIFFRACTION, DIFFUSE, INTERACTIONS, REFLECTION
-from sionna_partial.tracing.opened_scene import set_antennas
 from sionna_partial.tracing.paths import SolvedPaths, Wedges
 from sionna_partial.tracing.plan.edges import MAX_REFLECTIONS
 
