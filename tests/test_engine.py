@@ -87,11 +87,14 @@ class TestCompiling:
                 solver.verify(fewer, TX + 0.01 * skip, RX)[0]
             kernels = dr.kernel_history([dr.KernelType.JIT])
         assert len(kernels) >= 7
-        assert [kernel["hash"] for kernel in kernels if not kernel["cache_hit"]] == []
+        assert [kernel["hash"] for kernel in kernels if kernel["cache_disk"] or not kernel["cache_hit"]] == []
 
     @pytest.mark.parametrize("derived", [[], ["thickness_m", "frequency_hz"]], ids=["traces", "derivatives"])
     def test_other_scenes_are_not_compiled(self, derived: list[str]) -> None:
-        """In a process of its own: kernels depend on kinds of materials that other tests have left."""
+        """In a process of its own: kernels depend on kinds of materials that other tests have left.
+
+        Kernels that other processes left on the disk count as well.
+        """
         done = subprocess.run([sys.executable, "-c", SCENES, *derived], capture_output=True, text=True, timeout=600)
         assert done.returncode == 0, done.stderr
         launched, compiled = map(int, done.stdout.split())
@@ -131,7 +134,7 @@ with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
     solve(sp.Material(itu="wood"), 7.7e9)
     solve(sp.Material(5.0, 0.5, conductivity_exponent=0.77), 28e9)
     kernels = dr.kernel_history([dr.KernelType.JIT])
-print(len(kernels), sum(not kernel["cache_hit"] for kernel in kernels))
+print(len(kernels), sum(kernel["cache_disk"] or not kernel["cache_hit"] for kernel in kernels))
 """
 """Scenes at other frequencies and of all kinds of materials, alive together."""
 

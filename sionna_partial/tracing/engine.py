@@ -76,8 +76,9 @@ def open_scene(scene_xml: Path, frequency_hz: float, materials: Mapping[str, Mat
     with _holding:
         _hold_places(scene.mi_scene.shapes())
     set_antennas(scene, 1)
-    _set_frequency(scene, dr.opaque(mi.Float, frequency_hz))
-    _follow_frequency(scene, materials or {}, frequency_hz)
+    opaque_hz = dr.opaque(mi.Float, frequency_hz)
+    _follow_frequency(scene, materials or {}, opaque_hz, frequency_hz)
+    _set_frequency(scene, opaque_hz)
     for own in scene.radio_materials.values():
         dr.make_opaque(own.relative_permittivity, own.conductivity, own.thickness)
     return scene
@@ -100,7 +101,7 @@ def _set_frequency(scene: Any, frequency_hz: Any) -> None:
         material.frequency_of_scene = scene.frequency
 
 
-def _follow_frequency(scene: Any, materials: Mapping[str, Material], at_load_hz: float) -> None:
+def _follow_frequency(scene: Any, materials: Mapping[str, Material], frequency_hz: Any, at_load_hz: float) -> None:
     """Give all materials their dependence on frequency in the same form, for which Dr.Jit compiles once."""
     import drjit as dr
     import mitsuba as mi
@@ -108,7 +109,6 @@ def _follow_frequency(scene: Any, materials: Mapping[str, Material], at_load_hz:
     def update(laws: Sequence[tuple[Any, Any]], at_hz: Any) -> tuple[Any, ...]:
         return tuple(value * (at_hz / frequency_hz) ** exponent for value, exponent in laws)
 
-    frequency_hz = scene.frequency
     for name in materials.keys() & scene.radio_materials.keys():
         laws = power_laws(materials[name], at_load_hz)
         opaque = [(dr.opaque(mi.Float, law.value), dr.opaque(mi.Float, law.exponent)) for law in laws]
