@@ -8,14 +8,16 @@ replace its symbols. So pip's library is loaded when `sionna_partial` is importe
 import ctypes
 import functools
 import os
+import pkgutil
 import re
 import sys
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from types import ModuleType
-from typing import Final
+from typing import Any, Final
 
 from sionna_partial.errors import BackendError
 from sionna_partial.process import signals_held
@@ -91,10 +93,44 @@ def load_sionna() -> ModuleType:
             f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
             "before the first trace, or import sionna_partial in a process of its own."
         )
-    with signals_held():
+    with signals_held(), _postponed(*_DISPLAYS):
         import sionna.rt
 
     return sionna.rt
+
+
+_DISPLAYS = "ipywidgets", "ipywidgets.embed", "pythreejs", "IPython.display", "matplotlib.pyplot"
+"""Modules that Sionna RT imports to show things, in three times the time of its own."""
+
+
+class _Postponed(ModuleType):
+    """A module, or a name in one, that is imported on its first use after `_postponed` has ended."""
+
+    def __init__(self, name: str, module: str) -> None:
+        super().__init__(name)
+        self._module = module
+
+    def __getattr__(self, name: str) -> Any:
+        if not isinstance(sys.modules.get(self._module), _Postponed):
+            return getattr(pkgutil.resolve_name(self.__name__), name)
+        if name.startswith("__"):
+            raise AttributeError(name)
+        return _Postponed(f"{self.__name__}.{name}", self._module)
+
+    def __call__(self, *args: Any, **options: Any) -> Any:
+        return pkgutil.resolve_name(self.__name__)(*args, **options)
+
+
+@contextmanager
+def _postponed(*names: str) -> Iterator[None]:
+    """Let modules that are imported meanwhile do without these, which they load when they use them."""
+    waiting = {name: _Postponed(name, name) for name in names if name not in sys.modules}
+    sys.modules.update(waiting)
+    try:
+        yield
+    finally:
+        for name in waiting:
+            del sys.modules[name]
 
 
 @functools.cache

@@ -137,6 +137,24 @@ def test_any_order_of_imports_works_or_ends_in_one_line(names: str) -> None:
     assert "leak" not in done.stderr.lower()
 
 
+def test_stock_figures_and_preview_import_what_they_show() -> None:
+    shown = """
+import sys
+from sionna_partial.llvm import load_sionna
+rt = load_sionna()
+print({"ipywidgets", "pythreejs", "matplotlib.pyplot"} & {*sys.modules})
+scene = rt.load_scene()
+scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+figures = scene.tx_array.antenna_pattern.show()
+scene.preview()
+import ipywidgets, matplotlib.pyplot as plt
+print([type(figure) is plt.Figure for figure in figures], ipywidgets.widgets.__name__, rt.Previewer.__module__)
+"""
+    before, *_, after = run_python(shown, MPLBACKEND="Agg").splitlines()
+    assert before == "set()"
+    assert after == "[True, True, True] ipywidgets.widgets sionna.rt.preview"
+
+
 def test_folder_named_coverage_is_not_the_library_that_numba_looks_for(tmp_path: Path) -> None:
     (tmp_path / "coverage").mkdir()
     assert output(run("import sionna_partial, numba", "print(numba.__name__)", folder=tmp_path)) == "numba\n"
