@@ -94,7 +94,7 @@ def load_sionna() -> ModuleType:
             "before the first trace, or import sionna_partial in a process of its own."
         )
     with signals_held(), _postponed(*_DISPLAYS):
-        import sionna.rt
+        import sionna.rt.rcs  # which loading a scene imports
 
     return sionna.rt
 
