@@ -18,6 +18,7 @@ from sionna_partial.llvm import MITSUBA_VARIANT
 from sionna_partial.scene.scene import SceneGeometry, build_scene, write_scene
 from sionna_partial.tracing import engine
 from sionna_partial.tracing.engine import SceneSolver, engine_fault
+from sionna_partial.tracing.path_set import PARAMETERS
 from sionna_partial.tracing.paths import Candidates
 from sionna_partial.tracing.plan.edges import find_wedges
 
@@ -100,6 +101,24 @@ class TestCompiling:
         launched, compiled = map(int, done.stdout.split())
         assert launched >= 30
         assert compiled == 0
+
+    def test_further_variables_are_not_compiled(self) -> None:
+        """Derivatives by x, y and z have the same kernels; those by materials and frequency too."""
+        cells = np.pad(np.full((10, 14), CellState.FREE), 1, constant_values=CellState.WALL)
+        settings = sp.TraceSettings(max_depth=1, diffraction=False, refraction=False)
+        simulation = sp.Simulation(sp.map_from_array(cells, resolution_m=0.4), settings)
+        import drjit as dr  # after LLVM
+
+        paths, compiled = simulation.paths((2.0, 2.2, 1.4), [(1.0, 1.0, 1.5)]), []
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            for _, name, entry, slopes in paths._passes(paths.base, PARAMETERS):
+                dr.eval(slopes)
+                kernels = dr.kernel_history([dr.KernelType.JIT])
+                assert kernels
+                if entry or name in PARAMETERS[2:]:
+                    compiled += [name for each in kernels if each["cache_disk"] or not each["cache_hit"]]
+        assert compiled == []
 
 
 def _elsewhere(candidates: Candidates, skip: int) -> Candidates:

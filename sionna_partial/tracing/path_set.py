@@ -197,8 +197,10 @@ class PathSet:
                 power = solver.power(self._held_paths(number), variables, differentiable=True)
                 vertices_m = dr.zeros(type(power))
             results = power, vertices_m + dr.opaque(type(power), 0.0)  # power is made of them: theirs would be cleared
-            for name in names:
-                for entry, slopes in enumerate(_forward_passes(results, leaves[name])):
+            for some in ({"tx_m"}, {*PARAMETERS[1:]}):
+                entries = [(name, entry) for name in names if name in some for entry in range(len(leaves[name]))]
+                passes = _forward_passes(results, [leaves[name][entry] for name, entry in entries])
+                for (name, entry), slopes in zip(entries, passes, strict=True):
                     yield rows, name, entry, slopes
 
     def _moves(self, parameters: PathParameters) -> bool:
@@ -262,10 +264,13 @@ def _merged(parts: list[Part]) -> list[Part]:
 
 
 def _forward_passes(results: Any, leaves: Sequence[Any]) -> Iterator[Any]:
-    """Yield the derivatives of results by each variable."""
+    """Yield the derivatives of results by each variable, all by the same kernels."""
     import drjit as dr
 
     for leaf in leaves:
         dr.clear_grad(results)
-        dr.forward_from(leaf, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
+        for each in leaves:  # Dr.Jit compiles kernels for literals, and for variables without a derivative
+            dr.set_grad(each, dr.opaque(type(each), float(each is leaf)))
+        dr.enqueue(dr.ADMode.Forward, leaves)
+        dr.traverse(dr.ADMode.Forward, flags=dr.ADFlag.ClearInterior)  # the graph stays for the next variable
         yield dr.grad(results)
