@@ -12,6 +12,9 @@ given, and with three standard errors allowed as well. `one_prediction.py` compa
 `LinkModel.predict`. Run it with
 
     python benchmarks/gradient.py
+
+With --compiling it prints how many kernels a first `gain_gradients` of a process launches and compiles, and how many
+more another frequency and another material do; with an empty HOME, Dr.Jit finds none on the disk.
 """
 
 import argparse
@@ -60,7 +63,11 @@ def main() -> None:
     )
     parser.add_argument("--receivers", type=int, default=60, help="receivers with finite differences")
     parser.add_argument("--spacing", type=float, default=0.3, help="receiver spacing for the cost [m]")
+    parser.add_argument("--compiling", action="store_true", help="count compiled kernels instead")
     arguments = parser.parse_args()
+    if arguments.compiling:
+        count_kernels()
+        return
     found: dict[tuple[str, str], list[Errors]] = {}
     for seed in arguments.seeds:
         home = sp.make_home(seed)
@@ -173,6 +180,28 @@ def cost(scene: DifferentiableScene, tx: NDArray[np.float64], rx: NDArray[np.flo
     print(
         f"{name}, {len(rx)} receivers: trace 1 ({trace_s:.2f} s), {times}; peak {peak_memory_gb():.1f} GB", flush=True
     )
+
+
+def count_kernels() -> None:
+    """Print kernels and processor time of `gain_gradients` on a demo home, for one setting after the other."""
+    import drjit as dr
+
+    rx_m = [(6.0, 9.0, 1.5), (8.0, 9.9, 1.3), (5.0, 5.0, 1.2), (7.0, 8.0, 1.0)]
+    for frequency_hz, material in ((28e9, "drywall"), (28e9, "drywall"), (27.3e9, "drywall"), (28e9, "brick")):
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            start = time.process_time()
+            sp.gain_gradients(
+                sp.resources.scenes_folder() / "apartment/step100/map.yaml",
+                (7.0, 9.8, 1.5),
+                rx_m,
+                trace_settings=sp.TraceSettings(frequency_hz, max_depth=2),
+                scene_settings=sp.SceneSettings(material=sp.Material.named(material)),
+            )
+            took_s = time.process_time() - start
+            kernels = dr.kernel_history([dr.KernelType.JIT])
+        new = sum(kernel["cache_disk"] or not kernel["cache_hit"] for kernel in kernels)
+        print(f"{frequency_hz / 1e9:g} GHz, {material}: {len(kernels)} launches, {new} compiled, {took_s:.1f} s")
 
 
 def seconds(function: object) -> float:
