@@ -100,7 +100,7 @@ def load_sionna() -> ModuleType:
 
 
 _DISPLAYS = "ipywidgets", "ipywidgets.embed", "pythreejs", "IPython.display", "matplotlib.pyplot"
-"""Modules that Sionna RT imports to show things, in three times the time of its own."""
+"""Modules that Sionna RT imports to show things, which takes longer than the rest of its import."""
 
 
 class _Postponed(ModuleType):
