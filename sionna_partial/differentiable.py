@@ -297,7 +297,7 @@ class DifferentiableScene:
 
     @cached_property
     def _walls(self) -> WallDensity:
-        walls = UnseenWalls.shipped().of_map(self.partial)
+        walls = UnseenWalls.shipped_of_map(self.partial)
         return walls._replace(lines=UnseenWalls.keras_lines())
 
 

@@ -120,3 +120,13 @@ def test_training_repeats_itself(unseen_home, tmp_path, monkeypatch):
     assert not np.array_equal(first.cells.get_weights()[0], start)
     with np.load(tmp_path / "first.npz") as stored:
         assert np.array_equal(stored["cells_0"], first.cells.get_weights()[0])
+
+
+def test_a_map_is_read_once(monkeypatch: pytest.MonkeyPatch):
+    read, of_map = [], UnseenWalls.of_map
+    monkeypatch.setattr(UnseenWalls, "of_map", lambda walls, partial: read.append(partial) or of_map(walls, partial))
+    settings, far = sp.TraceSettings(5e9, max_depth=0, diffraction=False), [(8.5, 0.0, 1.5)]
+    first, other = half_known(), half_known(60)
+    for partial in (first, first, other):
+        sp.LinkModel(partial, trace_settings=settings).predict((4.0, 0.0, 1.5), far)
+    assert list(map(id, read)) == [id(first), id(other)]

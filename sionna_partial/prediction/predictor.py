@@ -39,7 +39,6 @@ from sionna_partial.prediction.unseen_walls import (
     WALL_LOSSES,
     DirectLines,
     UnseenWalls,
-    WallDensity,
     WallTrace,
     by_mean_losses,
 )
@@ -387,17 +386,13 @@ class MeanLosses:
         self.settings, self.fingerprint = networks.settings, networks.fingerprint
         self.predict_indoor = networks.predict_indoor
 
-    @cached_property
-    def _walls(self) -> WallDensity:
-        return UnseenWalls.shipped().of_map(self._partial)
-
     def predict(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links (N,)."""
         return self.predict_each([phi])[0]
 
     def predict_each(self, features: Sequence[LinkFeatures]) -> list[LinkPrediction]:
         """Predict the same links for several wall losses."""
-        walls = self._walls.counts(DirectLines.of(features[0]))
+        walls = UnseenWalls.shipped_of_map(self._partial).counts(DirectLines.of(features[0]))
         traces = map(WallTrace.of, features)
         return [LinkPrediction.of_parts(*by_mean_losses(trace, walls, self._max_walls)) for trace in traces]
 

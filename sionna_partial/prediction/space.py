@@ -8,12 +8,14 @@ nor its origin or orientation matter. A random walk, whose steps known walls sto
   known walls. It is symmetric in its ends.
 """
 
+import functools
 import itertools
 import math
 import weakref
 from collections import deque
+from collections.abc import Callable
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,7 +70,25 @@ _BEYOND_CELLS = 2
 _FACTORS_KEPT = 8
 """Number of maps with factors in memory, some 10 MB each."""
 
-_kept: dict[int, tuple[Any, "MapSpace"]] = {}
+_Found = TypeVar("_Found")
+
+
+def kept_by_map(function: Callable[[PartialMap], _Found]) -> Callable[[PartialMap], _Found]:
+    """Keep the results of a function of maps as long as its maps are there."""
+    kept: dict[int, tuple[Any, _Found]] = {}
+
+    @functools.wraps(function)
+    def of(partial: PartialMap) -> _Found:
+        known = kept.get(id(partial))
+        if known is None or known[0]() is not partial:  # numbers of maps that are gone are used again
+            for old in [key for key, (owner, _) in [*kept.items()] if owner() is None]:
+                kept.pop(old, None)
+            known = kept[id(partial)] = weakref.ref(partial), function(partial)
+        return known[1]
+
+    return of
+
+
 _factorised: deque["MapSpace"] = deque()
 
 
@@ -110,15 +130,11 @@ class MapSpace:
         sampled = _sampled_walls(walls, first, self._cells, self.shape)
         self._conductances = _conductances(sampled, self.shape)
 
-    @classmethod
-    def of(cls, partial: PartialMap) -> "MapSpace":
-        """Return the fields of a map; the latest are kept."""
-        kept = _kept.get(id(partial))
-        if kept is None or kept[0]() is not partial:  # numbers of maps that are gone are used again
-            for old in [key for key, (owner, _) in [*_kept.items()] if owner() is None]:
-                _kept.pop(old, None)
-            kept = _kept[id(partial)] = weakref.ref(partial), cls(partial)
-        return kept[1]
+    @staticmethod
+    @kept_by_map
+    def of(partial: PartialMap) -> "MapSpace":
+        """Return the fields of a map, which are kept with it."""
+        return MapSpace(partial)
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in vars(self).items() if name != "_factors"}

@@ -28,6 +28,7 @@ from sionna_partial.prediction.map_training import kernel_starts, u_net
 from sionna_partial.prediction.paper_networks import import_keras, layer
 from sionna_partial.prediction.predictor_files import shipped_bytes
 from sionna_partial.prediction.rule import RARE, Parts
+from sionna_partial.prediction.space import kept_by_map
 from sionna_partial.prediction.unobserved import centred_grid, overlaps
 from sionna_partial.resources import PREDICTORS_FOLDER
 from sionna_partial.settings import TraceSettings
@@ -162,6 +163,12 @@ class UnseenWalls(NamedTuple):
             arrays |= {f"{name}_{number}": values for number, values in enumerate(model.get_weights())}
         with atomic_write(path) as stream:
             np.savez_compressed(stream, **arrays)
+
+    @staticmethod
+    @kept_by_map
+    def shipped_of_map(partial: PartialMap) -> WallDensity:
+        """Return the walls of a map by the trained networks, which are kept with it."""
+        return UnseenWalls.shipped().of_map(partial)
 
     def of_map(self, partial: PartialMap) -> WallDensity:
         part = _known_part(partial)
