@@ -6,6 +6,7 @@ import os
 import signal
 import stat
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 
 import pytest
 import xarray as xr
@@ -72,6 +73,18 @@ def short_search() -> Iterator[None]:
             "FEW_FRINGES": 1,
         }.items():
             patch.setattr(material_fit, name, value)
+        yield
+
+
+@pytest.fixture
+def few_paths() -> Iterator[None]:
+    """Trace short paths without diffraction where no settings are given, which takes little time."""
+    from sionna_partial.settings import TraceSettings
+
+    few = {"max_depth": 2, "diffraction": False}
+    defaults = tuple(few.get(each.name, each.default) for each in fields(TraceSettings))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(TraceSettings.__init__, "__defaults__", defaults)
         yield
 
 

@@ -53,8 +53,8 @@ def make_home(seed: int, kind: str | None = None) -> SimpleNamespace:
     (notes / f"process-{os.getpid()}").touch()
     if (notes / "harmless").exists():
         return SimpleNamespace()
-    if seed == KILLS or (seed == KILLS_ONCE and not (notes / "killed").exists()):
-        (notes / "killed").touch()
+    if seed == KILLS or (seed == KILLS_ONCE and not (notes / f"killed {seed}").exists()):
+        (notes / f"killed {seed}").touch()
         print("last words", file=sys.stderr, flush=True)
         os.kill(os.getpid(), signal.SIGKILL)
     if seed == HANGS:

@@ -26,7 +26,7 @@ from sionna_partial.files import locked_folder
 from sionna_partial.lab.datasets import dataset, home_processes
 from sionna_partial.lab.datasets.dataset import DatasetReport, build_dataset
 from sionna_partial.lab.datasets.home_links import HomeSource
-from sionna_partial.lab.datasets.home_processes import HomeTask, run_home
+from sionna_partial.lab.datasets.home_processes import HomeResult, HomeTask, run_home
 from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.shards import read_dataset, read_shard, shard_path, write_shard
 
@@ -37,7 +37,7 @@ BUILD = """
 import sys
 from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.dataset import build_dataset
-build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=2)
+build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=1)
 """
 
 
@@ -162,6 +162,7 @@ def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
     folder = tmp_path_factory.mktemp("poisoned") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
+        patch.setattr(home_processes, "ATTEMPTS", 2)
         return build_dataset(folder, POISONED, SETTINGS, workers=2, home_time_limit_s=5.0)
 
 
@@ -171,7 +172,7 @@ class TestPoisonedHomes:
         assert poisoned.failed.keys() == {f"make_home({seed})" for seed in (KILLS, HANGS, RAISES)}
         assert set(read_dataset(poisoned.folder).home) == set(poisoned.built)
         for seed, words in (
-            (KILLS, ("its process died 3 times (SIGKILL)\n", "last words")),
+            (KILLS, ("its process died 2 times (SIGKILL)\n", "last words")),
             (HANGS, ("took longer than 5 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
             (RAISES, ("ZeroDivisionError: a fault of this home\nTraceback",)),
         ):
@@ -226,7 +227,11 @@ class TestRefused:
             with pytest.raises(error, match=message):
                 build_dataset(tmp_path / "set", **given)
 
-    def test_home_from_another_file(self, tmp_path: Path) -> None:
+    def test_home_from_another_file(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def unread(_: object, tasks: list[HomeTask], *__: object) -> Iterator[tuple[HomeTask, HomeResult]]:
+            yield from ((each, HomeResult("failed", "not read")) for each in tasks)
+
+        monkeypatch.setattr(dataset, "_results", unread)
         for folder in ("a", "b"):
             (tmp_path / folder / "villa").mkdir(parents=True)
             (tmp_path / folder / "villa" / "map.yaml").touch()

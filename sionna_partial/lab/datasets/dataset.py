@@ -112,7 +112,7 @@ def build_dataset(
     Examples
     --------
     >>> import sionna_partial as sp
-    >>> settings = sp.lab.DatasetSettings(links_per_home=4, stages=(0, 5))
+    >>> settings = sp.lab.DatasetSettings(links_per_home=4, transmitters_per_home=1, stages=(0, 5))
     >>> report = sp.lab.build_dataset("links", [7], settings, workers=1)
     >>> report.built
     ('make_home(7)',)
