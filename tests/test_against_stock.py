@@ -24,7 +24,7 @@ from sionna_partial.tracing.paths import SolvedPaths, join_paths
 from sionna_partial.tracing.simulation import resolved_settings
 from sionna_partial.tracing.stock import diffracted_as_exact, stock_paths
 
-DRYWALL = sp.Material()
+DRYWALL, RAYS = sp.Material(), 30_000
 Compared = Callable[[PlanScene | MeshScene, SolvedPaths], NDArray[np.bool_]]
 
 
@@ -92,10 +92,10 @@ INSIDE, OVER = np.array([1.03, 2.93, 1.4]), np.array([1.83, -0.08, 1.1])
 PLACES, HALF = (_grid(partial, 0.3) + np.array([0.021, 0.013, 0.3]) for partial in (_room(), _half_seen_room()))
 ABOUT = np.array([(2.0, 0.2, 0.35), (3.3, 0.8, 0.9), (4.6, 1.4, 1.5), (5.9, 2.0, 0.35), (3.8, 0.5, 0.9)])
 AMONG = np.random.default_rng(0).uniform((0.4, 0.3, 0.2), (7.6, 5.7, 2.8), (5, 3))
-OPAQUE = replace(SPECULAR, samples_per_tx=100_000)
-BENT = all_paths(max_depth=3, open_ends=True, samples_per_tx=100_000)
+OPAQUE = replace(SPECULAR, samples_per_tx=RAYS)
+BENT = all_paths(max_depth=3, open_ends=True, samples_per_tx=RAYS)
 LOW = replace(OPAQUE, max_depth=2, wall_depth_m=0.0)
-LEAKY = replace(EVERY, samples_per_tx=300_000)
+LEAKY = replace(EVERY, samples_per_tx=RAYS)
 THROUGH: dict[str, Any] = {"weakest": 1e-3, "material": BRICK}
 
 CASES = {
@@ -105,7 +105,7 @@ CASES = {
     "mesh": Case(furnished, replace(OPAQUE, max_depth=3), np.array([4.3, 2.8, 1.6]), AMONG, 150, found=0.99),
     "materials through walls": Case(of_several_materials, LEAKY, TX, RX, 30, power=2e-3, **THROUGH),
     "edges through walls": Case(
-        *(rooms, replace(EVERY, diffraction=True, max_depth=3), TX, RX, 3, 1e-4),
+        *(rooms, replace(LEAKY, diffraction=True, max_depth=3), TX, RX, 3, 1e-4),
         power=5e-3,
         compared=at_edges_alone,
         material=BRICK,
