@@ -68,7 +68,7 @@ def stock_paths(xml: Path, depth: int, arrays: dict[str, Any], *, synthetic: boo
         position, orientation = (mi.Point3f(*map(float, values)) for values in place)
         scene.add(device(f"end{number}", position=position, orientation=orientation))
     options = {"diffraction": diffraction, "edge_diffraction": diffraction, "synthetic_array": synthetic}
-    options |= {"samples_per_src": 100_000, "max_num_paths_per_src": 1_000_000}
+    options |= {"samples_per_src": 20_000, "max_num_paths_per_src": 200_000}
     return rt.PathSolver(deterministic=True)(scene, max_depth=depth, refraction=False, **options)
 
 
