@@ -349,8 +349,9 @@ class DifferentiableLinks:
         moved = moved_paths(self._paths, given)
         through_walls = self._scene.simulation.trace_settings.through_walls
         traces, prior = self._traces(moved[0], given)
-        found = [traced_parts(trace.link_state, trace.gain_db, ops) for trace in traces]
-        if not self._is_certain:
+        if self._is_certain:
+            found = [traced_parts(trace.link_state, trace.gain_db, ops) for trace in traces]
+        else:
             found = self._by_rule(traces, given, *moved)
         distribution = over_materials(found, prior, RESIDUAL_DB, ops) if through_walls else found[0]
         return LinkDistribution.of_parts(*distribution, ops=ops)
@@ -414,7 +415,13 @@ class DifferentiableLinks:
         lengths_m = (tf.convert_to_tensor(values[name]) for name in ("unobserved_distance_m", "distance_m"))
         lines = DirectLines._make([*self._moved.ends_m(tx_m), *lengths_m, traces[0].known])
         walls = scene._walls.counts(lines, ops)
-        return [by_mean_losses(trace, walls, scene.simulation.trace_settings.max_walls, ops) for trace in traces]
+        states, gains_db, losses_db, known = zip(*traces, strict=True)
+        together = WallTrace(
+            np.concatenate(states), tf.concat(gains_db, 0), tf.concat(losses_db, 0), np.concatenate(known)
+        )
+        repeated, max_walls = tf.tile(walls, [len(traces)]), scene.simulation.trace_settings.max_walls
+        found = (tf.split(part, len(traces), axis=1) for part in by_mean_losses(together, repeated, max_walls, ops))
+        return [*zip(*found, strict=True)]
 
     def _by_networks(self, values: Mapping[str, Any], given: Mapping[str, Any]) -> tuple[Any, Parts]:
         """Return the free-space gain (N,) [dB], and the distribution of the networks."""
