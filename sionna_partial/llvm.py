@@ -111,14 +111,20 @@ class _Postponed(ModuleType):
         self._module = module
 
     def __getattr__(self, name: str) -> Any:
-        if not isinstance(sys.modules.get(self._module), _Postponed):
+        if not self._waits:
             return getattr(pkgutil.resolve_name(self.__name__), name)
         if name.startswith("__"):
             raise AttributeError(name)
         return _Postponed(f"{self.__name__}.{name}", self._module)
 
     def __call__(self, *args: Any, **options: Any) -> Any:
+        if self._waits:  # another thread has imported it meanwhile
+            sys.modules.pop(self._module, None)
         return pkgutil.resolve_name(self.__name__)(*args, **options)
+
+    @property
+    def _waits(self) -> bool:
+        return isinstance(sys.modules.get(self._module), _Postponed)
 
 
 @contextmanager
@@ -129,8 +135,9 @@ def _postponed(*names: str) -> Iterator[None]:
     try:
         yield
     finally:
-        for name in waiting:
-            del sys.modules[name]
+        for name, module in waiting.items():
+            if sys.modules.get(name) is module:
+                del sys.modules[name]
 
 
 @functools.cache

@@ -220,3 +220,15 @@ def test_without_any_library(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(metadata, "distribution", missing)
     with pytest.raises(BackendError, match=r'^No LLVM library is installed: run pip install "karellen-llvm-core>='):
         llvm._loaded_library.__wrapped__()
+
+
+def test_a_postponed_module_is_there_for_other_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They import it, and call what is in it, while Sionna RT is being imported."""
+    monkeypatch.delitem(sys.modules, "colorsys", raising=False)
+    with llvm._postponed("colorsys"):
+        import colorsys
+
+        hue_of = colorsys.rgb_to_hsv
+        assert isinstance(colorsys, llvm._Postponed)
+        assert hue_of(1.0, 0.0, 0.0) == (0.0, 1.0, 1.0)
+    assert sys.modules["colorsys"].rgb_to_hsv is colorsys.rgb_to_hsv
