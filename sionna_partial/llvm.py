@@ -93,7 +93,8 @@ def load_sionna() -> ModuleType:
             f"mitsuba variant = {mi.variant()!r} is not supported: call mitsuba.set_variant('{MITSUBA_VARIANT}') "
             "before the first trace, or import sionna_partial in a process of its own."
         )
-    with signals_held(), _postponed(*_DISPLAYS):
+    loaded = "sionna.rt.rcs" in sys.modules
+    with signals_held(), _postponed(*() if loaded else _DISPLAYS):
         import sionna.rt.rcs  # which loading a scene imports
 
     return sionna.rt
