@@ -78,11 +78,11 @@ def short_search() -> Iterator[None]:
 
 @pytest.fixture
 def few_paths() -> Iterator[None]:
-    """Trace short paths without diffraction where no settings are given, which takes little time."""
+    """Trace paths of few interactions where no settings are given, which takes little time."""
+    from sionna_partial.link_model import _LEAST_DEPTH
     from sionna_partial.settings import TraceSettings
 
-    few = {"max_depth": 2, "diffraction": False}
-    defaults = tuple(few.get(each.name, each.default) for each in fields(TraceSettings))
+    defaults = tuple(_LEAST_DEPTH if each.name == "max_depth" else each.default for each in fields(TraceSettings))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(TraceSettings.__init__, "__defaults__", defaults)
         yield

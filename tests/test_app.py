@@ -180,8 +180,7 @@ class TestJobs:
         assert len(made) == 1
         window.session.radios.set(frequency_hz=28e9)
         window.settle()
-        assert len(made) == 2
-        assert "60 GHz" not in "".join(window.session.warnings)
+        assert (len(made), window.session.warnings) == (2, [])
 
 
 class TestTransmitters:
@@ -845,11 +844,10 @@ def test_put_drag_download_upload_cancel(url: str, tmp_path: Path) -> None:
         check_layout(tab)
         links = re.findall('href="([^"]+)"', tab.run(f"{_MODEL}('links').text"))
         assert {link.rpartition("/")[2] for link in links} == {*FILES}
-        (link,) = (each for each in links if each.endswith("/nc"))
-        file, end = url.rpartition("/")[0] + link, time.monotonic() + 60.0
-        while status_of(file) == 409 and time.monotonic() < end:  # the page may be behind its session: a late drag
+        picture, end = url.rpartition("/")[0] + links[0], time.monotonic() + 60.0
+        while status_of(picture) == 409 and time.monotonic() < end:  # the page may be behind its session: a late drag
             time.sleep(0.1)
-        assert status_of(file) == 200
+        assert status_of(picture) == 200
 
         uploaded(tmp_path)
         tab.choose_files("#map-file", tmp_path / "room.yaml", tmp_path / "room.pgm")

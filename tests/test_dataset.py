@@ -37,7 +37,7 @@ BUILD = """
 import sys
 from sionna_partial.lab.datasets.settings import DatasetSettings
 from sionna_partial.lab.datasets.dataset import build_dataset
-build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=1)
+build_dataset(sys.argv[1], range(8), DatasetSettings(5, 1, (0, 50)), workers=2)
 """
 
 
@@ -162,7 +162,6 @@ def poisoned(tmp_path_factory: pytest.TempPathFactory) -> DatasetReport:
     folder = tmp_path_factory.mktemp("poisoned") / "set"
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(processes_make_fakes(tmp_path_factory.mktemp("fakes")))
-        patch.setattr(home_processes, "ATTEMPTS", 2)
         return build_dataset(folder, POISONED, SETTINGS, workers=2, home_time_limit_s=5.0)
 
 
@@ -172,7 +171,7 @@ class TestPoisonedHomes:
         assert poisoned.failed.keys() == {f"make_home({seed})" for seed in (KILLS, HANGS, RAISES)}
         assert set(read_dataset(poisoned.folder).home) == set(poisoned.built)
         for seed, words in (
-            (KILLS, ("its process died 2 times (SIGKILL)\n", "last words")),
+            (KILLS, ("its process died 3 times (SIGKILL)\n", "last words")),
             (HANGS, ("took longer than 5 s, the time limit of a home\n", "dataset_fakes.py", "in make_home")),
             (RAISES, ("ZeroDivisionError: a fault of this home\nTraceback",)),
         ):

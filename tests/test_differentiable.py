@@ -245,6 +245,15 @@ class TestSmoothed:
         value, gradient = scene.smoothed(self.mean_db, near_wall, rx)
         assert np.isfinite([value, *gradient]).all()
 
+    def test_ascent(self):
+        def covered(found):
+            return tf.reduce_mean(found.coverage(-75.0))
+
+        scene = scene_of("partial")
+        value, gradient = scene.smoothed(covered, TX_M, RX_M)
+        there = TX_M + 0.1 * np.array([*gradient[:2], 0.0]) / np.linalg.norm(gradient[:2])
+        assert scene.smoothed(covered, there, RX_M)[0] > value
+
     def test_radius(self):
         with pytest.raises(SettingsError, match=r"within_m = 0 is not allowed: give a number in \(0, 1\]\."):
             scene_of("partial", "paper").smoothed(self.mean_db, TX_M, RX_M, within_m=0)
