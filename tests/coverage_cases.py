@@ -8,6 +8,7 @@ from extruded import drawn
 from sionna_partial.coverage.job import predict_map
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction.predictor import Predictor, warm_predictor
+from sionna_partial.settings import TraceSettings
 
 PICTURE = """
 ????????????
@@ -51,10 +52,11 @@ def shipped(name: str = "map") -> Predictor:
 
 
 @cache
-def _predicted(several: bool) -> xr.Dataset:
-    return predict_map(map_of(PICTURE), SEVERAL if several else TX, spacing_m=0.25, predictor=shipped())
+def _predicted(several: bool, settings: TraceSettings) -> xr.Dataset:
+    tx = SEVERAL if several else TX
+    return predict_map(map_of(PICTURE), tx, spacing_m=0.25, predictor=shipped(), trace_settings=settings)
 
 
 def small_coverage(*, several: bool = False) -> xr.Dataset:
-    """Return a copy of the coverage map of `PICTURE`, with receivers 0.25 m apart."""
-    return _predicted(several).copy(deep=True)
+    """Return a copy of the coverage map of `PICTURE`, with receivers 0.25 m apart, under the settings of the test."""
+    return _predicted(several, TraceSettings()).copy(deep=True)
