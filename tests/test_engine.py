@@ -70,6 +70,28 @@ class TestVerify:
         expected = 1 + 4 * ("walls" not in missing) + ("floor" not in missing) + (not missing or missing == ("walls",))
         assert len(paths.a) == len(candidates.rx) == expected
 
+    def test_materials_of_other_scenes_are_left_out(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        """Dr.Jit calls the materials of all scenes that there are, which takes time for each."""
+        geometry = extrude(ROOM)
+        solvers = [_solver(geometry, tmp_path) for _ in range(2)]
+        from sionna.rt import RadioMaterial  # after LLVM
+
+        matrix, evaluated = RadioMaterial._specular_reflection_transmission_matrix, []
+
+        def evaluate(material, *arguments):
+            evaluated.append(material.scene)
+            return matrix(material, *arguments)
+
+        monkeypatch.setattr(RadioMaterial, "_specular_reflection_transmission_matrix", evaluate)
+        candidates = _specular(geometry, TX, RX, 2)
+        for solver in solvers:
+            paths, _ = solver.verify(candidates, TX, RX)
+            assert evaluated
+            assert all(scene is solver._scene for scene in evaluated)
+            evaluated.clear()
+        others, _ = solvers[0].verify(candidates, TX, RX)
+        np.testing.assert_array_equal(others.transfer, paths.transfer)
+
 
 class TestCompiling:
     @pytest.mark.parametrize("make", [_specular, _diffracted], ids=["specular", "diffracted"])

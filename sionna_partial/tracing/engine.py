@@ -10,6 +10,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from contextvars import ContextVar
 from copy import copy
 from dataclasses import dataclass
 from importlib import metadata
@@ -165,10 +166,30 @@ class _IncoherentScene:
         return self._scene.ray_intersect(ray, **{**options, "coherent": False})
 
 
+_evaluated: ContextVar[Any] = ContextVar("scene whose materials are evaluated", default=None)
+
+
+@functools.cache
+def _leave_out_other_scenes() -> None:
+    """Let an evaluation trace the materials of its own scene only: Dr.Jit calls those of all scenes that there are."""
+    import mitsuba as mi
+
+    kind = load_sionna().RadioMaterial
+    evaluate = kind.eval
+
+    @functools.wraps(evaluate)
+    def evaluate_own(material: Any, *arguments: Any) -> Any:
+        scene = _evaluated.get()
+        return evaluate(material, *arguments) if scene in (None, material.scene) else mi.Spectrum(0.0)
+
+    kind.eval = evaluate_own
+
+
 class _Verification:
     """Sionna RT's image method and field calculator, with loops of one kind."""
 
     def __init__(self, loop_mode: str) -> None:
+        _leave_out_other_scenes()
         solvers = load_sionna().path_solvers
         self._image_method = solvers.image_method.ImageMethod()
         self._field_calculator = solvers.field_calculator.FieldCalculator()
@@ -193,18 +214,22 @@ class _Verification:
 
         still = dr.zeros(mi.Point3f, dr.width(source)), dr.zeros(mi.Point3f, dr.width(targets))
         dr.make_opaque(*still)
-        return self._field_calculator(
-            wavelength=scene.wavelength,
-            paths=buffer,
-            samples_per_src=field[0],
-            diffraction=diffraction,
-            src_positions=source,
-            tgt_positions=targets,
-            src_orientations=still[0],
-            tgt_orientations=still[1],
-            src_antenna_patterns=field[1],
-            tgt_antenna_patterns=field[1],
-        )
+        token = _evaluated.set(scene)
+        try:
+            return self._field_calculator(
+                wavelength=scene.wavelength,
+                paths=buffer,
+                samples_per_src=field[0],
+                diffraction=diffraction,
+                src_positions=source,
+                tgt_positions=targets,
+                src_orientations=still[0],
+                tgt_orientations=still[1],
+                src_antenna_patterns=field[1],
+                tgt_antenna_patterns=field[1],
+            )
+        finally:
+            _evaluated.reset(token)
 
 
 def _end_at_targets(buffer: Any, targets: Any) -> None:
