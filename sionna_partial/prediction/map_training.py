@@ -1,5 +1,6 @@
 """Building and training of the networks that read maps and the paths of links, by Keras."""
 
+import functools
 import itertools
 import logging
 import math
@@ -7,6 +8,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sionna_partial.arrays import Floats, Indices, States
 from sionna_partial.checks import Progress
@@ -229,8 +231,22 @@ def _gradient_step(networks: Mapping[str, "keras.Model"], steps: int) -> Callabl
         optimizer.apply_gradients(zip(slopes, weights, strict=True))
         return loss
 
-    compiled: Callable[..., Any] = tf.function(step, autograph=False, jit_compile=False, reduce_retracing=True)
-    return compiled
+    compiled: dict[bool, Callable[..., Any]] = {}
+
+    def step_on(of_batch: bool, *batch: Any) -> Any:
+        if of_batch not in compiled:
+            sizes = tf.nest.map_structure(_of_any_size, batch)  # otherwise TensorFlow traces the step for several
+            options = {"input_signature": sizes, "autograph": False, "jit_compile": False}
+            compiled[of_batch] = tf.function(functools.partial(step, of_batch), **options)
+        return compiled[of_batch](*batch)
+
+    return step_on
+
+
+def _of_any_size(array: NDArray[Any]) -> Any:
+    """Describe arrays with any number of rows, and images of any size."""
+    *sizes, last = array.shape
+    return tf.TensorSpec([None] * len(sizes) + [last] if sizes else [None], array.dtype)
 
 
 def _score(parts: Parts, state: Any, gain_db: Any) -> Any:
