@@ -13,7 +13,7 @@ from sionna_partial.constants import CellState, LinkState
 from sionna_partial.maps.partial_map import PartialMap
 from sionna_partial.prediction import map_training
 from sionna_partial.prediction.features import ATTENUATION_LENGTHS_M, LinkContext, LinkFeatures
-from sionna_partial.prediction.paper_networks import free_space_gain_db
+from sionna_partial.prediction.paper_networks import free_space_gain_db, import_keras, tf
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.settings import PredictorSettings
 
@@ -167,11 +167,19 @@ def quick_predictor():
 
 @contextmanager
 def shallow_map_networks() -> Iterator[None]:
-    """Let map networks have few layers, and see few maps at once: TensorFlow traces each layer of a training."""
+    """Let map networks have few layers, see few maps at once, and take their few steps without a graph of TensorFlow.
+
+    The graph, which takes longer to trace than many steps, is that of `test_map_networks` and `test_predictor_files`.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(map_training, "_WIDTHS", (4, 8))
         patch.setattr(map_training, "MAPS_AT_ONCE", 4)
-        yield
+        import_keras()
+        tf.config.run_functions_eagerly(True)
+        try:
+            yield
+        finally:
+            tf.config.run_functions_eagerly(False)
 
 
 def fit_context_predictor(networks, seed=0):

@@ -219,7 +219,7 @@ def test_the_rooms_of_receivers_are_learnt_from_maps(monkeypatch):
     others, state, _ = make_room_links(*OTHERS)
     monkeypatch.setattr(training, "LEARNING_RATE", 0.01)
     monkeypatch.setattr(training, "_WIDTHS", (8, 16))
-    found = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=16))
+    found = fit_context_networks(*make_room_links(*TRAINING), PredictorSettings("map", passes=11))
     networks = {name: Network.from_keras(network) for name, network in found.items()}
     probabilities, means_db, _ = predict_by_context(networks, others, FREQUENCY_HZ, MapFeatures(networks))
     assert (probabilities.argmax(axis=0) == state).mean() > 0.9

@@ -14,6 +14,7 @@ from predictor_links import (
     context_predictor,
     fit_context_predictor,
     make_links,
+    make_seen_links,
     quick_predictor,
 )
 
@@ -21,11 +22,13 @@ from sionna_partial.errors import OutputError, PredictorError
 from sionna_partial.files import unzipped, zipped
 from sionna_partial.prediction import predictor_files
 from sionna_partial.prediction.map_networks import LINK_INPUTS, LINK_NETWORK, LINK_OUTPUTS
+from sionna_partial.prediction.map_training import fit_context_networks
 from sionna_partial.prediction.paper_networks import GAIN_INPUTS, assemble, import_keras, parts
 from sionna_partial.prediction.predictor import Predictor
 from sionna_partial.prediction.predictor_files import CHECKSUMS, FORMAT, digest, pack, shipped_bytes
 from sionna_partial.prediction.rule import GATE_NETWORK
 from sionna_partial.resources import PREDICTORS_FOLDER
+from sionna_partial.settings import PredictorSettings
 
 pytestmark = QUIET
 
@@ -64,6 +67,11 @@ def test_stock_keras_loads_it(quick, saved):
 
 def test_a_training_by_seed_gives_the_same_bytes_whatever_was_trained_before_it(quick):
     assert fit_context_predictor("map").fingerprint == context_predictor("map").fingerprint
+    links, settings = make_seen_links(300), PredictorSettings("paths", passes=2)
+    one, other = (fit_context_networks(*links, settings) for _ in range(2))
+    for name, network in one.items():
+        for found, again in zip(network.get_weights(), other[name].get_weights(), strict=True):
+            np.testing.assert_array_equal(found, again)
 
 
 def _repack(archive, change):
