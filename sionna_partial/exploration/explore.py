@@ -16,7 +16,6 @@ from sionna_partial.checks import Progress, are_stages, is_whole, require, requi
 from sionna_partial.constants import CellState
 from sionna_partial.display import Pictured, reporting
 from sionna_partial.errors import MapError
-from sionna_partial.exploration.next_views import coverage_choice
 from sionna_partial.maps.mesh.cells import cut_to_known
 from sionna_partial.maps.partial_map import PartialMap, require_map
 from sionna_partial.settings import Policy, SensorSettings
@@ -200,6 +199,8 @@ def explore_trajectory(
     corner_m = np.array(home.origin_m) + (np.array([column0, row0]) - margin) * home.resolution_m
     choose: Choice | None = None
     if policy == "coverage":
+        from sionna_partial.exploration.next_views import coverage_choice  # xarray, which other robots do without
+
         corner = int(row0) - margin, int(column0) - margin
         choose = coverage_choice(replace(home, mesh=None), corner, tx, sensor)
     robot = Robot(padded[row0:row1, column0:column1], home.resolution_m, int(seed), sensor, choose)
