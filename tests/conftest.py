@@ -62,17 +62,9 @@ def several() -> xr.Dataset:
 @pytest.fixture(scope="module")
 def short_search() -> Iterator[None]:
     """Let a calibration search few cells of the plane of a material, which takes little time."""
-    from sionna_partial.calibration import material_fit
+    from short_searches import short_searches
 
-    with pytest.MonkeyPatch.context() as patch:
-        for name, value in {
-            "FRINGE_CELLS": 7,
-            "COARSE_CELLS": 8,
-            "MOST_FRINGES": 1,
-            "MOST_CELLS": 60,
-            "FEW_FRINGES": 1,
-        }.items():
-            patch.setattr(material_fit, name, value)
+    with short_searches():
         yield
 
 

@@ -156,6 +156,14 @@ def _csv(folder: Path) -> Path:
     return path
 
 
+def _read_csv(path: Path) -> None:
+    sys.path.insert(0, str(Path(HERE).parent))
+    from short_searches import short_searches
+
+    with short_searches():
+        sp.calibrate_materials(room(), path)
+
+
 def _vacuum(suffix: str, folder: Path) -> Path:
     sys.path.insert(0, str(Path(HERE).parent))
     from vacuum_files import valetudo_map, write_json, write_recording
@@ -256,7 +264,8 @@ def _read_coverage(path: Path) -> None:
 @functools.cache
 def _dataset_folder() -> Path:
     folder = Path(tempfile.mkdtemp(prefix="hostile_dataset_"))
-    settings = sp.lab.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0, 5))
+    trace = sp.TraceSettings(max_depth=2)
+    settings = sp.lab.DatasetSettings(links_per_home=8, transmitters_per_home=2, stages=(0, 5), trace=trace)
     sp.lab.build_dataset(folder / "links", [1], settings, workers=1)
     return folder / "links"
 
@@ -330,7 +339,7 @@ KINDS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], Any]]] = {
     "vacuum.json": (functools.partial(_vacuum, ".json"), sp.load_map),
     "vacuum.vwm": (functools.partial(_vacuum, ".vwm"), _read_recording),
     "plan.png": (_picture, lambda path: sp.load_map(path, resolution_m=0.05)),
-    "measurements.csv": (_csv, lambda path: sp.calibrate_materials(room(), path)),
+    "measurements.csv": (_csv, _read_csv),
     "predictor.keras": (_predictor, sp.Predictor.load),
     "predictor.json": (
         lambda folder: _predictor(folder).with_suffix(".json"),
