@@ -19,6 +19,9 @@ pytestmark = QUIET
 UNTRAINED = PredictorSettings(minimum_links=1_000_000)
 """Every network gives mean and spread of its links: quick, and as deterministic as the links."""
 
+FEW_TRAINED = dataclasses.replace(QUICK, minimum_links=350)
+"""One network of the predictor and one of the baseline are trained, and the indoor model."""
+
 HOMES = [f"home {index}" for index in range(10)]
 
 
@@ -29,7 +32,7 @@ def table():
 
 @pytest.fixture(scope="module")
 def run(table):
-    return train(table, test_fraction=0.4, settings=QUICK)
+    return train(table, test_fraction=0.4, settings=FEW_TRAINED)
 
 
 @pytest.fixture(scope="module")
