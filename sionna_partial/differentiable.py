@@ -291,7 +291,8 @@ class DifferentiableScene:
     ) -> tuple[float, Floats]:
         links = self.links(tx, rx, progress=progress)
         tx_m = tf.Variable(links.base.tx_m)
-        with tf.GradientTape() as tape:
+        with tf.GradientTape(watch_accessed_variables=False) as tape:  # the weights have no part in it
+            tape.watch(tx_m)
             value = objective(links(tx_m=tx_m))
         return float(value), tape.gradient(value, tx_m, unconnected_gradients="zero").numpy()
 

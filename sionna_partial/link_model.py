@@ -185,16 +185,13 @@ class LinkModel:
         PositionError
             As `trace_links`.
         """
-        phi, prediction, _ = self._checked(tx, rx)
-        return prediction.reshaped((*np.shape(tx)[:-1], len(phi) // max(1, np.size(tx) // 3)))
+        phi = self.features(tx, rx)
+        return self.predict_features(phi).reshaped((*np.shape(tx)[:-1], len(phi) // max(1, np.size(tx) // 3)))
 
     def features(self, tx: ArrayLike, rx: ArrayLike) -> LinkFeatures:
         """Return the features of the links in `predict`, sorted by transmitter."""
-        return self._checked(tx, rx)[0]
-
-    def _checked(self, tx: ArrayLike, rx: ArrayLike) -> tuple[LinkFeatures, LinkPrediction, Bools]:
         tx_m, rx_m = checked_positions(self.partial, tx, rx, self.simulation.trace_settings.frequency_hz)
-        return self.predict_each([(position_m, rx_m) for position_m in tx_m])
+        return self._features_each([(position_m, rx_m) for position_m in tx_m])
 
     def predict_each(
         self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress
@@ -203,10 +200,14 @@ class LinkModel:
 
         `ends_m` has pairs of a transmitter (3,) and its receivers (N, 3) [m]; links are in this order.
         """
+        phi = self._features_each(ends_m, report)
+        return phi, self.predict_features(phi), context_of(phi).complete
+
+    def _features_each(self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress) -> LinkFeatures:
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
         paths = [self._blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
-        return self._predict_paths(ends_m, paths)
+        return self._features_of_paths(ends_m, paths)
 
     def _blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
@@ -214,16 +215,15 @@ class LinkModel:
         unobserved = None if self.partial.is_complete else functools.partial(path_unobserved_m, self.partial)
         return self.simulation.blocks(tx_m, rx_m, report, antenna, unobserved)
 
-    def _predict_paths(
+    def _features_of_paths(
         self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
-    ) -> tuple[LinkFeatures, LinkPrediction, Bools]:
+    ) -> LinkFeatures:
         settings, unknown = self.simulation.resolved, self.simulation.material_unknown
         found = [
             features_of_paths(self.partial, *link_m, paths, settings, material_unknown=unknown)
             for link_m, paths in zip(ends_m, found_paths, strict=True)
         ]
-        phi = LinkFeatures.concatenate(found)
-        return phi, self.predict_features(phi), context_of(phi).complete
+        return LinkFeatures.concatenate(found)
 
     def predict_features(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links from their features (`rule.predicted`).
@@ -287,8 +287,9 @@ class LinkModel:
             sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
             found = self._every_path.blocks(tx_m, rx_m, report, Antenna()) if at_rx else None
             paths = sums.added(found or self._blocks(tx_m, rx_m, report, antenna))
-            phi, prediction, complete = self._predict_paths([(tx_m, rx_m)], [paths])
-            phi, prediction, antenna_db = sums.predict(phi, prediction, complete)
+            phi = self._features_of_paths([(tx_m, rx_m)], [paths])
+            complete = context_of(phi).complete
+            phi, prediction, antenna_db = sums.predict(phi, self.predict_features(phi), complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))
         known = self.partial.state_at(rx_m) != CellState.UNKNOWN
         return PredictedLinks(phi, prediction, np.where(known, 1.0, p_indoor), complete, antenna_db)
