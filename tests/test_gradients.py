@@ -50,19 +50,17 @@ def test_reflection_off_the_floor(material: sp.Material) -> None:
 
 
 def test_gain_state_and_outage() -> None:
-    settings = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0)
-    found, links = (
-        call(small_room(), TX_M, RX_M, trace_settings=settings) for call in (gain_gradients, sp.trace_links)
-    )
+    """Of the small room, and a closed one beside it with the last receiver."""
+    beside = np.pad(np.full((30, 9), CellState.FREE), ((1, 1), (0, 1)), constant_values=CellState.WALL)
+    rooms = dataclasses.replace(small_room(), state=np.hstack([small_room().state, beside]).astype(np.uint8))
+    settings, rx = sp.TraceSettings(max_depth=1, power_tolerance_db=0.0), np.vstack([RX_M, [4.7, 1.4, 1.2]])
+    found, links = (call(rooms, TX_M, rx, trace_settings=settings) for call in (gain_gradients, sp.trace_links))
     np.testing.assert_array_equal(found.link_state, links.link_state)
     np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
     assert (found.trace_settings, found.scene_settings) == (links.trace_settings, links.scene_settings)
-    state = np.zeros((22, 60), dtype=np.uint8)
-    state[[0, -1], :] = state[:, [0, 29, -1]] = CellState.WALL
-    found = gain_gradients(sp.PartialMap(state, 0.1), (1.0, 1.1, 1.5), [(4.5, 0.8, 1.2), (1.7, 0.7, 1.1)])
-    assert found.link_state.tolist() == [LinkState.OUTAGE, LinkState.LOS]
-    assert not all_slopes(found)[:, 0].any()
-    assert all_slopes(found)[:, 1].all()
+    assert found.link_state[[-1, 0]].tolist() == [LinkState.OUTAGE, LinkState.LOS]
+    assert not all_slopes(found)[:, -1].any()
+    assert all_slopes(found)[:, 0].all()
 
 
 def test_frequency_by_differences_for_every_named_material() -> None:

@@ -1,5 +1,6 @@
 """Losses of the walls of a map, and the prediction of links through walls."""
 
+import functools
 import logging
 import re
 from dataclasses import replace
@@ -29,7 +30,10 @@ from sionna_partial.prediction.unseen_walls import (
 from sionna_partial.tracing.power import MOST_LOSS_DB, wall_loss_db
 
 WIFI = sp.TraceSettings(5e9, max_depth=2)
+OPAQUE = replace(WIFI, refraction=False)
 DRYWALL = sp.SceneSettings(material="drywall")
+TX, RX = (1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)]
+"""Transmitter, and receivers in a row, the last far in the unknown [m]: traced together, they need the same kernels."""
 
 
 def half_seen() -> sp.PartialMap:
@@ -61,7 +65,7 @@ def test_walls_of_a_map_count_by_their_cells() -> None:
 
 def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
     model = sp.LinkModel(half_seen(), trace_settings=WIFI, scene_settings=DRYWALL)
-    found = model.predict((1.0, 2.0, 1.5), [(x, 2.0, 1.5) for x in (3.0, 5.0, 6.0, 7.0)])
+    found = model.predict(TX, RX)
     assert found.p_los[0] == 1.0
     assert (np.diff(found.p_los) < 0.0).all()
     assert (np.diff(found.gain_mean_db) < 0.0).all()
@@ -69,10 +73,14 @@ def test_longer_unobserved_lines_lose_more_and_are_less_certain() -> None:
     np.testing.assert_allclose(found.p_los + found.p_nlos + found.p_outage, 1.0)
 
 
+@functools.cache
+def traced_row() -> LinkFeatures:
+    return sp.LinkModel(half_seen(), trace_settings=WIFI).features(TX, RX)
+
+
 def some_links(count: int, wall_loss_db: float = 5.0) -> LinkFeatures:
     """Return equal links that are traced in LOS, with walls of some loss."""
-    phi = sp.LinkModel(half_seen(), trace_settings=WIFI).features((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
-    phi = phi.take(np.zeros(count, dtype=np.int64))
+    phi = traced_row().take(np.full(count, len(RX) - 1))
     assert phi.context is not None
     return replace(phi, context=replace(phi.context, wall_loss_db=np.full(count, wall_loss_db)))
 
@@ -117,27 +125,27 @@ def test_intervals_hold_gains_behind_walls_of_unknown_number() -> None:
 
 def test_the_default_through_walls() -> None:
     """The default predictor below 24 GHz, named in the coverage; a predictor that was asked for predicts."""
-    tx, options = (1.0, 2.0, 1.5), {"spacing_m": 0.5, "trace_settings": WIFI}
-    coverage = sp.predict_map(half_seen(), tx, **options)
+    options = {"spacing_m": 0.5, "trace_settings": WIFI}
+    coverage = sp.predict_map(half_seen(), TX, **options)
     assert coverage.attrs["predictor"] == WALL_LOSSES
     assert coverage.attrs["walls"] == "through walls"
     assert float(coverage.p_outage.max()) < 1e-3
-    opaque = sp.predict_map(half_seen(), tx, spacing_m=0.5, trace_settings=replace(WIFI, refraction=False))
+    opaque = sp.predict_map(half_seen(), TX, spacing_m=0.5, trace_settings=OPAQUE)
     assert opaque.attrs["predictor"] == "map"
-    assert sp.predict_map(half_seen(), tx, predictor="paper", **options).attrs["predictor"] == "paper"
+    assert sp.predict_map(half_seen(), TX, predictor="paper", **options).attrs["predictor"] == "paper"
 
 
 @QUIET
 def test_predictor_of_links_through_walls(caplog: pytest.LogCaptureFixture) -> None:
     """It predicts links through walls without a warning, and those on opaque walls with one."""
-    links = home_links(all_seen(), "home", sp.lab.DatasetSettings(links_per_home=40, stages=(0, 5), trace=WIFI))
+    links = home_links(all_seen(), "home", sp.lab.DatasetSettings(links_per_home=20, stages=(0, 5), trace=WIFI))
     assert (links.context.wall_loss_db < MOST_LOSS_DB).all()
-    learning = settings_for(LinkTraces(5e9, diffraction=True, through_walls=True), networks="paths", passes=4)
-    predictor = sp.Predictor.fit(links.features, links.link_state, links.gain_db, settings=replace(learning, steps=20))
+    learning = settings_for(LinkTraces(5e9, diffraction=True, through_walls=True), networks="paths", passes=2)
+    predictor = sp.Predictor.fit(links.features, links.link_state, links.gain_db, settings=replace(learning, steps=5))
     assert np.isfinite(predictor.predict(links.features).gain_mean_db).all()
     opaque = ["trained through walls, and is used on opaque walls"]
-    for trace, expected in ((WIFI, []), (sp.TraceSettings(), opaque)):
+    for trace, expected in ((WIFI, []), (OPAQUE, opaque)):
         caplog.clear()
         with caplog.at_level(logging.WARNING):
-            sp.LinkModel(half_seen(), predictor, trace).predict((1.0, 2.0, 1.5), [(7.0, 2.0, 1.5)])
+            sp.LinkModel(half_seen(), predictor, trace).predict(TX, RX)
         assert re.findall("trained .* used .* walls", "\n".join(caplog.messages)) == expected
