@@ -53,7 +53,7 @@ def test_gain_state_and_outage() -> None:
     """Of the small room, and a closed one beside it with the last receiver."""
     beside = np.pad(np.full((30, 9), CellState.FREE), ((1, 1), (0, 1)), constant_values=CellState.WALL)
     rooms = dataclasses.replace(small_room(), state=np.hstack([small_room().state, beside]).astype(np.uint8))
-    settings, rx = sp.TraceSettings(max_depth=1, power_tolerance_db=0.0), np.vstack([RX_M, [4.7, 1.4, 1.2]])
+    settings, rx = sp.TraceSettings(max_depth=2, power_tolerance_db=0.0), np.vstack([RX_M, [4.7, 1.4, 1.2]])
     found, links = (call(rooms, TX_M, rx, trace_settings=settings) for call in (gain_gradients, sp.trace_links))
     np.testing.assert_array_equal(found.link_state, links.link_state)
     np.testing.assert_allclose(found.gain_db, links.gain_db, rtol=1e-13)
