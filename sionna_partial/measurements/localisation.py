@@ -86,10 +86,10 @@ class TransmitterPosterior:
     @cached_property
     def position_m(self) -> Floats:
         """Cell (3,) with the smallest expected distance [m]."""
-        points_m, weights = self.points_m, self.probability.ravel()
+        weights = self.probability.ravel()
         possible = weights > 0.0
-        expected_m = [np.linalg.norm(points_m[possible] - each, axis=1) @ weights[possible] for each in points_m]
-        return points_m[np.where(possible, expected_m, math.inf).argmin()]
+        points_m = self.points_m[possible]
+        return points_m[(cdist(points_m, points_m) @ weights[possible]).argmin()]
 
     @property
     def std_m(self) -> float:
