@@ -1,12 +1,14 @@
 """Commands run in this process, and the arguments with which they call a function of the package."""
 
+import functools
 import inspect
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+import typer
+from click.testing import CliRunner, Result
 
 import sionna_partial as sp
 from sionna_partial import cli
@@ -16,8 +18,14 @@ class Called(Exception):
     """A function was called, with these arguments by name."""
 
 
+@functools.cache
+def _command() -> Any:
+    """Build the command line once, which takes longer than to run most of its commands."""
+    return typer.main.get_command(cli.app)
+
+
 def run(*words: object, exit_code: int = 0) -> Result:
-    result = CliRunner().invoke(cli.app, [str(word) for word in words])
+    result = CliRunner().invoke(_command(), [str(word) for word in words])
     assert result.exit_code == exit_code, result.output
     return result
 
