@@ -8,6 +8,7 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from sionna_partial.files import unzipped
 from sionna_partial.prediction.evaluate import Network
@@ -47,6 +48,20 @@ def randomized(model):
             weights[3] = 0.5 + weights[3] ** 2
         each.set_weights(weights)
     return model
+
+
+def blas_threads() -> set[int]:
+    return {each["num_threads"] for each in threadpool_info() if each["user_api"] == "blas"}
+
+
+def test_one_thread_computes_and_all_are_back_afterwards() -> None:
+    """On a loaded machine threads of small products wait for each other."""
+    network, threads = read(SHIPPED[0]), []
+    name, layer_of = next(iter(network.layers.items()))
+    with threadpool_limits(2, "blas"):
+        network.layers[name] = lambda *given, **options: threads.append(blas_threads()) or layer_of(*given, **options)
+        network({key: example(shape) for key, shape in network.input.items()})
+        assert (threads, blas_threads()) == ([{1}], {2})
 
 
 def test_shipped_predictors() -> None:

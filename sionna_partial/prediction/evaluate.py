@@ -7,8 +7,11 @@ import io
 import itertools
 import json
 import re
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from functools import cache
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -91,9 +94,10 @@ class Network:
         one = isinstance(self._input, list)
         given = {self._input[0]: inputs} if one else {end[0]: inputs[name] for name, end in self._input.items()}
         values = {name: np.asarray(each, dtype=np.float32) for name, each in given.items()}
-        for name, call in self._calls.items():
-            options = {key: each for key, each in call["kwargs"].items() if key != "mask"}
-            values[name] = self.layers[name](*_filled(call["args"], values), **options)
+        with _one_blas_thread():
+            for name, call in self._calls.items():
+                options = {key: each for key, each in call["kwargs"].items() if key != "mask"}
+                values[name] = self.layers[name](*_filled(call["args"], values), **options)
         return _by_name(self._output, values)
 
     @classmethod
@@ -111,6 +115,23 @@ class Network:
             if outside is not None:
                 raise ValueError(f"its weights '{outside}' are elsewhere")
             return cls(config, (_read(dataset, most) for dataset in _stored(config, stored)))
+
+
+_computing = threading.RLock()
+
+
+@contextmanager
+def _one_blas_thread() -> Iterator[None]:
+    """Let one thread compute small products: on a loaded machine those of OpenBLAS wait for each other."""
+    with _computing, _blas().limit(limits=1, user_api="blas"):
+        yield
+
+
+@cache
+def _blas() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
 
 
 def _by_name(ends: Any, values: Mapping[str, Any]) -> Any:
