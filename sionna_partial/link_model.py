@@ -206,8 +206,11 @@ class LinkModel:
     def _features_each(self, ends_m: Sequence[tuple[Floats, Floats]], report: Progress = no_progress) -> LinkFeatures:
         share = 1.0 / max(1, len(ends_m))
         parts = (part_of(report, number * share, (number + 1) * share) for number in range(len(ends_m)))
-        paths = [self._blocks(*link_m, part) for link_m, part in zip(ends_m, parts, strict=True)]
-        return self._features_of_paths(ends_m, paths)
+        found = [
+            self._features_of_paths(*link_m, self._blocks(*link_m, part))
+            for link_m, part in zip(ends_m, parts, strict=True)
+        ]
+        return LinkFeatures.concatenate(found)
 
     def _blocks(
         self, tx_m: Floats, rx_m: Floats, report: Progress, antenna: Antenna | None = None
@@ -215,15 +218,9 @@ class LinkModel:
         unobserved = None if self.partial.is_complete else functools.partial(path_unobserved_m, self.partial)
         return self.simulation.blocks(tx_m, rx_m, report, antenna, unobserved)
 
-    def _features_of_paths(
-        self, ends_m: Sequence[tuple[Floats, Floats]], found_paths: Sequence[Iterable[SolvedPaths]]
-    ) -> LinkFeatures:
+    def _features_of_paths(self, tx_m: Floats, rx_m: Floats, paths: Iterable[SolvedPaths]) -> LinkFeatures:
         settings, unknown = self.simulation.resolved, self.simulation.material_unknown
-        found = [
-            features_of_paths(self.partial, *link_m, paths, settings, material_unknown=unknown)
-            for link_m, paths in zip(ends_m, found_paths, strict=True)
-        ]
-        return LinkFeatures.concatenate(found)
+        return features_of_paths(self.partial, tx_m, rx_m, paths, settings, material_unknown=unknown)
 
     def predict_features(self, phi: LinkFeatures) -> LinkPrediction:
         """Predict links from their features (`rule.predicted`).
@@ -287,7 +284,7 @@ class LinkModel:
             sums = AntennaLinks(antenna, self.simulation.trace_settings.frequency_hz, tx_m, rx_m, at_rx=at_rx)
             found = self._every_path.blocks(tx_m, rx_m, report, Antenna()) if at_rx else None
             paths = sums.added(found or self._blocks(tx_m, rx_m, report, antenna))
-            phi = self._features_of_paths([(tx_m, rx_m)], [paths])
+            phi = self._features_of_paths(tx_m, rx_m, paths)
             complete = context_of(phi).complete
             phi, prediction, antenna_db = sums.predict(phi, self.predict_features(phi), complete)
         p_indoor = np.zeros(len(phi)) if complete.all() else np.where(complete, 0.0, self.predictor.predict_indoor(phi))

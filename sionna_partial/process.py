@@ -200,7 +200,7 @@ class _Kernel:
 
     @cached_property
     def _inner(self) -> Any:
-        """For compiled callers; the wrappers for calls by Python take a fifth of the time to compile."""
+        """For compiled callers, without the wrappers for calls by Python, which take time to compile."""
         return self._dispatcher(no_cpython_wrapper=True)
 
     def _dispatcher(self, **options: Any) -> Any:

@@ -178,9 +178,9 @@ def _leave_out_other_scenes() -> None:
     evaluate = kind.eval
 
     @functools.wraps(evaluate)
-    def evaluate_own(material: Any, *arguments: Any) -> Any:
+    def evaluate_own(material: Any, *arguments: Any, **named: Any) -> Any:
         scene = _evaluated.get()
-        return evaluate(material, *arguments) if scene in (None, material.scene) else mi.Spectrum(0.0)
+        return evaluate(material, *arguments, **named) if scene in (None, material.scene) else mi.Spectrum(0.0)
 
     kind.eval = evaluate_own
 

@@ -21,6 +21,7 @@ import sionna_partial as sp
 from sionna_partial.channels.samples import ChannelSamples
 
 HERE = str(Path(__file__).parent)
+sys.path.insert(0, str(Path(HERE).parent))  # files of the other tests
 
 TX = (1.1, 1.1, 1.5)
 
@@ -157,7 +158,6 @@ def _csv(folder: Path) -> Path:
 
 
 def _read_csv(path: Path) -> None:
-    sys.path.insert(0, str(Path(HERE).parent))
     from short_searches import short_searches
 
     with short_searches():
@@ -165,7 +165,6 @@ def _read_csv(path: Path) -> None:
 
 
 def _vacuum(suffix: str, folder: Path) -> Path:
-    sys.path.insert(0, str(Path(HERE).parent))
     from vacuum_files import valetudo_map, write_json, write_recording
 
     path = folder / f"home{suffix}"
@@ -303,7 +302,6 @@ def _drawing(folder: Path) -> Path:
 
 
 def _bag(name: str, folder: Path) -> Path:
-    sys.path.insert(0, str(Path(HERE).parent))
     from rosbag_files import write_drive
 
     name = {".bag": "drive.bag", ".mcap": "drive_mcap", ".db3": "drive_sqlite3"}[Path(name).suffix]
